@@ -18,8 +18,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
+from coil_rl.envs.boundaries import Boundaries
 from coil_rl.envs.constants import constant
 from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
 from coil_rl.envs.meanings import of_cones
@@ -32,52 +32,13 @@ from coil_rl.envs.reward import (
     recent_mean,
     weighted_terms,
 )
-from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SAMPLES, SIGHT, Frame, View, encode_samples, view
-from coil_rl.envs.sorting import append, first_come, rows_in_use
+from coil_rl.envs.seeded_env import SeededEnv
+from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SAMPLES, SIGHT, Frame, View, view
 from coil_rl.envs.splines import spline_fit
 from coil_rl.envs.track import NEVER, Track, begin_in_sight, places
 from coil_rl.envs.track_map import Location, TrackMap
 
 FINISH_RADIUS = 0.625  # m
-
-
-class SeededEnv(EnvBase):
-    """Env that draws all random numbers from `generator`, whose state is part of `state_dict`.
-
-    Attributes:
-        generator: of all random numbers.
-        different: number of rows that draw where their episodes begin, of B; row i begins as row
-            `i % different`. None: all rows draw.
-    """
-
-    generator: torch.Generator
-    different: int | None = None
-
-    def _drawn(self, high: int) -> Tensor:
-        """Draw an integer below `high` for each row, the same for rows that begin alike, [B]."""
-        rows = self.batch_size.numel()
-        drawn = torch.randint(high, (self.different or rows,), generator=self.generator)
-        return drawn if self.different is None else drawn[torch.arange(rows) % self.different]
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # For a buffer, the checks of PyTorch take longer than an operation on it.
-        buffers = self.__dict__.get("_buffers", {})
-        if name in buffers:
-            buffers[name] = value
-        else:
-            super().__setattr__(name, value)
-
-    def get_extra_state(self) -> Tensor:
-        """Return the state of the generator."""
-        return self.generator.get_state()
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Restore the state of the generator."""
-        self.generator.set_state(state.cpu())
-
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            self.generator.manual_seed(seed)
 
 
 class ConeTrackEnv(SeededEnv):
@@ -202,8 +163,8 @@ class ConeTrackEnv(SeededEnv):
         self.every_sighting = cone_bonus == "every_sighting"
         self.kept_cones, self.speed, self.car_length = kept_cones, speed, car_length
         self.max_steering = math.radians(max_steering)
-        self.fit, self.sight = spline_fit(spline, smoothing), sight
-        self.hold_boundary = hold_boundary
+        self.sight = sight
+        self.boundaries = Boundaries(spline_fit(spline, smoothing), sight, hold=hold_boundary)
         if finish_in_sight:
             tracks = [begin_in_sight(track, sight, HALF_FIELD_OF_VIEW) for track in tracks]
         self.map = TrackMap(tracks, sight=sight, dtype=dtype).to(self.device)
@@ -290,7 +251,9 @@ class ConeTrackEnv(SeededEnv):
         visible, _, cones = self._view(location, pose, frame)
         samples = torch.zeros(2, SAMPLES, 2, len(tracks), dtype=self.dtype_, device=self.device)
         new, sampled = torch.ones_like(lap_start, dtype=torch.bool), torch.zeros_like(samples[0, 0])
-        observation, samples, sampled = self._observe(frame, visible, cones, new, samples, sampled)
+        observation, samples, sampled = self.boundaries.observe(
+            frame, visible, cones, new, samples, sampled
+        )
         buffers = {
             "observation": observation.t(),
             "cones": visible.cones,
@@ -445,7 +408,7 @@ class ConeTrackEnv(SeededEnv):
 
     def _next_observation(self, frame: Frame, visible: View, cones: Tensor, new: Tensor) -> Tensor:
         """Estimate the boundaries, and return the observation [B, 20]."""
-        observed = self._observe(frame, visible, cones, new, self.samples, self.sampled)
+        observed = self.boundaries.observe(frame, visible, cones, new, self.samples, self.sampled)
         observation, self.samples, self.sampled = observed
         return observation
 
@@ -525,71 +488,6 @@ class ConeTrackEnv(SeededEnv):
         slots, cones = self.map.candidates(location, pose[2])
         return view(frame.to_car(cones), self.kept_cones, self.sight), slots, cones
 
-    def _observe(
-        self,
-        frame: Frame,
-        visible: View,
-        cones: Tensor,
-        new: Tensor,
-        samples: Tensor,
-        sampled: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Estimate the boundaries; return the observation and the new `samples` and `sampled`.
-
-        A side with fewer than two visible cones keeps its last estimate. A held boundary is
-        estimated only where a cone came into sight.
-
-        Args:
-            frame: of the cars.
-            visible: the cones in sight.
-            cones: positions of all candidates, [2, N, 2, B] m in world coordinates.
-            new: [B], whether a cone of the candidates came into sight.
-            samples: last boundary estimate, [2, 5, 2, B] m in world coordinates.
-            sampled: [2, B], 1 for a side with an estimate.
-
-        Returns:
-            The observation [B, 20], `samples` and `sampled`.
-        """
-        if self.hold_boundary:
-            samples = self._held_samples(visible, cones, new, samples)
-            sampled = torch.ones_like(sampled)
-            return encode_samples(frame.to_car(samples), sampled, self.sight), samples, sampled
-        fresh = visible.real[1]
-        local = self.fit(visible.cones, visible.count).equidistant(SAMPLES)
-        samples = torch.lerp(samples, frame.to_world(local), fresh)
-        sampled = torch.maximum(sampled, fresh)
-        # A fresh estimate is observed as it was made, without the detour over world coordinates.
-        local = torch.lerp(frame.to_car(samples), local, fresh)
-        return encode_samples(local, sampled, self.sight), samples, sampled
-
-    def _held_samples(self, visible: View, cones: Tensor, new: Tensor, samples: Tensor) -> Tensor:
-        """Estimate held boundaries where a cone came into sight; arguments as for `_observe`."""
-        rows = rows_in_use(new)
-        if not len(rows):
-            return samples
-        index = visible.index.view(visible.real.shape).index_select(-1, rows)
-        chosen = cones.flatten(1).index_select(1, index.flatten()).view(2, *index.shape)
-        estimate = self._estimate_distinct(chosen, visible.count.index_select(1, rows))
-        held = samples.index_select(-1, rows)
-        estimate = torch.where(new.index_select(0, rows), estimate, held)
-        return samples.index_copy(-1, rows, estimate)
-
-    def _estimate_distinct(self, cones: Tensor, count: Tensor) -> Tensor:
-        """Return samples of held boundaries, without cones that share x or y with a nearer one.
-
-        Args:
-            cones: visible cones, [2, K, 2, R] m in world coordinates, nearest first.
-            count: [2, R], number of real cones.
-
-        Returns:
-            Samples in world coordinates, [2, 5, 2, R] m.
-        """
-        real = count > constant(range(cones.shape[1]), cones[0])
-        distinct = first_come(real, (cones.unsqueeze(1) == cones.unsqueeze(2)).any(0))
-        none = torch.zeros_like(count, dtype=torch.int64)
-        points, count = append(torch.zeros_like(cones), none, cones, distinct)
-        return self.fit(points, count).equidistant(SAMPLES) * (count > 1)
-
     def _count_new_cones(
         self, visible: View, slots: Tensor, finished: Tensor
     ) -> tuple[Tensor, Tensor]:
@@ -613,7 +511,7 @@ class ConeTrackEnv(SeededEnv):
         last_seen = self.last_seen.view(-1)
         last = last_seen.index_select(0, index).view_as(slots)
         rewarded = visible.real * torch.lt(last, before if self.every_sighting else self.lap_epoch)
-        entered = visible.real * torch.lt(last, before) if self.hold_boundary else rewarded
+        entered = visible.real * torch.lt(last, before) if self.boundaries.hold else rewarded
         last_seen.scatter_(0, index, torch.where(visible.real.bool(), self.epoch, last).flatten())
         return rewarded.amax(0).sum(0), entered.flatten(0, 1).amax(0).bool()
 

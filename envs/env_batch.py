@@ -20,9 +20,9 @@ from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
-from coil_rl.envs.cone_track import SeededEnv
 from coil_rl.envs.gate import LIMIT, foreign
 from coil_rl.envs.limits import LARGEST_SEED, check_range
+from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.envs.step_limit import names_limit, warn_of_limit
 
 SEEDS = 2**31  # seeds of drawn episodes are below

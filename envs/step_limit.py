@@ -9,8 +9,8 @@ from typing import Any
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
-from coil_rl.envs.cone_track import SeededEnv
 from coil_rl.envs.gate import LIMIT, OWN_LIMITS
+from coil_rl.envs.seeded_env import SeededEnv
 
 # Names of the largest number of steps, or of seconds, of an episode.
 NAMES = (*OWN_LIMITS, "episode_length", "time_limit")

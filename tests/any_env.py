@@ -4,7 +4,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, OneHot, Unbounded
 
-from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.envs.seeded_env import SeededEnv
 
 FLOAT64 = {"dtype": torch.float64}
 

@@ -6,7 +6,7 @@ from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.envs.seeded_env import SeededEnv
 
 
 class CartPoles(SeededEnv):

@@ -24,9 +24,10 @@ from coil_rl.report import Returns
 from coil_rl.report.pictures import Picture
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run.evaluation import EvaluationResult
+from coil_rl.run.guide_returns import GuideReturns
 from coil_rl.run.judge import Evaluation, Trial, evaluate_guides, guide_titles
 from coil_rl.run.parts import TEST, TESTS, TRAIN, EnvMaker
-from coil_rl.run.run import Budget, GuideReturns, Run
+from coil_rl.run.run import Budget, Run
 from coil_rl.run.tuned_run import TunedRun
 from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions

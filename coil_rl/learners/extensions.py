@@ -34,6 +34,11 @@ class Extensions(Extension):
         for extension in self.each:
             extension.prepare(batch)
 
+    @property
+    def has_losses(self) -> bool:
+        """Whether any of them adds losses."""
+        return any(type(each).losses is not Extension.losses for each in self.each)
+
     def losses(
         self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase
     ) -> dict[str, Tensor]:

@@ -49,6 +49,17 @@ class LeanUpdate:
         self.read = list(dict.fromkeys(key for each in networks for key in each.in_keys))
         self.inputs = [each for each in self.policy.inputs if set(each.out_keys) & set(self.read)]
 
+    @classmethod
+    def of(
+        cls, policy: Any, critic: Any, loss: Any, sampler: Minibatches, gradient: GradientStep
+    ) -> "LeanUpdate | None":
+        """Return the lean form of an update with only PPO's own losses; None if it has none.
+
+        Arguments are those of the constructor, of any kind.
+        """
+        covered = cls.covers(policy, critic, loss, sampler)
+        return cls(policy, critic, loss, sampler, gradient) if covered else None
+
     @staticmethod
     def covers(policy: Any, critic: Any, loss: Any, sampler: Minibatches) -> bool:
         """Return whether an update has this form.

@@ -166,23 +166,14 @@ class PPO(Stateful, Learner):
             compile=compile,
             compilable=self.compilable and memory is None and not guide_may_act(env),
         )
+        # Losses of a subclass, an extension or a guide that acts have no lean form.
+        plain = type(self).losses is PPO.losses and self.objective == self.losses
         self.lean: LeanUpdate | None = None
-        if self._is_lean():
-            self.lean = LeanUpdate(self.policy, self.critic, self.loss, self.sampler, self.gradient)
+        if plain and not self.extensions.has_losses:
+            self.lean = LeanUpdate.of(
+                self.policy, self.critic, self.loss, self.sampler, self.gradient
+            )
         self._set_keys(env, in_keys)
-
-    def _is_lean(self) -> bool:
-        """Return whether an update that is not compiled takes its lean form, see `LeanUpdate`.
-
-        It does unless a subclass, an extension or a guide that acts has losses of its own.
-        """
-        own = [type(each).losses for each in self.extensions.each]
-        return (
-            self.objective == self.losses
-            and type(self).losses is PPO.losses
-            and all(losses is Extension.losses for losses in own)
-            and LeanUpdate.covers(self.policy, self.critic, self.loss, self.sampler)
-        )
 
     def build_policy(
         self,

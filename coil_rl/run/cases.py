@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, episodes

@@ -13,7 +13,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, where
 from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
-from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.learners.lean_policy import Entries, LeanPolicy
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.normalised_action import NormalisedAction

@@ -15,7 +15,6 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.compiled import compile_steps
 from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
 from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
 from coil_rl.learners.learner import Callback, Learner
@@ -25,12 +24,11 @@ from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.report.pictures import Picture
 from coil_rl.report.runs import DELIVERY, EVALUATION, read_curve
 from coil_rl.run import checkpoint
-from coil_rl.run.cases import TrainingCases
 from coil_rl.run.controller import Controller
-from coil_rl.run.curve import EvaluationCurve, Watch, measures
-from coil_rl.run.delivery import Delivery, guide_of, handed_over
+from coil_rl.run.curve import Watch
+from coil_rl.run.delivery import guide_of, handed_over
 from coil_rl.run.evaluation import EvaluationResult
-from coil_rl.run.experiment import PUT_BACK, Experiment, watched_keys
+from coil_rl.run.experiment import PUT_BACK
 from coil_rl.run.fallback import Fallback, make_fallback
 from coil_rl.run.folder import (
     begin,
@@ -43,17 +41,17 @@ from coil_rl.run.folder import (
     write_config,
 )
 from coil_rl.run.guide_episodes import driven_once
-from coil_rl.run.judge import Evaluation, Trial, guide_titles, judge, report_outcome
+from coil_rl.run.guide_returns import guide_returns
+from coil_rl.run.judge import Evaluation, Trial, judge, report_outcome
 from coil_rl.run.next_step import next_step
-from coil_rl.run.parts import TESTS, TRAIN, EnvMaker
-from coil_rl.run.rollout import Rollout
+from coil_rl.run.parts import TRAIN, EnvMaker
 from coil_rl.run.stopping import resume_command
-from coil_rl.transforms.normalised_action import given_units, units_of
+from coil_rl.run.training import training_of
+from coil_rl.run.weights import put_weights
 
 if TYPE_CHECKING:
     import pandas as pd
 
-INIT = "init.pt"  # the policy that a run began from
 HANDED_OVER = "handed_over"  # name of the policy that `delivery` chose
 
 
@@ -345,7 +343,7 @@ class Run:
         guide_returns = self._saved_guide_returns()
         # After the guides, which a resumed run does not evaluate again.
         torch.manual_seed(self.seed)
-        experiment = self._experiment(before)
+        experiment = training_of(self, before)
         if resumed:
             experiment.resume()
         start = time.monotonic()
@@ -359,77 +357,6 @@ class Run:
         experiment.metrics.close()
         learner.export(self.folder)
         return self._loaded(learner.policy, experiment.rollout.env, self.chosen)
-
-    def _experiment(self, before: int) -> Experiment:
-        """Return the training.
-
-        Args:
-            before: frames that were taken before it.
-        """
-        make_learner = self.make_learner
-        require_agent(self.folder, has_agent=self.has_agent)
-        env = self.make_env(self.budget.rows)
-        _say_units(env)
-        if self.compiled:
-            compile_steps(env)
-        learner = make_learner(env)  # type: ignore[misc]
-        if self.init is not None:
-            load_weights(learner.policy, self._init_file(), self.device)
-        keys = [*learner.keys, *watched_keys(env, self.watch)]
-        rollout = Rollout(env, learner.policy, self.budget.steps, keys, self.noise_correlation)
-        cases = TrainingCases(partial(self.make_env, cases=TESTS), self.budget.frames, self.seed)
-        curve = self._curve(learner.policy)
-        callbacks = [*learner.callbacks(cases), *self.callbacks(learner)]
-        reserve = 0
-        if self.delivery == "tested":
-            delivery = Delivery(learner, env, cases, curve, self.folder)
-            callbacks.append(delivery)
-            reserve = delivery.reserve
-        return Experiment(
-            learner,
-            rollout,
-            self.budget.frames,
-            self.folder,
-            logger=self.logger() if self.logger is not None else None,
-            watch=self.watch,
-            checkpoint_every=self.budget.checkpoint_every,
-            callbacks=callbacks,
-            curve=curve,
-            cases=cases,
-            reserve=reserve,
-            before=before,
-            identity=self.identity,
-            stages=self.budget.stages,
-        )
-
-    def _init_file(self) -> Path:
-        """Return the run's own copy of the policy that it begins with."""
-        copy = self.folder / INIT
-        if not copy.exists():
-            checkpoint.save(checkpoint.load(weights_file(Path(self.init or ""))), copy)
-        return copy
-
-    def _curve(self, policy: TensorDictModuleBase) -> EvaluationCurve | None:
-        """Return the evaluation curve of the run; None without cases."""
-        sizes = self.make_env.sizes
-        if EVALUATION not in sizes:
-            return None
-        chooses = self.delivery != "tested"
-        sets = sizes if chooses else [EVALUATION]
-        envs = {cases: partial(self._rows_of_policies, cases) for cases in sets}
-        return EvaluationCurve(
-            self.folder,
-            policy,
-            envs,
-            watch=self.watch,
-            points=self.budget.points,
-            batches=self.budget.batches,
-            chooses=chooses,
-        )
-
-    def _rows_of_policies(self, cases: str, policies: int) -> EnvBase:
-        """Return an env with all cases of a set for each of some policies."""
-        return self.make_env(policies * self.make_env.sizes[cases], cases)
 
     def _draw(
         self,
@@ -455,6 +382,18 @@ class Run:
         write_text(file, json.dumps(returns, indent=2))
         return returns
 
+    def require_agent(self) -> Callable[[EnvBase], Learner]:
+        """Return what makes the learner of the run for an env.
+
+        Raises:
+            UserError: for a run without an agent.
+        """
+        if self.make_learner is None:
+            raise UserError(
+                f"{self.folder} has no agent: its guide drives alone; give that guide instead"
+            )
+        return self.make_learner
+
     def load_policy(self, env: EnvBase, which: str = HANDED_OVER) -> TensorDictModuleBase:
         """Return the policy of the run for an env with its transforms.
 
@@ -465,9 +404,7 @@ class Run:
         Raises:
             UserError: if the policy is missing, damaged, or does not fit the configuration.
         """
-        make_learner = self.make_learner
-        require_agent(self.folder, has_agent=self.has_agent)
-        return self._loaded(make_learner(env).policy, env, which)  # type: ignore[misc]
+        return self._loaded(self.require_agent()(env).policy, env, which)
 
     def _loaded(
         self, policy: TensorDictModuleBase, env: EnvBase, which: str
@@ -521,7 +458,7 @@ class Run:
         The own env and tracks of the run are not built. Arguments and errors are those of
         `load_policy`; a policy that cannot act in this env is a `UserError` too.
         """
-        require_agent(self.folder, has_agent=self.has_agent)
+        self.require_agent()
         try:
             transformed = self.make_env.around(env)
             return transformed, self.load_policy(transformed, which)
@@ -555,55 +492,6 @@ class Run:
         }
 
 
-class GuideReturns:
-    """Mean return of each guide of a learner that trains its guides, with its present parameters.
-
-    A `Callback`.
-
-    Args:
-        make_env: makes the env.
-        guides: of the learner, by name.
-        each_phase: whether to measure after each phase that changed a guide, not only before and
-            after the training.
-    """
-
-    def __init__(
-        self,
-        make_env: EnvMaker,
-        guides: Mapping[str, TensorDictModuleBase],
-        *,
-        each_phase: bool = True,
-    ) -> None:
-        self.make_env, self.guides, self.each_phase = make_env, guides, each_phase
-        self.names: Sequence[str] = [f"guide/{name}" for name in guides]
-
-    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
-        """Return whether the guides have changed, or the training begins or ends."""
-        if update in (0, updates):
-            return True
-        return self.each_phase and bool(row["learner/guides_changed"])
-
-    def after_update(self, update: int) -> dict[str, float]:
-        """Return the means by their names in the log."""
-        returns = guide_returns(self.make_env, self.guides)
-        return dict(zip(self.names, returns.values(), strict=True))
-
-
-def guide_returns(
-    make_env: EnvMaker, guides: Mapping[str, TensorDictModuleBase]
-) -> dict[str, float]:
-    """Return the mean return of each guide in the cases of the curve.
-
-    It is empty without cases or guides.
-    """
-    if EVALUATION not in make_env.sizes or not guides:
-        return {}
-    env, policy = make_env.guided(make_env.sizes[EVALUATION], EVALUATION, guides)
-    with torch.random.fork_rng():
-        returns = measures(env, policy)["return"].view(len(guides), -1).mean(1)
-    return dict(zip(guide_titles(guides), returns.tolist(), strict=True))
-
-
 def trial_with_cases(trial: Trial, cases: int) -> Trial:
     """Return a trial with another number of cases.
 
@@ -618,55 +506,3 @@ def trial_with_cases(trial: Trial, cases: int) -> Trial:
         )
     evaluation = replace(trial.evaluation, cases=list(map(str, range(cases))))
     return replace(trial, evaluation=evaluation, count=cases)
-
-
-def load_weights(policy: TensorDictModuleBase, path: Path, device: str = "cpu") -> None:
-    """Load the weights of a file into a policy.
-
-    Raises:
-        UserError: if the file is missing or damaged, does not fit the policy, or holds weights that
-            are not finite.
-    """
-    put_weights(policy, checkpoint.load(path, device), path)
-
-
-def put_weights(policy: TensorDictModuleBase, state: Any, path: Path) -> None:
-    """Put the weights that were read from a file into a policy.
-
-    Args:
-        policy: gets the weights.
-        state: what the file holds.
-        path: of the file, for messages.
-
-    Raises:
-        UserError: if they do not fit the policy, or are not finite.
-    """
-    try:
-        policy.load_state_dict(state)
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
-    except (RuntimeError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{path} does not fit the networks in {path.parent / 'config.yaml'}; one of them was "
-            "changed after the run"
-        ) from error
-    if not all(parameter.isfinite().all() for parameter in policy.parameters()):
-        raise UserError(
-            f"{path} holds weights that are NaN or infinite; train again or use another"
-        )
-
-
-def _say_units(env: EnvBase) -> None:
-    """Print in which units an action without some of its bounds is normalised."""
-    if len(env.action_keys) != 1:
-        return
-    spec = env.full_action_spec[env.action_key]
-    units = given_units(env) or units_of(spec, len(env.batch_size))
-    if units is not None and units.assumed:
-        say(f"action: {'; '.join(units.assumed)}", error=True)
-
-
-def require_agent(folder: Path, *, has_agent: bool) -> None:
-    """Raise a `UserError` for a run without an agent."""
-    if not has_agent:
-        raise UserError(f"{folder} has no agent: its guide drives alone; give that guide instead")

@@ -22,7 +22,7 @@ from coil_rl.run import checkpoint
 from coil_rl.run.curve import POLICIES
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.parts import TEST, EnvMaker, transformed
-from coil_rl.run.run import put_weights
+from coil_rl.run.weights import put_weights
 from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.worth.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, ZERO
 

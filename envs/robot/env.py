@@ -16,7 +16,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from coil_rl.envs.cone_track import SeededEnv
 from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
 from coil_rl.envs.meanings import of_cones
 from coil_rl.envs.reward import (
@@ -36,6 +35,7 @@ from coil_rl.envs.robot.perception import (
     declare_specs,
     simulated_cone_classifier,
 )
+from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.envs.track import NEVER, Track, places
 
 FINISH_RADIUS = 0.15  # m, covers the width between the cones

@@ -72,7 +72,7 @@ def draw_moment(
     )
     axes.add_patch(PathPatch(surface, fc=style.ASPHALT, ec=style.KERB, lw=0.6, zorder=1))
     ego_view.draw_field_of_view(axes, SIGHT, HALF_FIELD_OF_VIEW)
-    boundary = env.fit(cones.permute(3, 2, 1, 0), count.t())
+    boundary = env.boundaries.fit(cones.permute(3, 2, 1, 0), count.t())
     samples = frame.to_car(env.samples)[..., 0].permute(2, 1, 0).double().numpy()
     for side, name in enumerate(SIDES):
         visible = facing_up(rows(cones[0, side, : count[0, side]].t()))

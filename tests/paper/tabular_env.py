@@ -5,7 +5,7 @@ from tensordict import TensorDict
 from torch.nn import functional as F
 from torchrl.data import Binary, Categorical, Composite, OneHot, Unbounded
 
-from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.envs.seeded_env import SeededEnv
 
 
 class TabularEnv(SeededEnv):

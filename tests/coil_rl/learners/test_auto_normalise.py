@@ -13,6 +13,7 @@ import coil_rl
 from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.errors import UserError
 from coil_rl.learners.normaliser import Moments
+from coil_rl.run.training import training_of
 
 TINY = ["budget.num_envs=4", "budget.steps=16", "evaluation.cases=2", "logger=none"]
 TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
@@ -97,12 +98,12 @@ def test_decision_is_resumed_to_the_bit(tmp_path, capsys):
         overrides=[*TINY, *ON_POLICY],
     )
     run.begin()
-    experiment = run._experiment(0)
+    experiment = training_of(run, 0)
     torch.manual_seed(run.seed)
-    experiment = run._experiment(0)
+    experiment = training_of(run, 0)
     experiment.update(0.0)
     state = experiment.state_dict()
-    other = run._experiment(0)
+    other = training_of(run, 0)
     other.load_state_dict(state)
     capsys.readouterr()
     other.update(0.25)

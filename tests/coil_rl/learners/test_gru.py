@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from coil_rl.config.build import build_guides, env_maker
 from coil_rl.config.check import check
 from coil_rl.config.load import open_run
-from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.errors import UserError
 from coil_rl.learners import (
     A2C,
