@@ -284,8 +284,8 @@ class StartTest:
     held. Opposites are tried only where no guide passes. More cases are added until one passes, or
     the test would take more than its share of the frames.
 
-    Then lower gains of it are tried in further cases. One is taken if it is better by more than a
-    standard error than the best of the gains above it.
+    Then lower gains of it are tried in further cases, if that share allows for them. One is taken
+    if it is better by more than a standard error than the best of the gains above it.
 
     Args:
         anchor: the settings.
@@ -305,6 +305,7 @@ class StartTest:
     def __init__(self, anchor: Anchor, policy: nn.Module, hold: Hold, cases: Cases) -> None:
         self.anchor, self.policy, self.hold, self.cases = anchor, policy, hold, cases
         self.returns: dict[tuple[float, ...], Tensor] = {}  # by the weights
+        self.steps: dict[tuple[float, ...], int] = {}  # of the episodes with these weights
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
         """Return whether the training has not begun."""
@@ -333,11 +334,12 @@ class StartTest:
         self, guides: Sequence[Any], opposites: Sequence[Any], new: tuple[float, ...]
     ) -> tuple[float, ...]:
         """Return the weights of the best guide or opposite that passes; those of none else."""
-        done = 0
+        done, per_case = 0, 0.0
         for total in BARS:
-            before = self.cases.steps
-            self.cases.renew(total - done)
-            done = total
+            more, before = total - done, self.cases.steps
+            if not self._affordable(per_case * more):
+                break
+            self.cases.renew(more)
             for each in (new, *guides):
                 self._act(each)
             if found := self._passing(guides, new):
@@ -346,27 +348,29 @@ class StartTest:
                 self._act(each)
             if found := self._passing(opposites, new):
                 return found
-            if not self._affordable(self.cases.steps - before):
-                break
+            done, per_case = total, (self.cases.steps - before) / more
         return new
 
     def _best_gain(self, held: tuple[float, ...]) -> tuple[float, ...]:
-        """Return the best gain of held weights."""
+        """Return the best gain of held weights; these where the frames do not allow for a test."""
         lower = [tuple(gain * value for value in held) for gain in self.anchor.gains]
-        del self.returns[held]  # all gains are compared in the same new cases
+        # With a lower gain episodes are assumed to be as long.
+        per_case = (1 + len(lower)) * self.steps[held] / len(self.returns[held])
         done, best = 0, held
         for total in GAIN_CASES:
-            before = self.cases.steps
-            self.cases.renew(total - done)
-            done = total
+            more, before = total - done, self.cases.steps
+            if not self._affordable(per_case * more):
+                break
+            if done == 0:
+                del self.returns[held]  # all gains are compared in the same new cases
+            self.cases.renew(more)
             for each in (held, *lower):
                 self._act(each)
             best = held
             for each in lower:
                 if self._clear(each, best, GAIN_ERRORS):
                     best = each
-            if not self._affordable((self.cases.steps - before) * (GAIN_CASES[-1] / done - 1)):
-                break
+            done, per_case = total, (self.cases.steps - before) / more
         return best
 
     def _affordable(self, steps: float) -> bool:
@@ -376,7 +380,9 @@ class StartTest:
     def _act(self, weights: tuple[float, ...]) -> None:
         """Add the returns of the policy with some weights in the present cases."""
         self.hold.set(weights)
+        before = self.cases.steps
         returns = self.cases.returns(self.policy, sampled=not any(weights))
+        self.steps[weights] = self.steps.get(weights, 0) + self.cases.steps - before
         known = self.returns.get(weights)
         self.returns[weights] = returns if known is None else torch.cat([known, returns])
 

@@ -94,10 +94,13 @@ class Delivery:
         """Return whether the training is over."""
         return update == updates > 0
 
-    @property
     def reserve(self) -> int:
-        """Frames that are kept for the test."""
-        return math.ceil(SHARE * self.cases.frames)
+        """Return the frames that are kept for the test, once the start test is over.
+
+        What that test took beyond the same share is missing here.
+        """
+        share = math.ceil(SHARE * self.cases.frames)
+        return max(min(share, 2 * share - self.cases.steps), 0)
 
     def after_update(self, update: int) -> dict[str, float]:
         """Test, hand over, and return the mean returns by name."""
@@ -154,21 +157,21 @@ class Delivery:
 
         An earlier policy is left out where the frames do not allow for it.
         """
-        names, returns = list(candidates), dict[str, Tensor]()
+        names, returns, reserve = list(candidates), dict[str, Tensor](), self.reserve()
         self.cases.begin()
         begun, count = self.cases.steps, FIRST_CASES
         while count > 0:
             self.cases.renew(count)
             for name in names:
                 with_one_more = (self.cases.steps - begun) * (1 + 1 / max(len(returns), 1))
-                if name == "earlier" and name not in returns and with_one_more > self.reserve:
+                if name == "earlier" and name not in returns and with_one_more > reserve:
                     continue
                 policy = policy_of(candidates[name], self.learner, self.env)
                 known = returns.get(name, torch.empty(0))
                 returns[name] = torch.cat([known, self.cases.returns(policy)])
             names = list(returns)
             done, taken = len(returns["last"]), self.cases.steps - begun
-            affordable = int(self.reserve * done / taken)  # as long as those so far
+            affordable = int(reserve * done / taken)  # as long as those so far
             count = min(affordable, MOST_CASES) - done
         self.learner.policy.load_state_dict(last)
         return returns

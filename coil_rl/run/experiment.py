@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
@@ -50,7 +50,8 @@ class Experiment:
             its numbers are columns of the log. One without acts after the row was logged.
         curve: keeps policies and evaluates them; a callback that the log has columns of.
         cases: in which callbacks compare policies; their steps are frames. None: there are none.
-        reserve: frames that are kept for a test at the end.
+        reserve: returns the frames that are kept for a test at the end, once the tests before the
+            first update are over. None: there is no such test.
         before: frames that were taken before the run, by what prepared it.
         identity: values of the configuration, which a checkpoint keeps and a resumed run must have.
         stages: earlier lengths of a run that was made longer, in frames.
@@ -69,7 +70,7 @@ class Experiment:
     callbacks: Sequence[Callback] = ()
     curve: EvaluationCurve | None = None
     cases: TrainingCases | None = None
-    reserve: int = 0
+    reserve: Callable[[], int] | None = None
     before: int = 0
     identity: Mapping[str, Any] = field(default_factory=dict)
     stages: Sequence[int] = ()
@@ -109,9 +110,10 @@ class Experiment:
         What was taken before, what tests have taken and what is kept for the last one is left out
         of the frames. At least one further update is left.
         """
+        kept = 0 if self.reserve is None else self.reserve()
         for frames in (*self.stages, self.frames):
             if frames not in self.ends:
-                taken = self.before + self.tested + self.reserve
+                taken = self.before + self.tested + kept
                 updates = math.ceil((frames - taken) / self.rollout.frames)
                 self.ends[frames] = max(updates, self.updates + 1)
         if self.curve is not None:
@@ -180,7 +182,7 @@ class Experiment:
                     self._act(row)
         policy = self.learner.policy.state_dict()
         checkpoint.save(policy, self.folder / "policy_last.pt")
-        if self.curve is None and not self.reserve:
+        if self.curve is None and self.reserve is None:
             checkpoint.save(policy, self.folder / "policy_best.pt")
         return self.metrics.rows
 

@@ -48,7 +48,7 @@ def training_of(run: Run, before: int) -> Experiment:
     cases = TrainingCases(partial(run.make_env, cases=TESTS), run.budget.frames, run.seed)
     curve = _curve_of(run, learner.policy)
     callbacks = [*learner.callbacks(cases), *run.callbacks(learner)]
-    reserve = 0
+    reserve = None
     if run.delivery == "tested":
         delivery = Delivery(learner, env, cases, curve, run.folder)
         callbacks.append(delivery)

@@ -301,6 +301,22 @@ def test_start_test_ends_when_it_would_take_more_than_its_share():
     assert cases.steps == 600
 
 
+@pytest.mark.parametrize("frames", [1_000, 12_000, 18_000, 30_000, 50_000, 200_000])
+@pytest.mark.parametrize("gain", [100.0, 0.3, -100.0], ids=["good", "even", "reversed"])
+def test_start_test_takes_no_more_than_its_share_after_its_first_cases(gain, frames):
+    cases = Returns(lambda weights: gain * weights[0], frames=frames)
+    decided(None, cases=cases)
+    assert cases.steps <= max(600, 0.05 * frames)
+
+
+def test_lower_gains_are_not_tried_where_the_share_does_not_allow_for_them():
+    cases = Returns(lambda weights: 100 - 60 * abs(weights[0] - 0.5) if weights[0] else 0)
+    cases.frames = 30_000
+    weights, numbers, _ = decided(None, cases=cases)
+    assert weights == [1], "four cases of three gains would take 1,200 steps more"
+    assert numbers["start/guide"] == pytest.approx(70, abs=2), "of the cases that there are"
+
+
 def test_lower_gain_is_taken_only_if_it_is_better():
     weights, *_ = decided(lambda weights: 100 - 60 * abs(weights[0] - 0.5) if weights[0] else 0)
     assert weights == [0.5]

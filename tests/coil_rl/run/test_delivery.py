@@ -15,7 +15,7 @@ from coil_rl.guides.simple import FollowAdvice
 from coil_rl.report.runs import DELIVERY
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
-from coil_rl.run.delivery import GUIDE, GuideActs, handed_over
+from coil_rl.run.delivery import GUIDE, Delivery, GuideActs, handed_over
 from coil_rl.run.parts import TESTS
 
 pytest.importorskip("gymnasium.envs.classic_control")
@@ -91,6 +91,14 @@ def test_every_step_is_a_frame_and_the_log_has_the_parts(guide_wins):
     assert last["frames"] < 6000 + 200, "within the budget but for a part of a batch"
     assert last["frames/tests"] <= 0.1 * 6000
     assert float(rows[-1]["guide/calls"]) > last["frames"]
+
+
+@pytest.mark.parametrize(("taken", "kept"), [(0, 50), (50, 50), (70, 30), (120, 0)])
+def test_test_at_the_end_gets_what_the_start_test_leaves_of_a_tenth(taken, kept, tmp_path):
+    cases = TrainingCases(build=GuideActs, frames=1000)
+    cases.steps = taken
+    delivery = Delivery(learner=None, env=None, cases=cases, curve=None, folder=tmp_path)
+    assert delivery.reserve() == kept
 
 
 def test_learned_policy_is_handed_over_where_it_is_better(tmp_path):
