@@ -197,11 +197,16 @@ class AnchoredSample(Sample):
     def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
         """Write the own part and the action."""
         tensordict = super().forward(tensordict, *args, **options)
-        space, own = self.hold.space, tensordict[UNCLIPPED]
-        pull = self.hold.pull(tensordict[self.anchor.advice_key]).to(own.dtype)
+        self.write_action(tensordict)
+        return tensordict
+
+    def write_action(self, entries: Any) -> None:
+        """Write the action of the own part and the advice in some entries [*batch]."""
+        space, own = self.hold.space, entries[UNCLIPPED]
+        pull = self.hold.pull(entries[self.anchor.advice_key]).to(own.dtype)
         reach = torch.where(self.hold.held, self.anchor.reach, 1.0).to(own.dtype)
         action = space.denormalise(pull + reach * space.normalise(own))
-        return tensordict.set(self.action_key, space.clamp(action))
+        entries.set(self.action_key, space.clamp(action))
 
 
 class AnchoredHead(nn.Module):

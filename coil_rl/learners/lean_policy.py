@@ -18,10 +18,12 @@ from torch.distributions import Categorical
 from torch.nn import functional as F
 from torchrl.modules import IndependentNormal, TanhNormal
 
+from coil_rl.learners.anchor import AnchoredInputs, AnchoredSample
 from coil_rl.learners.networks import FastTensorDictModule
 from coil_rl.learners.normaliser import Normaliser
 from coil_rl.learners.sampling import NOISE, ClippedNormal, Sample
 
+INPUTS = (Normaliser, AnchoredInputs)  # modules that change what networks read
 LOG_ROOT = math.log(math.sqrt(2 * math.pi))  # of a normal density
 
 
@@ -187,7 +189,7 @@ class LeanPolicy:
         policy: for which `covers` is true. It keeps the weights.
 
     Attributes:
-        inputs: the modules that normalise what is observed.
+        inputs: the modules that change what the network reads.
         head: the module that gives the parameters of the distribution.
         density: the distribution.
     """
@@ -203,8 +205,9 @@ class LeanPolicy:
     def covers(policy: Any) -> bool:
         """Return whether a policy has this form.
 
-        It has if it is a network after at most a normaliser, without a memory, guides or an anchor,
-        for numbers that are squashed to between -1 and 1, clipped or unbounded, or for one choice.
+        It has if it is a network after at most a normaliser and shown advice, without a memory, for
+        numbers that are squashed to between -1 and 1, clipped or unbounded, or for one choice. It
+        may be anchored.
         """
         if type(policy) is not ProbabilisticTensorDictSequential:
             return False
@@ -212,9 +215,9 @@ class LeanPolicy:
         kinds = [type(module) for module in modules]
         return (
             len(kinds) >= 2
-            and all(kind is Normaliser for kind in kinds[:-2])
+            and all(kind in INPUTS for kind in kinds[:-2])
             and kinds[-2] is FastTensorDictModule
-            and kinds[-1] in (Sample, ClippedNormal)
+            and kinds[-1] in (Sample, ClippedNormal, AnchoredSample)
             and density_of(modules[-1]) is not None
         )
 
@@ -225,15 +228,14 @@ class LeanPolicy:
         parameters = self.density.parameters(entries)
         sample, log_prob = self.density.draw(parameters, entries.get(NOISE))
         entries |= {self.last.sample_key: sample, "action_log_prob": log_prob}
-        if isinstance(self.last, ClippedNormal):
-            entries[self.last.action_key] = self.last.clipped(sample)
+        self.last.write_action(entries)
         return entries
 
 
 def networks_of(critic: Any) -> list[FastTensorDictModule] | None:
-    """Return the modules of a critic after its normaliser; None if it has others."""
+    """Return the networks of a critic after what changes its inputs; None if it has others."""
     modules = list(critic.module) if type(critic) is TensorDictSequential else [critic]
     kinds = {type(module) for module in modules}
-    if not kinds <= {Normaliser, FastTensorDictModule}:
+    if not kinds <= {*INPUTS, FastTensorDictModule}:
         return None
     return [module for module in modules if isinstance(module, FastTensorDictModule)]

@@ -43,6 +43,13 @@ class Sample(SafeProbabilisticModule):
             log_prob_key="action_log_prob",
         )
 
+    def write_action(self, entries: Any) -> None:
+        """Write the action of the sample in some entries, unless the sample is the action.
+
+        Args:
+            entries: a TensorDict or `Entries`, [*batch].
+        """
+
     def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
         """Write the sample and its logarithmic probability."""
         noise = tensordict.get(NOISE, None)
@@ -81,8 +88,9 @@ class ClippedNormal(Sample):
     def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
         """Write the sample and the action."""
         tensordict = super().forward(tensordict, *args, **options)
-        return tensordict.set(self.action_key, self.clipped(tensordict[UNCLIPPED]))
+        self.write_action(tensordict)
+        return tensordict
 
-    def clipped(self, sample: Tensor) -> Tensor:
-        """Return the action of a sample [*batch, *event]."""
-        return sample.clamp(self.low, self.high)
+    def write_action(self, entries: Any) -> None:
+        """Write the action, the clipped sample, of some entries [*batch]."""
+        entries.set(self.action_key, entries[UNCLIPPED].clamp(self.low, self.high))

@@ -4,15 +4,17 @@ import pytest
 import torch
 import worlds
 from any_env import AnyEnv
+from tensordict.nn import TensorDictModule
 from torchrl.data import Unbounded
 from torchrl.envs import TransformedEnv
 
 from coil_rl import GymnasiumEnv
 from coil_rl.learners import A2C, PPO, Anchor, KickstartLoss
 from coil_rl.run.rollout import Rollout
-from coil_rl.transforms import NormalisedAction, Takeover
+from coil_rl.transforms import GuideActions, NormalisedAction, Takeover
 
 ADVISED = ["observation", "guide_action"]
+ANCHORED = {"in_keys": ADVISED, "anchor": Anchor()}
 
 
 def pendulums():
@@ -21,6 +23,11 @@ def pendulums():
 
 def poles():
     return GymnasiumEnv("CartPole-v1", 3)
+
+
+def advised_poles():
+    leans = TensorDictModule(lambda state: (state[..., 2] > 0).long(), ["observation"], ["action"])
+    return TransformedEnv(poles(), GuideActions({"leans": leans}))
 
 
 def updated(make_env, lean, options):
@@ -46,6 +53,10 @@ def updated(make_env, lean, options):
         pytest.param(poles, {"normalise": "auto", "entropy": 0.01}, id="choice"),
         pytest.param(lambda: AnyEnv(action=Unbounded((2, 2))), {"entropy": 0.01}, id="unbounded"),
         pytest.param(worlds.cones, {"action_scale": 0.5, "clip": 0.01}, id="much clipped"),
+        pytest.param(worlds.cones, ANCHORED, id="anchored"),
+        pytest.param(worlds.cones, ANCHORED | {"normalise": True}, id="anchored, normalised"),
+        pytest.param(worlds.cones, ANCHORED | {"squash": False}, id="anchored, clipped"),
+        pytest.param(advised_poles, ANCHORED, id="anchored choice"),
     ],
 )
 def test_lean_update_gives_the_same_weights_to_the_bit(make_env, options):
@@ -62,7 +73,6 @@ def test_what_a_lean_update_does_not_know_keeps_the_loss_of_torchrl():
     assert PPO(worlds.cones()).lean is not None
     assert PPO(worlds.cones(), entropy=0.1).lean is None  # it is estimated from samples
     assert PPO(worlds.cones(), auxiliary=[KickstartLoss()]).lean is None
-    assert PPO(worlds.cones(), ADVISED, anchor=Anchor()).lean is None
     assert PPO(worlds.cones(Takeover(0.5))).lean is None
     assert A2C(worlds.cones()).lean is None
     assert PPO(worlds.carts(categorical=False)).lean is None  # a one-hot action

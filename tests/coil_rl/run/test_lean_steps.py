@@ -7,6 +7,7 @@ import pytest
 import torch
 import worlds
 from any_env import AnyEnv
+from tensordict.nn import TensorDictModule
 from torchrl.data import MultiCategorical
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 
@@ -24,6 +25,15 @@ ADVISED = ["observation", "guide_action"]
 def gym(name, **options):
     env = GymnasiumEnv(name, 3, max_steps=9, **options)
     return TransformedEnv(env, Compose(RewardSum(), NormalisedAction()))
+
+
+def advised_pendulum():
+    brakes = TensorDictModule(
+        lambda state: (-state[..., 2:]).clamp(-2, 2), ["observation"], ["action"]
+    )
+    env = gym("Pendulum-v1")
+    env.append_transform(GuideActions({"brakes": brakes}))
+    return env
 
 
 def cones():
@@ -56,6 +66,7 @@ def collected(make_env, correlation, lean, options):
     [
         pytest.param(cones, {"in_keys": ADVISED}, id="advice"),
         pytest.param(cones, {"in_keys": ADVISED, "squash": False}, id="clipped"),
+        pytest.param(advised_pendulum, {"in_keys": ADVISED, "anchor": Anchor()}, id="anchored"),
         pytest.param(partial(gym, "Pendulum-v1"), {"normalise": True}, id="pendulum"),
         pytest.param(partial(gym, "CartPole-v1"), {"normalise": "auto"}, id="cart pole"),
     ],
@@ -86,8 +97,6 @@ def test_what_lean_steps_do_not_know_keeps_the_steps_of_torchrl():
     assert not covered(bare(GuideActions({"guide": SplineGuide()}), Takeover(0.5)))
     gru = Gru(state=4)
     assert not covered(bare(*gru.env_transforms()), network=gru)
-    advised = bare(GuideActions({"guide": SplineGuide()}))
-    assert not covered(advised, in_keys=ADVISED, anchor=Anchor())
     assert not covered(AnyEnv(action=MultiCategorical([2, 3])))
     assert not covered(AnyEnv(agents=True))
     assert not covered(worlds.carts())  # an env of TorchRL
