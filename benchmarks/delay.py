@@ -20,8 +20,6 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import DictConfig, open_dict
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 
 from coil_rl.config.build import assemble
 from coil_rl.config.saved import read_config
@@ -30,6 +28,7 @@ from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.statistics import mean_interval
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.parts import TEST
+from coil_rl.run.policy_batch import PoliciesBeside
 from coil_rl.run.run import Run
 
 LAGS = {"0": (0, 0), "0.5": (0, 1), "1": (1, 1), "2": (2, 2)}  # least and most steps, by turns
@@ -48,28 +47,6 @@ COLUMNS = {
     "smoothness": ("smoothness", ".3f"),
     "by_seed": ("crashed of 20, by seed", ""),
 }
-
-
-class PoliciesBeside(TensorDictModuleBase):
-    """Several policies that act side by side, each on its own rows.
-
-    Args:
-        policies: each acts on an equal part of the rows, in their order.
-    """
-
-    def __init__(self, policies: Sequence[TensorDictModuleBase]) -> None:
-        self.in_keys, self.out_keys = list(policies[0].in_keys), ["action"]
-        super().__init__()
-        self.policies = list(policies)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the `action` of each row."""
-        parts = tensordict.chunk(len(self.policies))
-        actions = [
-            policy(part.clone(recurse=False))["action"]
-            for policy, part in zip(self.policies, parts, strict=True)
-        ]
-        return tensordict.set("action", torch.cat(actions))
 
 
 def runs_by_label(folder: Path) -> dict[str, list[Path]]:
@@ -121,7 +98,8 @@ def driven(
     runs = [late_run(folder, lags, missing, count) for folder in folders]
     trial = runs[0].trial
     policies = [run.policy(trial.env(ROWS_OF_SPECS)) for run in runs]
-    result = trial.evaluation.run(trial.env(len(runs) * count), PoliciesBeside(policies))
+    beside = PoliciesBeside(policies, [False] * len(policies))
+    result = trial.evaluation.run(trial.env(len(runs) * count), beside)
     return [result[index * count : (index + 1) * count] for index in range(len(runs))]
 
 

@@ -94,6 +94,7 @@ class DrivingTasksEnv(ConeTrackEnv):
     """
 
     reward_terms: ClassVar[tuple[str, ...]] = (*TERMS, *PositionWeights._fields)
+    draws_in_steps: ClassVar[bool] = True  # the changes of tasks
 
     def __init__(
         self,

@@ -1,6 +1,6 @@
 """An env that draws all its random numbers from a generator of its own."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -14,7 +14,10 @@ class SeededEnv(EnvBase):
         generator: of all random numbers.
         different: number of rows that draw where their episodes begin, of B; row i begins as row
             `i % different`. None: all rows draw.
+        draws_in_steps: whether rows that begin alike and act alike draw different numbers later.
     """
+
+    draws_in_steps: ClassVar[bool] = False
 
     generator: torch.Generator
     different: int | None = None

@@ -21,6 +21,7 @@ the policy; what acts by them (`ShownAdvice`, `AnchoredSample`, `AnchoredHead`, 
 and `StartTest`, which sets them.
 """
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -345,12 +346,10 @@ class StartTest:
             if not self._affordable(per_case * more):
                 break
             self.cases.renew(more)
-            for each in (new, *guides):
-                self._act(each)
+            self._act([new, *guides])
             if found := self._passing(guides, new):
                 return found
-            for each in opposites:
-                self._act(each)
+            self._act(opposites)
             if found := self._passing(opposites, new):
                 return found
             done, per_case = total, (self.cases.steps - before) / more
@@ -369,8 +368,7 @@ class StartTest:
             if done == 0:
                 del self.returns[held]  # all gains are compared in the same new cases
             self.cases.renew(more)
-            for each in (held, *lower):
-                self._act(each)
+            self._act([held, *lower])
             best = held
             for each in lower:
                 if self._clear(each, best, GAIN_ERRORS):
@@ -382,14 +380,23 @@ class StartTest:
         """Return whether the test may take that many further steps."""
         return self.cases.steps + steps <= self.anchor.share * self.cases.frames
 
-    def _act(self, weights: tuple[float, ...]) -> None:
-        """Add the returns of the policy with some weights in the present cases."""
-        self.hold.set(weights)
-        before = self.cases.steps
-        returns = self.cases.returns(self.policy, sampled=not any(weights))
-        self.steps[weights] = self.steps.get(weights, 0) + self.cases.steps - before
-        known = self.returns.get(weights)
-        self.returns[weights] = returns if known is None else torch.cat([known, returns])
+    def _act(self, each: Sequence[tuple[float, ...]]) -> None:
+        """Add the returns of the policy with each of some weights in the present cases."""
+        policies = [self._with(weights) for weights in each]
+        found = self.cases.compared(policies, [not any(weights) for weights in each])
+        for weights, returns, steps in zip(each, found, self.cases.taken, strict=True):
+            known = self.returns.get(weights, returns.new_empty(0))
+            self.returns[weights] = torch.cat([known, returns])
+            self.steps[weights] = self.steps.get(weights, 0) + steps
+
+    def _with(self, weights: tuple[float, ...]) -> Any:
+        """Return a copy of the policy with some weights."""
+        policy = copy.deepcopy(self.policy)
+        hold = hold_of(policy)
+        if hold is None:
+            raise RuntimeError("the copy of an anchored policy has no weights")
+        hold.set(weights)
+        return policy
 
     def _passing(self, candidates: Sequence[Any], new: tuple[float, ...]) -> Any:
         """Return the best of some weights that pass; None if none does."""

@@ -1,7 +1,7 @@
 """What every learner has: the base class `Learner`, and what a run calls between its updates."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
@@ -103,10 +103,12 @@ class Cases(Protocol):
     Attributes:
         frames: of the whole run.
         steps: that all comparisons have taken so far.
+        taken: of these the steps of each policy in the last comparison.
     """
 
     frames: int
     steps: int
+    taken: list[int]
 
     def begin(self) -> None:
         """Begin a comparison, which does not depend on those before."""
@@ -114,10 +116,12 @@ class Cases(Protocol):
     def renew(self, count: int) -> None:
         """Draw that many new cases."""
 
-    def returns(self, policy: Callable[..., Any], *, sampled: bool = False) -> Tensor:
-        """Return the return of a policy in each of the present cases, [C].
+    def compared(
+        self, policies: Sequence[TensorDictModuleBase], sampled: Sequence[bool] | None = None
+    ) -> list[Tensor]:
+        """Return the returns of policies in the present cases, [C] each.
 
         Args:
-            policy: writes the action.
-            sampled: whether its actions are sampled, as in training.
+            policies: each writes the action.
+            sampled: whether each samples its actions, as in training; None: none does.
         """

@@ -1,10 +1,11 @@
 """The cases of a training in which policies are compared; their steps are frames."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
@@ -12,17 +13,20 @@ from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, episodes
+from coil_rl.run.policy_batch import PoliciesBeside, memory_keys
 from coil_rl.transforms import GuideActions
+from coil_rl.transforms.guide_transform import SeededGenerator
 
 SEEDS = 2**31  # seeds of cases are below
+SOME_ROWS = 2  # of an env that is only looked at; some ways to degrade advice need several
 
 
 @dataclass(eq=False)
 class TrainingCases:
     """Cases of a training in which policies are compared, the `Cases` of its learner.
 
-    They are drawn as the episodes of the training are. All policies act in them one after the other
-    in an env of the same seed, so a difference of two returns is that of the policies.
+    They are drawn as the episodes of the training are. All policies act in them from the same seed,
+    so a difference of two returns is that of the policies.
 
     Args:
         build: makes an env of a number of rows.
@@ -31,6 +35,7 @@ class TrainingCases:
 
     Attributes:
         steps: that all comparisons have taken so far.
+        taken: of these the steps of each policy in the last comparison.
         calls: number of actions that guides were asked for.
     """
 
@@ -43,7 +48,8 @@ class TrainingCases:
     def __post_init__(self) -> None:
         self.generator = torch.Generator().manual_seed(self.seed)
         self.env: EnvBase | None = None
-        self.env_seed = 0
+        self.env_seed, self.count = 0, 0
+        self.taken: list[int] = []
 
     def begin(self) -> None:
         """Begin a comparison: forget the env of the one before, of which nothing may be left."""
@@ -58,16 +64,27 @@ class TrainingCases:
                 for which `can_copy` holds has more than one.
         """
         self.env_seed = int(torch.randint(SEEDS, (), generator=self.generator))
-        self._build(count * copies)
-        seeded = seeded_env(self.env)
-        if seeded is not None:
-            seeded.different = count if copies > 1 else None
+        self.count = count
+        self._copy(copies)
 
     def can_copy(self) -> bool:
-        """Return whether several rows of the env can have the same case."""
+        """Return whether several rows of the env can have the same case.
+
+        They cannot where rows that begin alike draw different numbers later.
+        """
         if self.env is None:
-            self._build(1)
-        return seeded_env(self.env) is not None
+            self._build(SOME_ROWS)
+        seeded = seeded_env(self.env)
+        if seeded is None or seeded.draws_in_steps or self.env is None:
+            return False
+        return not any(isinstance(part, SeededGenerator) for part in self.env.modules())
+
+    def _copy(self, copies: int) -> None:
+        """Give each of the present cases that many rows."""
+        self._build(self.count * copies)
+        seeded = seeded_env(self.env)
+        if seeded is not None:
+            seeded.different = self.count if copies > 1 else None
 
     def _build(self, rows: int) -> None:
         """Make the env with that many rows, unless it has them."""
@@ -75,9 +92,48 @@ class TrainingCases:
             with torch.random.fork_rng():
                 self.env = self.build(rows)
 
+    def compared(
+        self, policies: Sequence[TensorDictModuleBase], sampled: Sequence[bool] | None = None
+    ) -> list[Tensor]:
+        """Return the returns of policies in the present cases, [C] each.
+
+        They act side by side in the rows of one env, if its rows can have the same case and no
+        policy has a memory, and else one after the other.
+
+        Args:
+            policies: each writes the action.
+            sampled: whether each samples its actions, as in training; None: none does.
+        """
+        sampled = [False] * len(policies) if sampled is None else sampled
+        if len(policies) > 1 and self._can_act_beside(policies):
+            self._copy(len(policies))
+            totals = self._acted(PoliciesBeside(policies, sampled), sampled=False)
+            self.taken = [int(part.sum()) for part in totals.steps.split(self.count)]
+            return list(totals.results()["return"].split(self.count))
+        self._copy(1)
+        self.taken, returns = [], []
+        for policy, samples in zip(policies, sampled, strict=True):
+            totals = self._acted(policy, sampled=samples)
+            self.taken.append(int(totals.steps.sum()))
+            returns.append(totals.results()["return"])
+        return returns
+
+    def _can_act_beside(self, policies: Sequence[TensorDictModuleBase]) -> bool:
+        """Return whether policies can act side by side in one env."""
+        return (
+            self.can_copy()
+            and self.env is not None
+            and self.env.action_key == "action"
+            and not any(memory_keys(policy) for policy in policies)
+        )
+
+    def returns(self, policy: TensorDictModuleBase) -> Tensor:
+        """Return the return of a policy in each row of the present cases, [rows]."""
+        return self._acted(policy, sampled=False).results()["return"]
+
     @torch.no_grad()
-    def returns(self, policy: Callable[..., Any], *, sampled: bool = False) -> Tensor:
-        """Return the return of a policy in each of the present cases, [C]."""
+    def _acted(self, policy: TensorDictModuleBase, *, sampled: bool) -> Totals:
+        """Return the totals of a policy in the rows of the present cases, and count its steps."""
         if self.env is None:
             raise RuntimeError("there are no cases yet; call renew first")
         totals = Totals({"return": Measure("episode_reward", "last")})
@@ -87,12 +143,15 @@ class TrainingCases:
             progress(unit="step", desc="test", leave=False, mininterval=0.5) as bar,
         ):
             self.env.set_seed(self.env_seed)
+            for number, part in enumerate(self.env.modules()):
+                if isinstance(part, SeededGenerator):  # of a transform: the env does not seed it
+                    part.generator.manual_seed(self.env_seed + number)
             torch.manual_seed(self.env_seed)
             for after, running in episodes(self.env, policy, sampled=sampled, tick=bar.update):
                 totals.add(after, running)
         self.steps += int(totals.steps.sum())
         self.calls += guide_calls(self.env) - before
-        return totals.results()["return"]
+        return totals
 
     def state_dict(self) -> dict[str, Any]:
         """Return what later comparisons depend on."""

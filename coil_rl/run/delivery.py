@@ -7,6 +7,7 @@ the highest mean return is handed over. A policy that holds a guide is compared 
 policy instead. None of these cases is in the evaluation curve or in the table.
 """
 
+import copy
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -109,7 +110,7 @@ class Delivery:
         earlier = self._earlier(update)
         if earlier is not None:
             candidates["earlier"] = checkpoint.load(earlier)
-        returns = self._tested(candidates, last)
+        returns = self._tested(candidates)
         means = {name: float(values.mean()) for name, values in returns.items()}
         chosen = max(means, key=lambda name: means[name])
         cases = len(returns["last"])
@@ -152,29 +153,39 @@ class Delivery:
         titles = guide_titles(found[0].names) if found else []
         return {title: {GUIDE: torch.tensor(index)} for index, title in enumerate(titles)}
 
-    def _tested(self, candidates: Mapping[str, Any], last: dict[str, Any]) -> dict[str, Tensor]:
+    def _tested(self, candidates: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return the returns of the candidates in the same new cases, [C] each.
 
         An earlier policy is left out where the frames do not allow for it.
         """
-        names, returns, reserve = list(candidates), dict[str, Tensor](), self.reserve()
+        returns, reserve = dict[str, Tensor](), self.reserve()
+        policies = {
+            name: policy_of(state, self.learner, self.env) for name, state in candidates.items()
+        }
+        earlier = policies.pop("earlier", None)
         self.cases.begin()
         begun, count = self.cases.steps, FIRST_CASES
         while count > 0:
             self.cases.renew(count)
-            for name in names:
-                with_one_more = (self.cases.steps - begun) * (1 + 1 / max(len(returns), 1))
-                if name == "earlier" and name not in returns and with_one_more > reserve:
-                    continue
-                policy = policy_of(candidates[name], self.learner, self.env)
-                known = returns.get(name, torch.empty(0))
-                returns[name] = torch.cat([known, self.cases.returns(policy)])
-            names = list(returns)
-            done, taken = len(returns["last"]), self.cases.steps - begun
+            self._act(policies, returns)
+            taken = self.cases.steps - begun
+            if earlier is not None:
+                # It is as long as the others, as far as is known.
+                if taken * (1 + 1 / len(policies)) <= reserve:
+                    self._act({"earlier": earlier}, returns)
+                    policies["earlier"] = earlier
+                    taken = self.cases.steps - begun
+                earlier = None
+            done = len(returns["last"])
             affordable = int(reserve * done / taken)  # as long as those so far
             count = min(affordable, MOST_CASES) - done
-        self.learner.policy.load_state_dict(last)
         return returns
+
+    def _act(self, policies: Mapping[str, Any], returns: dict[str, Tensor]) -> None:
+        """Add the returns of policies in the present cases."""
+        found = self.cases.compared(list(policies.values()))
+        for name, more in zip(policies, found, strict=True):
+            returns[name] = torch.cat([returns.get(name, more.new_empty(0)), more])
 
     def _report(
         self, chosen: str, means: Mapping[str, float], cases: int, earlier: Path | None
@@ -191,18 +202,19 @@ class Delivery:
 
 
 def policy_of(state: dict[str, Any], learner: Learner, env: EnvBase) -> TensorDictModuleBase:
-    """Return the policy that a file of weights stands for: a guide, or the learner's with them.
+    """Return the policy that a file of weights stands for: a guide, or a copy of the learner's.
 
     Args:
         state: of the file.
-        learner: has the policy, which gets the weights.
+        learner: has the policy, which stays as it is.
         env: with the transforms of the run.
     """
     guide = guide_of(state, env)
     if guide is not None:
         return guide
-    learner.policy.load_state_dict(state)
-    return learner.policy
+    policy = copy.deepcopy(learner.policy)
+    policy.load_state_dict(state)
+    return policy
 
 
 def guide_of(state: Mapping[str, Any], env: EnvBase) -> GuideActs | None:

@@ -11,7 +11,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs.utils import exploration_type
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from coil_rl.compiled import record
 
@@ -111,3 +111,32 @@ class PoliciesInTurn(TensorDictModuleBase):
         for key in self.out_keys:
             tensordict.set(key, torch.cat([part[key] for part in parts]))
         return tensordict
+
+
+class PoliciesBeside(TensorDictModuleBase):
+    """Any policies without a memory, side by side.
+
+    Each acts on its own part of the rows.
+
+    Args:
+        policies: each acts on an equal part of the rows, in their order. Their weights stay.
+        sampled: whether each samples its actions.
+    """
+
+    def __init__(self, policies: Sequence[TensorDictModuleBase], sampled: Sequence[bool]) -> None:
+        super().__init__()
+        keys = [key for policy in policies for key in policy.in_keys]
+        self.in_keys, self.out_keys = list(dict.fromkeys(keys)), ["action"]
+        # A list, so that they are no submodules.
+        self.policies = [TracedPolicy(each) if is_tensors(each) else each for each in policies]
+        kinds = {True: ExplorationType.RANDOM, False: ExplorationType.DETERMINISTIC}
+        self.kinds = [kinds[each] for each in sampled]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the `action` of the policy of each row."""
+        parts = tensordict.select(*self.in_keys).chunk(len(self.policies))
+        actions = []
+        for policy, part, kind in zip(self.policies, parts, self.kinds, strict=True):
+            with set_exploration_type(kind):
+                actions.append(policy(part)["action"])
+        return tensordict.set("action", torch.cat(actions))

@@ -9,7 +9,7 @@ not from a real robot.
 import math
 from collections.abc import Sequence
 from functools import reduce
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -86,6 +86,8 @@ class SimulatedRobotEnv(SeededEnv):
         >>> env.rollout(3, break_when_any_done=False)["next", "observation"].shape
         torch.Size([2, 3, 20])
     """
+
+    draws_in_steps: ClassVar[bool] = True  # the noise of the scans
 
     def __init__(
         self,

@@ -236,12 +236,16 @@ class Returns:
     def renew(self, count):
         self.cases = self.noise * torch.randn(count, generator=self.generator)
 
-    def returns(self, policy, *, sampled=False):
-        weights = tuple(policy.weight.tolist())
-        self.sampled[weights] = sampled
-        self.steps += 100 * len(self.cases)
-        spread = torch.randn(len(self.cases), generator=self.generator)
-        return self.of(weights) + self.cases + 0.2 * spread
+    def compared(self, policies, sampled):
+        self.taken = [100 * len(self.cases)] * len(policies)
+        self.steps += sum(self.taken)
+        returns = []
+        for policy, samples in zip(policies, sampled, strict=True):
+            weights = tuple(policy.weight.tolist())
+            self.sampled[weights] = samples
+            spread = torch.randn(len(self.cases), generator=self.generator)
+            returns.append(self.of(weights) + self.cases + 0.2 * spread)
+        return returns
 
 
 def decided(of, guides=1, action=None, cases=None, **options):

@@ -72,10 +72,10 @@ def test_comparison_leaves_policy_and_random_numbers_alone():
     before, state = torch.get_rng_state(), learner.policy.state_dict()
     copies = {name: value.clone() for name, value in state.items()}
     cases.renew(2)
-    sampled = cases.returns(learner.policy, sampled=True)
+    (sampled,) = cases.compared([learner.policy], [True])
     assert torch.equal(torch.get_rng_state(), before)
     assert all(torch.equal(value, copies[name]) for name, value in state.items())
-    assert torch.equal(cases.returns(learner.policy, sampled=True), sampled)
+    assert torch.equal(cases.compared([learner.policy], [True])[0], sampled)
     assert not torch.equal(cases.returns(learner.policy), sampled)
 
 
@@ -137,3 +137,36 @@ def test_rows_may_begin_in_the_same_cases(words):
     assert torch.equal(first[0], first[2])
     cases.renew(6)
     assert len(cases.env.reset()["observation"].reshape(6, -1).unique(dim=0)) > 2
+
+
+def test_policies_side_by_side_have_the_returns_of_each_alone():
+    cases, learner = built("env=pendulum")
+    cases.renew(3)
+    guide = GuideActs(cases.env)
+    beside = cases.compared([learner.policy, guide])
+    taken, steps = cases.taken, cases.steps
+    assert cases.env.batch_size == torch.Size([6])
+    for policy, returns, expected in zip([learner.policy, guide], beside, taken, strict=True):
+        (alone,) = cases.compared([policy])
+        torch.testing.assert_close(returns, alone, rtol=1e-3, atol=0.1)  # it is chaotic
+        assert cases.taken == [expected]
+    assert cases.steps == 2 * steps
+    assert not torch.equal(*cases.compared([learner.policy] * 2, [True, False]))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["env=pendulum", "disturb=[observation_noise]"],
+        ["env=pendulum", "disturb=[action_delay]"],
+        ["env=pendulum", "degrade=[shuffled]"],
+        ["env=simulated_robot"],
+    ],
+    ids=["noise", "delay", "shuffled advice", "noisy scans"],
+)
+def test_policies_act_in_turn_where_rows_that_begin_alike_draw_other_numbers(words):
+    cases, learner = built(*words)
+    assert not cases.can_copy()
+    cases.renew(2)
+    first, second = cases.compared([learner.policy, learner.policy])
+    assert torch.equal(first, second)
