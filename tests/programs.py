@@ -27,7 +27,6 @@ TINY = [
     "logger=none",
 ]
 
-# The smallest run of any experiment in the cone world.
 # One arm of an experiment on tasks of Gymnasium.
 TINY_ARM = [
     "budget.frames=300",
@@ -37,6 +36,7 @@ TINY_ARM = [
     "evaluation.curve.num_envs=2",
     "evaluation.curve.points=1",
 ]
+# The smallest run of any experiment in the cone world.
 TINY_SWEEP = [
     "track=generated",
     "track.train.count=2",
