@@ -196,6 +196,7 @@ def compile_graph(graph: GraphModule, arguments: Sequence[Tensor], path: Path) -
         UserError: if there is no C++ compiler or no place for the library.
     """
     import torch._inductor  # takes two seconds to import
+    from torch._inductor.cpp_builder import get_cpp_compiler
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -204,9 +205,10 @@ def compile_graph(graph: GraphModule, arguments: Sequence[Tensor], path: Path) -
             f"{path.parent} cannot be made for compiled code ({error.strerror}); "
             "set XDG_CACHE_HOME to another folder, or take compile=false"
         ) from error
-    say("compiling, once for these sizes and this machine (20 to 60 s) ...", error=True)
     examples = tuple(argument.detach() for argument in arguments)
     try:
+        get_cpp_compiler()  # otherwise a missing one is found out after most of the work
+        say("compiling, once for these sizes and this machine (20 to 60 s) ...", error=True)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             made = torch._inductor.aot_compile(graph, examples, options=OPTIONS)
