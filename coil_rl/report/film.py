@@ -37,7 +37,8 @@ class Film(Picture):
     Args:
         every: number of steps between two frames.
         frames: largest number of frames.
-        width: largest width of the frame of one policy, pixels.
+        width: largest width and height of the frame of one policy, pixels; a larger picture is
+            reduced by a whole number.
         duration: of a frame, ms.
         active: whether to make the film.
     """
@@ -73,8 +74,8 @@ class Film(Picture):
             pixels: NDArray[np.uint8] | None = env.render(row)
             if pixels is not None:
                 image = Image.fromarray(pixels).convert("RGB")
-                image.thumbnail((self.width, self.width))
-                images.append(image)
+                # Means of whole blocks take a tenth of the time of any other size.
+                images.append(image.reduce(-(-max(image.size) // self.width)))
 
     def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
         """Write the animation; nothing without frames.
