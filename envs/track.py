@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 Side = Literal["left", "right"]
@@ -129,6 +128,8 @@ class Track:
         Args:
             spacing: m, largest distance of two boundary points along the chords.
         """
+        from scipy.spatial import cKDTree  # takes a quarter of a second
+
         left, right = self.boundary("left", spacing), self.boundary("right", spacing)
         return np.asarray((left + right[cKDTree(right).query(left)[1]]) / 2)
 
@@ -269,6 +270,8 @@ def _encloses(ring: Array, point: Array) -> bool:
 
 def _first_crossing(rings: dict[Side, Array]) -> tuple[set[Side], Array] | None:
     """Return the sides and the place of the first crossing of closed polylines [P, 2], or None."""
+    from scipy.spatial import cKDTree
+
     begin = np.concatenate([rings[side] for side in SIDES])
     edge = np.concatenate([_edges(rings[side]) for side in SIDES])
     count = len(rings["left"])

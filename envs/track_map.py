@@ -14,7 +14,6 @@ import numpy as np
 import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from coil_rl.envs.constants import constant
@@ -306,6 +305,8 @@ def boundary_distances(track: Track, dtype: torch.dtype) -> NDArray[np.float64]:
         track: the track.
         dtype: of the corner of the grid.
     """
+    from scipy.spatial import cKDTree  # only tables that are not kept yet need it
+
     nodes = Grid(track, FIELD_CELL, dtype).nodes()
     distances = []
     for side in SIDES:

@@ -6,7 +6,7 @@ feedback, a planner. Those that are functions work on a whole batch and are chos
 """
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from functools import partial
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import gymnasium
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
@@ -102,7 +102,7 @@ def swing_tip(observation: Tensor) -> Tensor:
     return 2 * (observation[..., 5] > 0).long()
 
 
-class ClassicGuide(TensorDictModule):
+class ClassicGuide(TensorDictModuleBase):
     """Guide that acts by one of the functions above.
 
     Args:
@@ -111,17 +111,19 @@ class ClassicGuide(TensorDictModule):
         options: arguments of the function after the observation, by name.
     """
 
+    in_keys, out_keys = ["observation"], ["action"]
     pure = True
 
     def __init__(self, controller: str, options: Mapping[str, Any] | None = None) -> None:
         functions = (lander, energy_pump, swing_up, linear_feedback, swing_tip)
         known = {each.__name__: each for each in functions}
         check_choice(tuple(known), controller=controller)
-        super().__init__(
-            partial(known[controller], **(options or {})),
-            in_keys=["observation"],
-            out_keys=["action"],
-        )
+        super().__init__()
+        self.function: Callable[..., Tensor] = partial(known[controller], **(options or {}))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        return tensordict.set("action", self.function(tensordict["observation"]))
 
 
 class Oscillator(TensorDictModuleBase):
