@@ -12,12 +12,13 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, expand_as_right
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.measures import Measure
+from coil_rl.run.lean_steps import LeanEnv
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def evaluate_policy(
     env: EnvBase,
     policy: TensorDictModuleBase,
     *,
-    sampled: bool | Tensor = False,
+    sampled: bool = False,
     measures: Mapping[str, Measure] | None = None,
     record: Mapping[str, NestedKey] | None = None,
     cases: Sequence[str] = (),
@@ -67,8 +68,7 @@ def evaluate_policy(
     Args:
         env: of any batch size, also of none.
         policy: writes the action.
-        sampled: whether to sample actions instead of taking the deterministic ones; bool, or [B]
-            for each row.
+        sampled: whether to sample actions instead of taking the deterministic ones.
         measures: by name.
         record: entries after each step to keep, by name.
         cases: names of the cases; row i is case i modulo their number. By default rows are
@@ -173,7 +173,7 @@ def episodes(
     env: EnvBase,
     policy: TensorDictModuleBase,
     *,
-    sampled: bool | Tensor = False,
+    sampled: bool = False,
     tick: Callable[[], Any] | None = None,
 ) -> Iterator[tuple[TensorDictBase, Tensor]]:
     """Yield the entries after each step of one episode on every row.
@@ -183,27 +183,26 @@ def episodes(
     Arguments as for `evaluate_policy`.
     """
     carrier = env.eval().reset()
+    lean = LeanEnv(env) if LeanEnv.covers(env) else None
     running = torch.ones_like(env.full_done_spec["done"].zero())
     for count in itertools.count(1):
-        step = env.step(_act(policy, carrier, sampled))
-        yield step["next"], running
-        running = running & ~step["next", "done"]
+        acted = _act(policy, carrier, sampled)
+        # Entries of a policy for the next step, `("next", KEY)`, are left to TorchRL.
+        if lean is None or "next" in acted:
+            step = env.step(acted)
+            after, carrier = step["next"], env.step_mdp(step)
+        else:
+            after = lean.step(acted["action"], acted)
+            carrier = acted.exclude(*after.keys()).update(after)
+        yield after, running
+        running = running & ~after["done"]
         # The test waits for the device.
         if count % 8 == 0 and not running.any():
             return
-        carrier = env.step_mdp(step)
         if tick is not None:
             tick()
 
 
-def _act(
-    policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool | Tensor
-) -> TensorDictBase:
-    if isinstance(sampled, Tensor):
-        drawn = _act(policy, carrier, True)["action"]
-        deterministic = _act(policy, carrier, False)
-        return deterministic.set(
-            "action", torch.where(expand_as_right(sampled, drawn), drawn, deterministic["action"])
-        )
+def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool) -> TensorDictBase:
     with set_exploration_type(ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC):
         return policy(carrier)

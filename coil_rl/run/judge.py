@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -35,7 +35,7 @@ from coil_rl.report.statistics import mean_interval
 from coil_rl.run.evaluation import EvaluationResult, evaluate_policy
 from coil_rl.run.fallback import Fallback
 from coil_rl.run.parts import TEST, EnvMaker
-from coil_rl.run.policy_batch import TracedPolicy, is_tensors
+from coil_rl.run.policy_batch import PartlySampled, traced
 
 COLUMNS = {
     "driver": ("driver", ""),
@@ -200,12 +200,15 @@ def judge(
 
 def _evaluate(trial: Trial, policy: TensorDictModuleBase, judgement: Judgement, bar: Any) -> None:
     """Add the episodes of a policy with each kind of advice, and of the guides beside it."""
-    repeats = trial.repeats if hasattr(policy, "get_dist") else 0
-    acting = TracedPolicy(policy) if is_tensors(policy) else policy
+    samples = isinstance(policy, ProbabilisticTensorDictSequential)
+    deterministic = traced(policy)
     for advice in ("", *trial.advice):
         bar.set_postfix_str(", ".join(filter(None, (trial.label, advice))))
         beside = list(trial.guides) if trial.together and not advice else []
-        _evaluate_with(trial, acting, judgement, bar, advice, beside, 0 if advice else repeats)
+        if samples and trial.repeats and not advice:
+            _evaluate_with(trial, policy, judgement, bar, advice, beside, trial.repeats)
+        else:
+            _evaluate_with(trial, deterministic, judgement, bar, advice, beside, 0)
 
 
 def _evaluate_with(
@@ -229,11 +232,13 @@ def _evaluate_with(
         compile_steps(env)
     watching = [] if advice else [picture for picture in trial.pictures if picture.watches]
     shown = {trial.label: 0} | {name: own + count * index for index, name in enumerate(beside)}
+    if repeats:
+        sampled = (rows >= count) & (rows < own)
+        policy = traced(PartlySampled(policy, sampled))
     if beside:
         policy = PolicyAndGuides(env, policy, own, len(beside))
-    sampled = repeats > 0 and (rows >= count) & (rows < own)
     watch = partial(_watch, env, watching, shown) if watching else None
-    result = trial.evaluation.run(env, policy, sampled=sampled, tick=bar.update, watch=watch)
+    result = trial.evaluation.run(env, policy, tick=bar.update, watch=watch)
     if beside:
         for name, of_guide in zip(beside, result[own:].split(len(beside)), strict=True):
             judgement.add(of_guide, name)

@@ -6,7 +6,7 @@ is known. `LeanSteps` is for those: it calls the env and its transforms directly
 what is read. All others keep TorchRL's step, see `LeanSteps.covers`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -18,7 +18,72 @@ from coil_rl.learners.lean_policy import Entries, LeanPolicy
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.normalised_action import NormalisedAction
 
-ENDS = ["done", "terminated", "truncated"]
+ENDS = {"done", "terminated", "truncated"}
+
+
+class LeanEnv:
+    """The step of an env with its transforms, called directly.
+
+    Args:
+        env: for which `covers` is true.
+    """
+
+    def __init__(self, env: EnvBase) -> None:
+        self.base = env.base_env if isinstance(env, TransformedEnv) else env
+        self.batch_size, self.device = env.batch_size, env.device
+        transforms = _transforms(env)
+        self.advice = [each for each in transforms if isinstance(each, GuideActions)]
+        self.actions = [each for each in transforms if isinstance(each, NormalisedAction)]
+        self.sums = [each.out_keys[0] for each in transforms if isinstance(each, RewardSum)]
+
+    @staticmethod
+    def covers(env: EnvBase) -> bool:
+        """Return whether the steps of an env have this form.
+
+        They have if it is one of this project with advice, a normalised action and a sum of rewards
+        at most, and if no guide looks at the past.
+
+        Args:
+            env: with transforms.
+        """
+        base = env.base_env if isinstance(env, TransformedEnv) else env
+        return (
+            isinstance(base, SeededEnv)
+            and len(env.batch_size) == 1
+            and (env.action_keys, env.reward_keys, set(env.done_keys))
+            == (["action"], ["reward"], ENDS)
+            and not list(base.state_spec.keys(True, True))
+            and all(_is_known(each) for each in _transforms(env))
+        )
+
+    def step(self, action: Tensor, before: Mapping[NestedKey, Tensor] | TensorDictBase) -> Any:
+        """Return the entries after a step.
+
+        Args:
+            action: as the transforms get it.
+            before: entries before the step, of which the sums of rewards are read.
+        """
+        for each in self.actions:
+            if each.units is not None:
+                action = each.units.denormalise(action)
+        after = self.base._step(self.few(action=action))
+        for key in self.sums:
+            after.set(key, before[key] + after["reward"])
+        for guides in self.advice:
+            after = guides._call(after)
+        return after
+
+    def reset(self, rows: Tensor) -> TensorDictBase:
+        """Return the entries after a reset of some rows, [B, 1]."""
+        mask = self.few(_reset=rows)
+        first = self.base._reset(mask)
+        for guides in self.advice:
+            first = guides._reset(mask, first)
+        return first
+
+    def few(self, **entries: Tensor) -> TensorDict:
+        """Return a few entries as data of the env."""
+        return TensorDict(entries, self.batch_size, device=self.device)
 
 
 class LeanSteps:
@@ -31,23 +96,16 @@ class LeanSteps:
     """
 
     def __init__(self, env: EnvBase, policy: Any, keys: Sequence[NestedKey]) -> None:
-        self.policy = LeanPolicy(policy)
-        self.base_env = env.base_env if isinstance(env, TransformedEnv) else env
-        self.batch_size, self.device = env.batch_size, env.device
+        self.policy, self.env = LeanPolicy(policy), LeanEnv(env)
         self.before = [key for key in keys if not _is_next(key)]
         self.after = {key: _in_next(key) for key in keys if _is_next(key)}
-        transforms = _transforms(env)
-        self.advice = [each for each in transforms if isinstance(each, GuideActions)]
-        self.actions = [each for each in transforms if isinstance(each, NormalisedAction)]
-        self.sums = [each.out_keys[0] for each in transforms if isinstance(each, RewardSum)]
-        self.carried = [*_observed(policy, keys), *self.sums]
+        self.carried = [*_observed(policy, keys), *self.env.sums]
 
     @staticmethod
     def covers(env: EnvBase, policy: Any, keys: Sequence[NestedKey] | None) -> bool:
         """Return whether the steps of an env and a policy have this form.
 
-        They have if the env is one of this project with advice, a normalised action and a sum of
-        rewards at most, if no guide looks at the past, if the policy has a lean form, and if all
+        They have if those of the env have, see `LeanEnv`, if the policy has a lean form, and if all
         that it observes is written by the env.
 
         Args:
@@ -55,16 +113,10 @@ class LeanSteps:
             policy: of the env.
             keys: entries that are kept of each step; None: all.
         """
-        base = env.base_env if isinstance(env, TransformedEnv) else env
         return (
             keys is not None
             and LeanPolicy.covers(policy)
-            and isinstance(base, SeededEnv)
-            and len(env.batch_size) == 1
-            and (env.action_key, env.reward_key, sorted(env.done_keys))
-            == ("action", "reward", ENDS)
-            and not list(base.state_spec.keys(True, True))
-            and all(_is_known(each) for each in _transforms(env))
+            and LeanEnv.covers(env)
             and set(_observed(policy, keys)) <= set(env.observation_spec.keys(True, True))
         )
 
@@ -78,15 +130,7 @@ class LeanSteps:
         Args:
             entries: what is read in this step; it gets what the policy writes.
         """
-        action = self.policy.act(entries)["action"]
-        for each in self.actions:
-            if each.units is not None:
-                action = each.units.denormalise(action)
-        after = self.base_env._step(self._few(action=action))
-        for key in self.sums:
-            after.set(key, entries[key] + after["reward"])
-        for guides in self.advice:
-            after = guides._call(after)
+        after = self.env.step(self.policy.act(entries)["action"], entries)
         kept = {key: entries[key] for key in self.before}
         kept |= {key: after[name] for key, name in self.after.items()}
         return kept, self._begun(after)
@@ -96,23 +140,17 @@ class LeanSteps:
         done, carried = after["done"], self.carry(after)
         if not done.any():
             return carried
-        mask = self._few(_reset=done.clone())
-        first = self.base_env._reset(mask)
-        for guides in self.advice:
-            first = guides._reset(mask, first)
-        for key in self.sums:
+        first = self.env.reset(done.clone())
+        for key in self.env.sums:
             first.set(key, carried[key].new_zeros(()).expand_as(carried[key]))
         for key, value in carried.items():
             rows = done.view(-1, *(1,) * (value.ndim - 1))
             carried[key] = where(rows, first[key], value)
         return carried
 
-    def _few(self, **entries: Tensor) -> TensorDict:
-        return TensorDict(entries, self.batch_size, device=self.device)
-
     def data(self, entries: Entries) -> TensorDict:
         """Return entries as data of the env."""
-        data = TensorDict({}, self.batch_size, device=self.device)
+        data = self.env.few()
         for key, value in entries.items():
             data[key] = value
         return data

@@ -9,7 +9,12 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
@@ -38,6 +43,38 @@ def memory_keys(policy: TensorDictModuleBase) -> list[NestedKey]:
     There are none without a memory.
     """
     return [key for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
+
+
+def traced(policy: TensorDictModuleBase) -> TensorDictModuleBase:
+    """Return a policy for an evaluation, traced if it is one of tensors only."""
+    return TracedPolicy(policy) if is_tensors(policy) else policy
+
+
+class PartlySampled(TensorDictModuleBase):
+    """A policy that samples its actions in some rows, and takes the deterministic ones in others.
+
+    Its network is computed once for both.
+
+    Args:
+        policy: whose last module draws the action.
+        sampled: [B], whether the actions of each row are sampled.
+    """
+
+    def __init__(self, policy: ProbabilisticTensorDictSequential, sampled: Tensor) -> None:
+        self.in_keys, self.out_keys = list(policy.in_keys), list(policy.out_keys)
+        super().__init__()
+        *modules, self.last = policy.module
+        self.network, self.sampled = TensorDictSequential(*modules), sampled
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        tensordict = self.network(tensordict)
+        with set_exploration_type(ExplorationType.RANDOM):
+            drawn = self.last(tensordict)["action"]
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            chosen = self.last(tensordict)["action"]
+        rows = expand_as_right(self.sampled, drawn)
+        return tensordict.set("action", torch.where(rows, drawn, chosen))
 
 
 class TracedPolicy(TensorDictModuleBase):
@@ -128,7 +165,7 @@ class PoliciesBeside(TensorDictModuleBase):
         keys = [key for policy in policies for key in policy.in_keys]
         self.in_keys, self.out_keys = list(dict.fromkeys(keys)), ["action"]
         # A list, so that they are no submodules.
-        self.policies = [TracedPolicy(each) if is_tensors(each) else each for each in policies]
+        self.policies = [traced(each) for each in policies]
         kinds = {True: ExplorationType.RANDOM, False: ExplorationType.DETERMINISTIC}
         self.kinds = [kinds[each] for each in sampled]
 

@@ -1,6 +1,7 @@
 """Lean steps give the batches of TorchRL's steps, to the bit."""
 
 import copy
+import itertools
 from functools import partial
 
 import pytest
@@ -15,7 +16,8 @@ from coil_rl import GymnasiumEnv
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import SplineGuide, SplineMemoryGuide
 from coil_rl.learners import PPO, Anchor, Gru
-from coil_rl.run.lean_steps import LeanSteps
+from coil_rl.run.evaluation import episodes
+from coil_rl.run.lean_steps import LeanEnv, LeanSteps
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions, NormalisedAction, Takeover
 
@@ -78,6 +80,44 @@ def test_lean_steps_are_those_of_torchrl_to_the_bit(make_env, options, correlati
         different = [key for key in one.keys(True, True) if not torch.equal(one[key], other[key])]
         assert not different
     assert any(batch["next", "done"].any() for batch in ours)
+
+
+@pytest.mark.parametrize(
+    "make_env", [cones, partial(gym, "Pendulum-v1"), partial(gym, "CartPole-v1")]
+)
+def test_episodes_are_those_of_torchrl_to_the_bit(make_env, monkeypatch):
+    kept = []
+    for lean in (True, False):
+        env = make_env()
+        torch.manual_seed(0)
+        policy = PPO(env, in_keys=["observation"]).policy
+        assert LeanEnv.covers(env)
+        with monkeypatch.context() as patch, torch.no_grad():
+            if not lean:
+                patch.setattr(LeanEnv, "covers", lambda env: False)
+            steps = itertools.islice(episodes(env, policy, sampled=True), 30)
+            kept.append([(after.copy(), running) for after, running in steps])
+    assert len(kept[0]) == len(kept[1])
+    for (one, running), (other, theirs) in zip(*kept, strict=True):
+        assert torch.equal(running, theirs)
+        assert set(one.keys(True, True)) == set(other.keys(True, True))
+        assert all(torch.equal(one[key], other[key]) for key in one.keys(True, True))
+
+
+@pytest.mark.parametrize("lean", [True, False])
+def test_policy_finds_what_it_wrote_in_the_step_before(lean, monkeypatch):
+    env, found = bare(), []
+    assert LeanEnv.covers(env)
+    if not lean:
+        monkeypatch.setattr(LeanEnv, "covers", lambda env: False)
+
+    def act(carrier):
+        count = carrier.get("count", torch.zeros(4, 1))
+        found.append(int(count[0]))
+        return carrier.set("action", torch.zeros(4, 1)).set("count", count + 1)
+
+    list(itertools.islice(episodes(env, act), 3))
+    assert found == [0, 1, 2]
 
 
 def bare(*transforms):

@@ -8,8 +8,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from worlds import cones, perturbed
 
 from coil_rl.imitation import Imitation, SklearnRegressor
-from coil_rl.learners import DQN, PPO, SAC
+from coil_rl.learners import DQN, PPO, SAC, Anchor
 from coil_rl.run.policy_batch import (
+    PartlySampled,
     PoliciesInTurn,
     StackedPolicies,
     TracedPolicy,
@@ -65,6 +66,24 @@ def test_recorded_policy_acts_and_draws_like_the_policy(learner, kind):
     for expected, action in zip(*actions, strict=True):
         torch.testing.assert_close(action, expected)
     assert len(recorded.traced) == 1
+
+
+@pytest.mark.parametrize("options", [{}, {"squash": False}, {"anchor": Anchor()}])
+def test_rows_of_a_partly_sampled_policy_are_those_of_the_policy_to_the_bit(options):
+    env = cones()
+    policy = PPO(env, KEYS, **options).policy
+    policy.load_state_dict(perturbed(policy, 0))
+    sampled, rows = torch.arange(15) % 3 > 0, observations(env)
+    actions = []
+    for each in (policy, PartlySampled(policy, sampled)):
+        for kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
+            torch.manual_seed(0)
+            with torch.no_grad(), set_exploration_type(kind):
+                actions.append(each(rows.clone())["action"])
+    drawn, deterministic, *parts = actions
+    assert not torch.equal(drawn, deterministic)
+    for part in parts:
+        assert torch.equal(part, torch.where(sampled.unsqueeze(-1), drawn, deterministic))
 
 
 def test_recorded_policy_takes_any_number_of_rows_and_mode():
