@@ -136,7 +136,7 @@ class SeededRows(RowsInTurn, SeededEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict[self.action_key].detach().cpu().numpy().copy()
         self.actions.append(actions)
-        self.ages += 1
+        np.add(self.ages, 1, out=self.ages)  # PyTorch's checks of a new attribute take longer
         self.step_rows(self._decode(actions))
         return self._output(stepped=True)
 

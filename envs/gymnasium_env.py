@@ -148,6 +148,8 @@ class GymnasiumEnv(SeededRows):
         self.rate = _rate(env)
         self.space, self.entries = env.action_space, self.held.entries
         check_action_space(name, self.space)
+        self.whole = has_whole_numbers(self.space)  # of the action: whole or real numbers
+        self.real = isinstance(self.space, spaces.Box) and not self.whole
         lowest = torch.as_tensor(lowest_choices(self.space)).reshape(-1)
         self.first_choices = lowest if lowest.any() else None  # the lowest numbers, if not 0
         self._declare_specs(name, makers, dtype)
@@ -217,17 +219,17 @@ class GymnasiumEnv(SeededRows):
             self._place_rows()
         if self.workers is None:
             self.held.begin_rows(seeds, actions)
-            self.parts = [self.held.entries_of_rows()]
+            self.parts[:] = [self.held.entries_of_rows()]
         else:
-            self.parts = self.workers.begin(seeds, actions)
+            self.parts[:] = self.workers.begin(seeds, actions)
 
     def step_rows(self, actions: Any) -> None:
         """Take a step in all rows, see `RowsInTurn`."""
         if self.workers is None:
             self.held.step_rows(actions)
-            self.parts = [self.held.entries_of_rows()]
+            self.parts[:] = [self.held.entries_of_rows()]
         else:
-            self.parts = self.workers.step(actions)
+            self.parts[:] = self.workers.step(actions)
 
     def _place_rows(self) -> None:
         """Decide in which processes the rows are, and make them there."""
@@ -254,7 +256,7 @@ class GymnasiumEnv(SeededRows):
         """
         (row,) = self.rows
         row.observe(observation, first=first)
-        self.parts = [self.held.entries_of_rows()]
+        self.parts[:] = [self.held.entries_of_rows()]
         return self._output(stepped=not first)
 
     def decode(self, actions: torch.Tensor) -> Any:
@@ -263,7 +265,7 @@ class GymnasiumEnv(SeededRows):
         return action
 
     def _decode(self, actions: NDArray[Any]) -> NDArray[Any]:
-        if isinstance(self.space, spaces.Box) and not has_whole_numbers(self.space):
+        if self.real:
             if not np.isfinite(actions).all():
                 raise ForeignError(
                     f"the action for the env {self.rows[0].gate.name} holds a number that is not "
@@ -274,7 +276,7 @@ class GymnasiumEnv(SeededRows):
                 typed = typed[..., 0]
             return np.clip(typed, self.space.low, self.space.high)
         numbered = actions + lowest_choices(self.space)
-        return numbered.astype(self.space.dtype) if has_whole_numbers(self.space) else numbered
+        return numbered.astype(self.space.dtype) if self.whole else numbered
 
     def _output(self, *, stepped: bool) -> TensorDict:
         tensors: dict[Any, torch.Tensor] = {}

@@ -89,7 +89,8 @@ class NormalDensity(Density):
     def log_prob(self, parameters: Parameters, sample: Tensor) -> Tensor:
         """Return the logarithmic density of a sample."""
         loc, scale = parameters
-        return self.summed(-((sample - loc) ** 2) / (2 * scale**2) - scale.log() - LOG_ROOT)
+        squares = -(sample - loc).square() / (2 * scale.square())
+        return self.summed(squares - scale.log() - LOG_ROOT)
 
     def entropy(self, parameters: Parameters) -> Tensor:
         """Return the entropy."""

@@ -66,7 +66,8 @@ class LeanEnv:
         for each in self.actions:
             if each.units is not None:
                 action = each.units.denormalise(action)
-        after = self.base._step(self.few(action=action))
+        # An env of this project reads its action by the key only; a dictionary is made at once.
+        after = self.base._step(Entries(action=action))
         for key in self.sums:
             after.set(key, before[key] + after["reward"])
         for guides in self.advice:
