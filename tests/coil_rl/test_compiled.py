@@ -9,9 +9,8 @@ from coil_rl.errors import UserError
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
+def _cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return tmp_path
 
 
 def walk(position, step, bias=2.0):
@@ -21,11 +20,24 @@ def walk(position, step, bias=2.0):
     return position.norm(), torch.rand(3)
 
 
-def test_compiled_function_has_the_results_the_changes_and_the_random_numbers_of_the_function():
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory):
+    """A cache with the compiled code of `walk` for 4 numbers."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        Compiled(walk)(torch.ones(4), torch.ones(4))
+    return folder
+
+
+def test_compiled_function_has_the_results_the_changes_and_the_random_numbers_of_the_function(
+    walked, monkeypatch
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(walked))
     function = Compiled(walk)
-    found, expected = torch.ones(5), torch.ones(5)
+    found, expected = torch.ones(4), torch.ones(4)
     for seed in range(3):
-        step = torch.linspace(-1, seed, 5)
+        step = torch.linspace(-1, seed, 4)
         torch.manual_seed(seed)
         distance, drawn = function(found, step)
         torch.manual_seed(seed)
@@ -33,9 +45,8 @@ def test_compiled_function_has_the_results_the_changes_and_the_random_numbers_of
         torch.testing.assert_close([distance, drawn, found], [*reference, expected])
 
 
-def test_code_is_found_by_the_operations_and_the_shapes_and_constants(cache, monkeypatch):
-    sizes = (torch.ones(4), torch.ones(4))
-    Compiled(walk)(*sizes)
+def test_code_is_found_by_the_operations_and_the_shapes_and_constants(walked, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(walked))
     made = []
     monkeypatch.setattr(compiled, "compile_graph", lambda graph, arguments, path: made.append(path))
     before, *_ = sizes = (torch.zeros(4), torch.ones(4))
@@ -51,7 +62,7 @@ def test_code_is_found_by_the_operations_and_the_shapes_and_constants(cache, mon
         with pytest.raises(RuntimeError, match="cannot open shared object file"):
             Compiled(function)(*arguments)
     assert len(set(made)) == 4
-    assert len(list((cache / "coil-rl").iterdir())) == 1
+    assert len(list((walked / "coil-rl").iterdir())) == 1
 
 
 def test_shapes_that_depend_on_values_are_refused():
