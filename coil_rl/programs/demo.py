@@ -54,6 +54,8 @@ def driven() -> EvaluationResult:
     """Return one lap of the agent, and one of its guide, on the same track."""
     from importlib import resources
 
+    import torch
+
     from coil_rl.config.build import assemble, build_evaluation
     from coil_rl.config.pretrained import folder_of
     from coil_rl.config.saved import read_config
@@ -63,6 +65,7 @@ def driven() -> EvaluationResult:
 
     folder = folder_of(POLICY)
     config = read_config(folder, "run")
+    torch.set_num_threads(config.threads)
     file = str(resources.files("coil_rl.envs") / "tracks" / "test" / f"{TRACK}.csv")
     tracks = {"_target_": "coil_rl.envs.load_tracks", "path": file}
     config.env.laps = 1
