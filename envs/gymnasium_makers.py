@@ -4,6 +4,7 @@ import importlib
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium
@@ -102,6 +103,10 @@ def _reason(id: str, error: BaseException) -> str:
     extra = next((EXTRAS[name] for name in EXTRAS if name in f"{id} {error}".lower()), None)
     if extra and isinstance(error, (errors.DependencyNotInstalled, ModuleNotFoundError)):
         return f"a package is not installed: python -m pip install 'coil-rl[{extra}]'"
+    module, _, name = id.rpartition(":")
+    package = module.partition(".")[0]
+    if package and isinstance(error, ModuleNotFoundError) and find_spec(package) is None:
+        return f"there is no module {package}; install its package, or add its folder to PYTHONPATH"
     if not isinstance(error, errors.Error):  # of the env itself
         text = shortened(re.split(r" was raised from", str(error).strip())[0])
         return f"it raised {type(error).__name__}: {text}" if text else type(error).__name__
@@ -110,7 +115,6 @@ def _reason(id: str, error: BaseException) -> str:
         return "env.id is empty; write env.id=MODULE:NAME, or the id of a registered env"
     if not isinstance(error, (errors.NameNotFound, errors.NamespaceNotFound)):
         return first_line or type(error).__name__
-    module, _, name = id.rpartition(":")
     if module:
         return f"{module} has no env {name}, and registers none of this name"
     # Gymnasium may have a suggestion of its own: "Did you mean ...".

@@ -164,6 +164,7 @@ def test_torchrl_env_is_an_env(tmp_path):
         ({"env": ENV, "guide": 3}, "name a class, a function, an object"),
         ({"env": ENV, "method": "coill"}, "there is no method=coill"),
         ({"env": "NoSuchEnv-v3"}, "NoSuchEnv-v3 cannot be made"),
+        ({"env": "no_such.plant:Env"}, "no module no_such; install its package, or add its folder"),
         ({"env": ENV, "overrides": ["learner.lr=1"]}, "did you mean learning_rate"),
     ],
 )
