@@ -12,7 +12,10 @@ from unittest.mock import patch
 
 from hydra._internal.hydra import Hydra
 
+import coil_rl.conf
+
 ROOT = Path(__file__).parents[1]
+CONF = Path(coil_rl.conf.__path__[0])  # of the library that is tested, which may be a wheel
 
 TRACK = ["track=folder", f"track.dir={ROOT / 'tests' / 'ring.csv'}"]
 LAP = [*TRACK, "env.laps=1", "env.rate=6"]
@@ -54,6 +57,11 @@ TINY_SWEEP = [
     "proxy.budget.num_envs=2",
     "proxy.budget.steps=16",
 ]
+
+
+def shipped(group):
+    """Return the names of the files of a group of the configuration."""
+    return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
 
 
 def module(name):

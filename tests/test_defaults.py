@@ -8,8 +8,10 @@ from typing import Any
 import hydra.utils
 import pytest
 from omegaconf import OmegaConf
+from programs import CONF
 
-ROOT = Path(__file__).parents[1]
+import coil_paper.conf
+
 PROJECT = ("coil_rl.", "coil_paper.")
 # Folders in which a file changes the defaults of a class for a method or an experiment.
 VARIATION_FOLDERS = ("experiment", "method", "preset", "paper/experiment")
@@ -37,10 +39,10 @@ VARIATIONS = {
     "paper/reproduce/table_5.yaml": ["worlds"],
     "paper/reproduce/table_6.yaml": ["experiments", "worlds", "car_length"],
 }
-CONF = {"": ROOT / "conf", "paper/": ROOT / "paper" / "conf"}
+FOLDERS = {"": CONF, "paper/": Path(coil_paper.conf.__path__[0])}
 FILES = {
     f"{prefix}{path.relative_to(conf).as_posix()}": path
-    for prefix, conf in CONF.items()
+    for prefix, conf in FOLDERS.items()
     for path in sorted(conf.rglob("*.yaml"))
 }
 

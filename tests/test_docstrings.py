@@ -12,11 +12,11 @@ import inspect
 import pkgutil
 import re
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import hydra.utils
 import pytest
+from programs import CONF
 
 import coil_paper
 import coil_rl
@@ -27,7 +27,6 @@ MODULES = [
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
     if ">>>" in (importlib.util.find_spec(module.name).loader.get_source(module.name) or "")
 ]
-CONF = Path(__file__).parents[1] / "conf"
 TARGET = re.compile(r"_target_: *(coil_rl\.[\w.]+)")
 NAME = re.compile(r"    (\*{0,2}\w[\w, ]*):")
 

@@ -1,14 +1,16 @@
 """Every experiment file of the paper is a sweep that can be run and resumed."""
 
-import pytest
-from programs import ROOT, TINY_SWEEP
+from pathlib import Path
 
-from coil_paper import sweeps
+import pytest
+from programs import TINY_SWEEP
+
+from coil_paper import conf, sweeps
 from coil_rl import compose_train
 from coil_rl.config.check import check
 from coil_rl.programs.train import train
 
-EXPERIMENTS = sorted(file.stem for file in (ROOT / "paper/conf/experiment").glob("*.yaml"))
+EXPERIMENTS = sorted(file.stem for file in Path(conf.__path__[0], "experiment").glob("*.yaml"))
 
 
 def first(experiment, run_dir):

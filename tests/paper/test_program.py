@@ -6,10 +6,10 @@ import pytest
 from drives import drive as circle
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
-from programs import ROOT, TRACK, called, program
+from programs import TRACK, called, program
 from run_folders import driven, make_run
 
-from coil_paper import sweeps
+from coil_paper import conf, sweeps
 from coil_paper.program import INDEX
 from coil_paper.reproduce.result import check_pools
 from coil_paper.reproduce.training import Figure22
@@ -197,7 +197,7 @@ def test_every_budget_fits_every_experiment(budget):
         sweeps.planned(name, [*chosen.every, *chosen.only.get(name, [])], range(chosen.seeds))
         for name in experiments
     ]
-    files = (ROOT / "paper" / "conf" / "experiment").glob("*.yaml")
+    files = Path(conf.__path__[0], "experiment").glob("*.yaml")
     assert experiments == {path.stem for path in files}
     assert set(chosen.only) <= experiments
     for plan in plans:

@@ -1,11 +1,11 @@
 import math
-from pathlib import Path
 
 import pytest
 import torch
 import worlds
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
+from programs import shipped
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
@@ -25,9 +25,7 @@ from coil_rl.transforms import (
     ShuffledAdvice,
 )
 
-NAMES = sorted(
-    file.stem for file in (Path(__file__).parents[2] / "conf" / "degrade").glob("*.yaml")
-)
+NAMES = shipped("degrade")
 CARS = 6
 WORLD = ConeTrackEnv(random_tracks(count=1, seed=5), CARS)
 

@@ -1,9 +1,8 @@
-from pathlib import Path
-
 import pytest
 import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
+from programs import shipped
 
 from coil_rl.config.build import (
     build_bare_env,
@@ -21,7 +20,6 @@ from coil_rl.run.parts import TEST, TESTS, TRAIN
 from coil_rl.testing import check_env, check_guide
 from coil_rl.transforms import ActionDelay, GuideActions, ObservationDelay
 
-CONF = Path(__file__).parents[3] / "conf"
 SMALL = [
     "track=generated",
     "track.train.count=1",
@@ -36,17 +34,13 @@ def composed(*overrides, name="train"):
         return compose(name, [*SMALL, *overrides])
 
 
-def choices(group):
-    return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
-
-
 # Each method with the first preset, and each preset with one method.
 PRESETS = [
     pytest.param(
         *(method, preset), marks=[] if preset == "default" or method == "coil" else pytest.mark.slow
     )
-    for method in choices("method")
-    for preset in choices("preset")
+    for method in shipped("method")
+    for preset in shipped("preset")
 ]
 
 
@@ -80,7 +74,7 @@ OF_OTHER_ENVS = {
 
 
 @pytest.mark.parametrize(
-    "guide", sorted({*choices("guide")} - {"none", *NOT_ALONE, *OF_OTHER_ENVS})
+    "guide", sorted({*shipped("guide")} - {"none", *NOT_ALONE, *OF_OTHER_ENVS})
 )
 def test_every_guide_acts_on_the_observations_of_the_env(guide):
     config = composed(f"guide={guide}")
@@ -132,7 +126,7 @@ def test_advice_is_degraded_after_the_transforms_of_the_method():
     torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.25))
 
 
-@pytest.mark.parametrize("learner", choices("learner"))
+@pytest.mark.parametrize("learner", shipped("learner"))
 def test_every_learner_is_built(learner):
     config = composed(f"learner={learner}")
     env = env_maker(config)()
@@ -146,7 +140,7 @@ SLOW_TRACKS = [pytest.param("unseen", marks=pytest.mark.slow)]  # many generated
 
 
 @pytest.mark.parametrize(
-    "track", [*sorted({*choices("track")} - {"folder", "unseen"}), *SLOW_TRACKS]
+    "track", [*sorted({*shipped("track")} - {"folder", "unseen"}), *SLOW_TRACKS]
 )
 def test_every_track_group_has_tracks(track):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):

@@ -1,18 +1,17 @@
 """A method that needs numbers as actions is refused by name where they are choices."""
 
-from pathlib import Path
-
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
 from hydra import compose, initialize_config_module
+from programs import shipped
 
 from coil_rl.config.check import check_parts
 from coil_rl.config.choices import WITH_CHOICES
 from coil_rl.errors import UserError
 
-METHODS = sorted(path.stem for path in (Path(__file__).parents[3] / "conf" / "method").glob("*"))
+METHODS = shipped("method")
 # They have no agent, or need several guides, or numbers of a guide.
 OTHERS = ("guide", "coil_multi", "tune")
 

@@ -4,13 +4,13 @@ import importlib.util
 
 import pytest
 import yaml
-from programs import ROOT
+from programs import CONF
 
 from coil_rl.config import logger
 from coil_rl.config.logger import check_logger, make_logger, shipped_logger
 from coil_rl.errors import UserError
 
-SHIPPED = {path.stem: yaml.safe_load(path.read_text()) for path in (ROOT / "conf/logger").iterdir()}
+SHIPPED = {path.stem: yaml.safe_load(path.read_text()) for path in (CONF / "logger").iterdir()}
 NAMES = sorted(name for name, node in SHIPPED.items() if node)
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
-from programs import ROOT, called
+from programs import CONF, called, shipped
 
 from coil_rl import UserError, compose_train
 
-METHODS = sorted(file.stem for file in (ROOT / "conf" / "method").glob("*.yaml"))
+METHODS = shipped("method")
 FAST = ("coil", "dagger", "rlpd")
 # Groups whose files may set everything, and a shipped file to begin with.
 GLOBAL = {"env": "gym", "method": None, "experiment": None}
@@ -94,7 +94,7 @@ def test_every_value_of_a_users_file_survives_the_composition(group, method, tmp
 @pytest.mark.parametrize("method", FAST)
 def test_every_value_of_a_users_part_survives_the_composition(group, method, tmp_path):
     shipped, node = OWN[group]
-    source = OmegaConf.load(ROOT / "conf" / group / f"{shipped}.yaml")
+    source = OmegaConf.load(CONF / group / f"{shipped}.yaml")
     own = OmegaConf.to_container(source, resolve=False)
     own.pop("defaults", None)
     values = {key: changed(value) for key, value in leaves(own)}

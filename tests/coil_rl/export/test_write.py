@@ -8,13 +8,13 @@ import pytest
 import torch
 from learned_runs import learned
 from outside_package.install import SOURCE
+from programs import shipped
 
 import coil_rl
 from coil_rl.export import write
 from coil_rl.export.contract import CONTRACT, DRIVER, ONNX, TORCH
 
-CONF = Path(__file__).parents[3] / "conf"
-METHODS = sorted(file.stem for file in (CONF / "method").glob("*.yaml"))
+METHODS = shipped("method")
 OBSERVATIONS = 30
 REFUSED = {"dagger", "oil"}  # regressors of scikit-learn
 

@@ -2,7 +2,6 @@
 
 import copy
 from functools import partial
-from pathlib import Path
 
 import gymnasium
 import pytest
@@ -10,6 +9,7 @@ import torch
 import worlds
 from cart_poles import CartPoles
 from omegaconf import OmegaConf
+from programs import CONF
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import RewardSum, TransformedEnv
@@ -19,9 +19,7 @@ from coil_rl.envs.gym import ConeTrackGym
 from coil_rl.learners import A2C, PPO, TRPO, Reinforce
 from coil_rl.run.rollout import Rollout
 
-CONFIG = OmegaConf.to_container(
-    OmegaConf.load(Path(__file__).parents[3] / "conf/learner/ppo_sb3.yaml")
-)
+CONFIG = OmegaConf.to_container(OmegaConf.load(CONF / "learner" / "ppo_sb3.yaml"))
 OPTIONS = {
     key: value
     for key, value in CONFIG["learner"].items()

@@ -7,17 +7,16 @@ import csv
 import shlex
 import signal
 import time
-from pathlib import Path
 
 import kill_and_resume
 import pytest
 from hydra import compose, initialize_config_module
-from programs import called
+from programs import called, shipped
 
 import coil_rl.config.schema  # noqa: F401 registers the schema
 from coil_rl.config.build import env_maker
 
-FILES = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "env").glob("*.yaml"))
+FILES = shipped("env")
 REPLAYS = ["mcap_replay"]  # of recordings, see config/test_replay.py
 # Envs of other libraries, without tracks and guides.
 OTHERS = {

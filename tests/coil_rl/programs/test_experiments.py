@@ -1,17 +1,15 @@
 """Every experiment file is a sweep that can be run and resumed."""
 
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from programs import TINY_SWEEP
+from programs import CONF, TINY_SWEEP
 
 from coil_rl.config.check import check
 from coil_rl.programs.train import train
 
-CONF = Path(__file__).parents[3] / "conf"
 FOLDER = CONF / "experiment"
 EXPERIMENTS = sorted(
     file.relative_to(FOLDER).with_suffix("").as_posix() for file in FOLDER.rglob("*.yaml")

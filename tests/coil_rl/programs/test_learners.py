@@ -1,18 +1,15 @@
 """Every combination of a method and a learner trains or is refused."""
 
-from pathlib import Path
-
 import pytest
 from hydra import compose, initialize_config_module
+from programs import shipped
 
 from coil_rl.config.build import build_learner, env_maker
 from coil_rl.config.check import check
 from coil_rl.errors import UserError
 from coil_rl.run.rollout import Rollout
 
-METHODS = sorted(
-    file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml")
-)
+METHODS = shipped("method")
 DYNAMIC = [name for name in METHODS if name.startswith("dynamic")]
 IMITATION = ["dagger", "oil"]
 TINY = [

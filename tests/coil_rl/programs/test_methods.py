@@ -3,11 +3,11 @@
 import csv
 import json
 import shutil
-from pathlib import Path
 
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from programs import shipped
 
 from coil_rl.config.check import check
 from coil_rl.config.load import open_run
@@ -16,9 +16,7 @@ from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume, train
 from coil_rl.run import checkpoint
 
-METHODS = sorted(
-    file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml")
-)
+METHODS = shipped("method")
 # Their parts are also tested with another method.
 SLOW = ["coil_multi", "coil_rfc", "kickstart", "mixing", "residual", "residual_coil", "rfc", "wsrl"]
 SLOW += [

@@ -1,20 +1,17 @@
 """The shipped experiments with an env and a controller of somebody else."""
 
-from pathlib import Path
-
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from programs import called
+from programs import CONF, called, shipped
 
 from coil_rl.config.check import check_parts
 from coil_rl.programs import plan
 from coil_rl.programs.plan import Pace, described, duration, estimated
 
-CONF = Path(__file__).parents[3] / "conf" / "experiment"
 # What each experiment needs besides an env of one's own.
 OWN = {
     "advice": "controller",
@@ -77,9 +74,9 @@ def repeat(observation):
 
 def jobs(experiment):
     """Return the overrides of the first seed of each job of an experiment."""
-    file = OmegaConf.load(CONF / f"{experiment}.yaml")
+    file = OmegaConf.load(CONF / "experiment" / f"{experiment}.yaml")
     if OmegaConf.select(file, "hydra.sweeper.params") is None:
-        file = OmegaConf.load(CONF / f"{file.defaults[0]}.yaml")
+        file = OmegaConf.load(CONF / "experiment" / f"{file.defaults[0]}.yaml")
     words = [[]]
     for key, value in file.hydra.sweeper.params.items():
         choices = str(value).split(",")[: 1 if key == "seed" else None]
@@ -88,7 +85,7 @@ def jobs(experiment):
 
 
 def test_every_experiment_is_either_for_any_env_or_refused():
-    assert sorted({*OWN, *REFUSED}) == sorted(path.stem for path in CONF.glob("*.yaml"))
+    assert sorted({*OWN, *REFUSED}) == shipped("experiment")
 
 
 @pytest.mark.parametrize("experiment", sorted(OWN))

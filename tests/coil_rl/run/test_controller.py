@@ -1,21 +1,19 @@
 """What a machine is sent is what an evaluation executes, for every method."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from learned_runs import ON_POLICY, OPTIONS, STEPS, TINY, learned
 from outside_package.install import SOURCE
+from programs import shipped
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
 from coil_rl.run.controller import Controller
 from coil_rl.run.parts import TEST
 
-CONF = Path(__file__).parents[3] / "conf"
 # A search of numbers trains no policy.
-METHODS = sorted({file.stem for file in (CONF / "method").glob("*.yaml")} - {"tune"})
+METHODS = sorted({*shipped("method")} - {"tune"})
 # Learners that refuse a network with a memory.
 WITHOUT_MEMORY = {*OPTIONS, "advisor"} - {"coil_anchored", "guide"}
 WITHOUT_MEMORY |= {method for method in METHODS if method.startswith("dynamic_coil")}

@@ -3,19 +3,18 @@
 import csv
 import math
 from functools import partial
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from programs import shipped
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
 
-CONF = Path(__file__).parents[3] / "conf"
-METHODS = sorted(file.stem for file in (CONF / "method").glob("*.yaml"))
+METHODS = shipped("method")
 WITHOUT_GUIDE = ("ppo",)
 FAST = ("coil", "residual", "residual_coil", "rfc", "mixing", "kickstart", "ppo")
 
