@@ -13,6 +13,7 @@ from unittest.mock import patch
 from hydra._internal.hydra import Hydra
 
 import coil_rl.conf
+from coil_rl.run.stopping import remember_trust
 
 ROOT = Path(__file__).parents[1]
 CONF = Path(coil_rl.conf.__path__[0])  # of the library that is tested, which may be a wheel
@@ -122,5 +123,6 @@ def called(name, *arguments, cwd=".", code=0):
     finally:
         sys.argv = given
         logging.getLogger().handlers.clear()
+        remember_trust([])  # as in the next process
     assert code is None or ended == code, error.getvalue()
     return subprocess.CompletedProcess(sys.argv, ended, out.getvalue(), error.getvalue())

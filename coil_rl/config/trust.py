@@ -87,9 +87,9 @@ def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -
                 f"trust=[{name}] cannot be: functions of {name} run any code; name the package of "
                 "the part"
             )
-    remember_trust(names)
     _packages = frozenset(names)
     _own = frozenset() if command is None else _targets(command)
+    remember_trust(sorted({*names, *_foreign(command)}))
 
 
 def trust_own(config: DictConfig) -> None:
@@ -104,6 +104,18 @@ def _targets(config: DictConfig) -> frozenset[str]:
         for name, key, value in _entries(OmegaConf.to_container(config))
     )
     return frozenset(path for path in paths if isinstance(path, str))
+
+
+def _foreign(command: DictConfig | None) -> frozenset[str]:
+    """Return the packages that the folder of a run of this command may name only if trusted."""
+    if command is None:
+        return frozenset()
+    named = _targets(
+        OmegaConf.masked_copy(command, [str(key) for key in command if key != "logger"])
+    )
+    packages = {target.partition(".")[0] for target in named - NAMED - _shipped_targets()}
+    known = metadata.entry_points(group=ENTRY_POINTS).names
+    return frozenset(packages - NEVER_TRUSTED - known)
 
 
 def check_config(config: DictConfig, path: Path) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from coil_rl.report.runs import RETURN
+from coil_rl.run.stopping import command_of, resume_command
 
 RISE = 0.05  # of the range of a curve: a rise of its last quarter that is worth more training
 
@@ -32,9 +33,8 @@ def next_step(folder: Path, frames: int, rows: Sequence[Mapping[str, float]] = (
         frames: that it has been trained for.
         rows: of `metrics.csv`.
     """
-    run = shlex.quote(str(folder))
-    longer = f"coil-train resume={run} budget.frames={2 * frames}"
+    longer = f"{resume_command(folder)} budget.frames={2 * frames}"
     report = f"coil-report folder={shlex.quote(str(folder.parent))}"
     if still_rising(rows):
         return f"Still rising at the end: {longer}"
-    return f"Next: coil-evaluate run={run} | {report} | {longer}"
+    return f"Next: {command_of('coil-evaluate', 'run', folder)} | {report} | {longer}"

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-_trusted: list[str] = []  # packages that the command of this process trusts
+_trusted: list[str] = []  # packages that a later command must trust, for the runs of this process
 
 
 class Stop:
@@ -52,11 +52,22 @@ STOP = Stop()
 
 
 def remember_trust(packages: Iterable[str]) -> None:
-    """Set the packages that a command which continues a run must trust, too."""
+    """Set the packages that a command which takes the folder of a run must trust, too."""
     _trusted[:] = packages
+
+
+def command_of(program: str, key: str, folder: Path) -> str:
+    """Return the command that takes the folder of a run, as a shell reads it.
+
+    Args:
+        program: that takes it.
+        key: by which it takes it.
+        folder: of the run.
+    """
+    trust = [f"trust=[{','.join(_trusted)}]"] if _trusted else []
+    return shlex.join([program, f"{key}={folder}", *trust])
 
 
 def resume_command(folder: Path) -> str:
     """Return the command that continues a run, as a shell reads it."""
-    trust = [f"trust=[{','.join(_trusted)}]"] if _trusted else []
-    return shlex.join(["coil-train", f"resume={folder}", *trust])
+    return command_of("coil-train", "resume", folder)
