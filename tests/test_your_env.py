@@ -1,6 +1,6 @@
 """docs/your_env.md: its commands and Python blocks run, at toy size.
 
-Its other code is that of the package.
+Its other code is that of the package, but for the file at its beginning.
 """
 
 import math
@@ -14,7 +14,12 @@ from programs import ROOT, called
 
 PAGE = (ROOT / "docs" / "your_env.md").read_text()
 ALL_BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
-BLOCKS = [(language, block) for language, block in ALL_BLOCKS if "vmas" not in block]
+PLANT, IN_ONE_FILE = (block for _, block in ALL_BLOCKS if "Tank" in block)
+BLOCKS = [
+    (language, block)
+    for language, block in ALL_BLOCKS
+    if "vmas" not in block and "Tank" not in block
+]
 (SEVERAL_AGENTS,) = (block for _, block in ALL_BLOCKS if "vmas" in block)
 PROGRAMS = [block for language, block in BLOCKS if language == "python" and "import" in block]
 EXCERPTS = [block for language, block in BLOCKS if language and block not in PROGRAMS]
@@ -36,6 +41,17 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(install(folder))
         yield folder / "source"
+
+
+def test_env_and_controller_in_one_file_are_enough(tmp_path, monkeypatch):
+    (tmp_path / "plant.py").write_text(PLANT)
+    monkeypatch.syspath_prepend(tmp_path)
+    path, *commands = IN_ONE_FILE.splitlines()
+    assert path == "export PYTHONPATH=."
+    for name, *arguments in map(shlex.split, commands):
+        called(name.removeprefix("coil-"), *arguments, *TOY[name], cwd=tmp_path)
+    rows = (tmp_path / "outputs" / "tank" / "evaluation.csv").read_text().splitlines()
+    assert {row.split(",")[0] for row in rows[1:]} == {"guide", "coil_anchored"}
 
 
 @pytest.mark.parametrize(
