@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from try_wheel import NEED_A_CHECKOUT
 
 ROOT = Path(__file__).resolve().parents[1]
 UNPINNED = {"trackio"}  # extras that need other versions than the tested ones
@@ -167,6 +168,10 @@ main()
     assert "test_3" in out, "the shipped tracks are missing in the wheel"
     paper = [sys.executable, "-m", "coil_paper.program", "table=1", "budget=smoke"]
     assert "table_1 made" in run(*paper, cwd=tmp_path, pythonpath=installed)
+
+
+def test_what_try_wheel_leaves_out_is_there() -> None:
+    assert [name for name in NEED_A_CHECKOUT if not (ROOT / "tests" / name).exists()] == []
 
 
 def test_every_dependency_is_pinned_within_its_range() -> None:

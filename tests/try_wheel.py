@@ -1,74 +1,141 @@
-"""Run the tests that need no checkout with a wheel in a bare environment: make test-wheel.
+"""Test what a release consists of, away from the checkout: make test-wheel.
 
-The tests are copied to a folder without the sources, so that nothing but the wheel is imported.
+The sdist gives the same wheel as the checkout, and its tests can be collected. Then the wheel is
+installed in a bare environment with the versions of constraints.txt, where `coil-demo` draws its
+picture, and all tests that need no checkout are run from a folder that has nothing but them.
 
-    python tests/try_wheel.py                   a new environment, which takes minutes and gigabytes
-    python tests/try_wheel.py --site FOLDER     the packages of FOLDER, and only the wheel anew
+    python tests/try_wheel.py                 a new environment, which takes minutes and gigabytes
+    python tests/try_wheel.py --site FOLDER   the packages of FOLDER, and only the wheel anew
+    python tests/try_wheel.py -m '' -x        what is not known here is for pytest
 """
 
 import argparse
-import re
+import os
 import shutil
 import subprocess
 import sys
+import sysconfig
+import tarfile
 import tempfile
+import time
+import zipfile
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
-# What a file of tests has that reads the sources, or something beside them.
-OF_A_CHECKOUT = re.compile(r"\bROOT\b|parents\[|pyproject|conf/|run_folders\.py")
-OTHERS = ("benchmarks", "docs", "examples", "paper")  # folders of tests of what is not installed
+# Tests of what is not installed: of sources as files, of pages, of benchmarks and examples.
+NEED_A_CHECKOUT = [
+    "benchmarks",
+    "docs",
+    "examples",
+    "test_contributing.py",
+    "test_fuzz.py",
+    "test_imports.py",
+    "test_packaging.py",
+    "test_readme.py",
+    "test_style.py",
+    "test_your_env.py",
+]
+EXTRAS = "gym,export"  # whose parts the tests use
 
 
-def without_checkout(tests: Path) -> list[str]:
-    """Return the files of tests that need no checkout."""
-    found = []
-    for path in sorted(tests.rglob("test_*.py")):
-        place = path.relative_to(tests)
-        text = path.read_text(encoding="utf-8")
-        if place.parts[0] not in OTHERS and not OF_A_CHECKOUT.search(text):
-            found.append(str(Path("tests", place)))
-    return found
-
-
-def environment(folder: Path, site: str | None) -> str:
-    """Return the interpreter of an environment with the wheel.
+def run(*command: str | Path, cwd: Path, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a command where nothing but packages is imported.
 
     Args:
-        folder: where it is made.
-        site: folder with the other packages; None: they are installed.
+        command: with its arguments.
+        cwd: where it runs.
+        options: of `subprocess.run`; without them, a failure ends this program.
     """
-    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
-    subprocess.run(build, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-    (wheel,) = folder.glob("*.whl")
-    subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
-    python = str(folder / "venv" / "bin" / "python")
-    packages = [f"{wheel}[gym]", "pytest", "hypothesis"]
+    env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    options = {"check": True, "text": True} | options
+    return subprocess.run([*map(str, command)], cwd=cwd, env=env, **options)
+
+
+def built(folder: Path) -> tuple[Path, Path]:
+    """Return the wheel of the checkout, and the unpacked sdist, which gives the same wheel.
+
+    Args:
+        folder: where both are made.
+    """
+    build = [sys.executable, "-m", "build", "--no-isolation"]
+    shutil.rmtree(ROOT / "build" / "lib", ignore_errors=True)  # or removed files are in the wheel
+    run(*build, "--wheel", "--sdist", "--outdir", folder, cwd=ROOT, stdout=subprocess.DEVNULL)
+    (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    with tarfile.open(sdist) as file:
+        file.extractall(folder, filter="data")
+    unpacked = sdist.with_name(sdist.name.removesuffix(".tar.gz"))
+    again = folder / "again"
+    run(*build, "--wheel", "--outdir", again, cwd=unpacked, stdout=subprocess.DEVNULL)
+    here, there = contents(wheel), contents(again / wheel.name)
+    if here != there:
+        names = sorted({name for name, _ in here ^ there})
+        sys.exit(f"the wheel of the sdist differs from that of the checkout: {', '.join(names)}")
+    print(f"the sdist gives the {len(here)} files of the wheel", flush=True)
+    return wheel, unpacked
+
+
+def contents(wheel: Path) -> set[tuple[str, int]]:
+    """Return the names and checksums of the files of a wheel."""
+    with zipfile.ZipFile(wheel) as file:
+        return {(info.filename, info.CRC) for info in file.infolist()}
+
+
+def environment(place: Path, packages: list[str], site: str | None) -> Path:
+    """Return the interpreter of a new environment.
+
+    Args:
+        place: its folder.
+        packages: what pip installs.
+        site: folder with all other packages; None: they are installed too.
+    """
+    run(sys.executable, "-m", "venv", place, cwd=place.parent)
     if site is not None:
-        (own,) = (folder / "venv" / "lib").glob("python*/site-packages")
+        (own,) = place.glob("lib/python*/site-packages")
         (own / "others.pth").write_text(f"{Path(site).resolve()}\n")
-        packages = ["--no-deps", "--force-reinstall", str(wheel)]
-    pip = [python, "-m", "pip", "install", "-q", "--disable-pip-version-check"]
-    subprocess.run([*pip, *packages], check=True)
+        packages = ["--no-deps", "--force-reinstall", *packages]
+    python = place / "bin" / "python"
+    run(python, "-m", "pip", "install", "-q", *packages, cwd=place.parent)
     return python
 
 
+def collected(unpacked: Path, place: Path) -> str:
+    """Return how many tests of an sdist can be collected, installed as by `make venv`.
+
+    Args:
+        unpacked: the sdist.
+        place: folder of an environment with the developer tools of this one.
+    """
+    python = environment(place, ["-e", str(unpacked)], sysconfig.get_path("purelib"))
+    pytest = [python, "-m", "pytest", "-q", "--collect-only"]
+    done = run(*pytest, cwd=unpacked, check=False, stdout=subprocess.PIPE)
+    if done.returncode:
+        sys.exit(f"the tests of the sdist cannot be collected:\n{done.stdout[-2000:]}")
+    return done.stdout.strip().splitlines()[-1]
+
+
 def main() -> int:
-    """Run the tests, and return the exit code of pytest."""
-    parser = argparse.ArgumentParser(description="Test the wheel in a bare environment.")
+    """Try sdist and wheel, and return the exit code of the tests."""
+    parser = argparse.ArgumentParser(description="Test sdist and wheel away from the checkout.")
     parser.add_argument("--site", help="folder with the other packages")
     given, others = parser.parse_known_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        python = environment(folder, given.site)
-        shutil.copytree(ROOT / "tests", folder / "tests")
+        wheel, unpacked = built(folder)
+        print(f"in the sdist: {collected(unpacked, folder / 'of_sdist')}", flush=True)
+        tools = ["pytest", "hypothesis", "-c", str(ROOT / "constraints.txt")]
+        packages = [str(wheel)] if given.site else [f"{wheel}[{EXTRAS}]", *tools]
+        python = environment(folder / "of_wheel", packages, given.site)
+        bare = folder / "bare"
+        shutil.copytree(ROOT / "tests", bare / "tests")
         # The settings of pytest are in pyproject.toml, which is no part of the package.
-        shutil.copy(ROOT / "pyproject.toml", folder)
-        files = without_checkout(folder / "tests")
-        print(f"{len(files)} files of tests need no checkout", flush=True)
-        return subprocess.run(
-            [python, "-m", "pytest", "-q", *files, *others], cwd=folder
-        ).returncode
+        shutil.copy(ROOT / "pyproject.toml", bare)
+        start = time.perf_counter()
+        run(python.with_name("coil-demo"), cwd=bare)
+        print(f"coil-demo: {time.perf_counter() - start:.1f} s to the picture", flush=True)
+        left_out = [f"--ignore=tests/{place}" for place in NEED_A_CHECKOUT]
+        command = [python, "-m", "pytest", "-q", *left_out, *others]
+        return run(*command, cwd=bare, check=False).returncode
 
 
 if __name__ == "__main__":
