@@ -1,15 +1,17 @@
-"""Install the project with the floor and the ceiling of each range, and run tests.
+"""Install the project with the floor and the ceiling of each range, run tests and a training.
 
 `make test-versions` does it.
 
-It takes minutes and gigabytes an environment, so it is no part of the tests. Where an interpreter
-is missing or a version cannot be installed, the table says so.
+It takes minutes and gigabytes an environment, so it is no part of the tests; each is removed before
+the next one. Interpreters are looked for on the PATH. Where one is missing, a version cannot be
+installed or a training fails, the table says so.
 
     python tests/try_versions.py                    all environments
     python tests/try_versions.py --only 'torch 2.12' --tests tests/transforms
 """
 
 import argparse
+import os
 import re
 import shutil
 import subprocess
@@ -32,7 +34,10 @@ ENVIRONMENTS = {
     "Python 3.12": ("3.12", ["torch==2.13.*"]),
     "Python 3.13": ("3.13", ["torch==2.13.*"]),
 }
+TRAINING = ["method=coil", "budget.frames=65_536", "hydra.run.dir=run"]
+COLUMNS = ["environment", "Python", "torch", "TorchRL", "tensordict", "tests", "training"]
 SUMMARY = r"^(?:\d+ \w+,? ?)+"
+REWARD = r"mean test reward (\S+),"
 
 
 def floors() -> list[str]:
@@ -41,46 +46,70 @@ def floors() -> list[str]:
     for text in PROJECT["dependencies"]:
         requirement = Requirement(text)
         (floor,) = (each.version for each in requirement.specifier if each.operator == ">=")
-        zeros = ".*" if floor.count(".") < 2 else ""
-        lowest.append(f"{requirement.name}=={floor}{zeros}")
+        if floor.count(".") < 2:  # 4 is 4.0, and its corrections
+            floor = ".".join([*floor.split("."), "0"][:2]) + ".*"
+        lowest.append(f"{requirement.name}=={floor}")
     return lowest
 
 
 def run(command: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Return what a command did, with its output as text."""
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
-
-
-def tried(name: str, interpreter: str, pins: list[str], tests: list[str], folder: Path) -> str:
-    """Return the line of the table for an environment.
+    """Return what a command did, with its output as text, where nothing but packages is imported.
 
     Args:
-        name: of the environment.
+        command: with its arguments.
+        cwd: where it runs.
+    """
+    env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    env |= {"OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, check=False)
+
+
+def row(*cells: str) -> str:
+    """Return a line of the table."""
+    return f"| {' | '.join(cells)} |"
+
+
+def installed(interpreter: str, pins: list[str], place: Path) -> str | None:
+    """Make an environment, and return what went wrong.
+
+    Args:
         interpreter: its Python, as "3.12".
         pins: versions to install.
-        tests: what pytest runs.
-        folder: where the environment is made.
+        place: folder of the environment.
     """
     python = shutil.which(f"python{interpreter}")
     if python is None or run([python, "--version"], ROOT).returncode:
-        return f"| {name} | - | Python {interpreter} is not on this machine |"
-    place = folder / re.sub(r"\W", "_", name)
+        return f"Python {interpreter} is not on this machine"
     run([python, "-m", "venv", str(place)], ROOT)
-    own = str(place / "bin" / "python")
-    pip = [own, "-m", "pip", "install", "-q", "--disable-pip-version-check"]
+    pip = [str(place / "bin" / "python"), "-m", "pip", "install", "-q"]
     done = run([*pip, *pins, "pytest", "hypothesis", f"{ROOT}[gym]"], ROOT)
-    if done.returncode:
-        reason = [line for line in done.stderr.splitlines() if "ERROR" in line] or ["unknown"]
-        return f"| {name} | - | cannot be installed: {reason[0][:120]} |"
-    versions = run([own, "-m", "coil_rl.programs.info"], folder).stdout
-    shown = ", ".join(
-        " ".join(line.split())
-        for line in versions.splitlines()
-        if line.split()[0] in ("torch", "torchrl", "tensordict")
-    )
-    done = run([own, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests], ROOT)
-    found = re.search(SUMMARY, done.stdout.strip().splitlines()[-1])
-    return f"| {name} | {shown} | {found[0].strip() if found else done.stdout[-120:]} |"
+    if not done.returncode:
+        return None
+    reason = [line for line in done.stderr.splitlines() if "ERROR" in line] or ["unknown"]
+    return f"cannot be installed: {reason[0][:120]}"
+
+
+def tried(name: str, place: Path, tests: list[str]) -> str:
+    """Return the line of the table for an environment, and name failed tests on standard error.
+
+    Args:
+        name: of the environment.
+        place: its folder.
+        tests: what pytest runs.
+    """
+    python = str(place / "bin" / "python")
+    info = run([python, "-m", "coil_rl.programs.info"], place).stdout
+    versions = dict(line.split(maxsplit=1) for line in info.splitlines())
+    shown = [versions[package] for package in ("python", "torch", "torchrl", "tensordict")]
+    done = run([python, "-m", "pytest", "-q", "-p", "no:cacheprovider", *tests], ROOT)
+    for line in done.stdout.splitlines():
+        if line.startswith(("FAILED", "ERROR")):
+            print(line, file=sys.stderr, flush=True)
+    found = re.search(SUMMARY, (done.stdout.strip().splitlines() or [""])[-1])
+    result = found[0].strip() if found else (done.stdout + done.stderr)[-120:]
+    done = run([python, "-m", "coil_rl.programs.train", *TRAINING], place)
+    reward = re.search(REWARD, done.stdout)
+    return row(name, *shown, result, reward[1] if reward else done.stderr[-120:])
 
 
 def main() -> None:
@@ -93,10 +122,14 @@ def main() -> None:
     unknown = sorted(set(given.only or ()) - set(environments))
     if unknown:
         sys.exit(f"--only {', '.join(unknown)}: there are {', '.join(environments)}")
-    print("| environment | versions | tests |\n| --- | --- | --- |", flush=True)
-    with tempfile.TemporaryDirectory() as folder:
-        for name in given.only or environments:
-            print(tried(name, *environments[name], given.tests, Path(folder)), flush=True)
+    print(row(*COLUMNS), row(*["---"] * len(COLUMNS)), sep="\n", flush=True)
+    for name in given.only or environments:
+        with tempfile.TemporaryDirectory() as folder:
+            place = Path(folder, "venv")
+            interpreter, pins = environments[name]
+            wrong = installed(interpreter, pins, place)
+            line = row(name, wrong) if wrong else tried(name, place, given.tests)
+            print(line, flush=True)
 
 
 if __name__ == "__main__":
