@@ -1,5 +1,6 @@
 """A plain function as a guide, of one observation or of a batch of them."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,8 +11,13 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from coil_rl.envs.gate import ForeignError, action_array, foreign
+from coil_rl.envs.gate import ForeignError, action_array, foreign, shown
 from coil_rl.transforms.action_space import nested_key
+
+# Factor and offset of a row, and of two others that a function for a batch must not mix with it:
+# one of its size, and one beyond all limits of a sum or a maximum.
+ROWS = ((1.0, 0.0), (0.37, 1.61), (-1000.0, 1000.0))
+ROUNDING = 1e-4  # of the largest number of an action
 
 
 class FunctionGuide(TensorDictModuleBase):
@@ -21,8 +27,9 @@ class FunctionGuide(TensorDictModuleBase):
 
     A function for a batch gets tensors [B, N] and returns actions [B, A]. One for a single
     observation gets NumPy arrays [N] and returns an action [A], a number or an index. Which of the
-    two it is, is found out at its first call: it is for a batch if it gives the same for a row in a
-    batch as for the row alone, or if it cannot take a row alone.
+    two it is, is found out at its first call: it is for a batch if it gives the same for a row
+    beside quite other ones as for the row alone, or if it cannot take a row alone. Then it is also
+    asked the same twice, because a function that remembers something would mix the rows.
 
     Args:
         function: takes one value for each of `in_keys`; it must give the same action for the same
@@ -32,7 +39,8 @@ class FunctionGuide(TensorDictModuleBase):
 
     Raises:
         ForeignError: at a call, for what the function raises, for a batch if it can take neither,
-            and for what it returns that is no action.
+            for what it returns that is no action, and at the first call for another action for the
+            same observation.
     """
 
     foreign = True
@@ -52,13 +60,14 @@ class FunctionGuide(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
+        flat = tensordict.select(*self.in_keys).reshape(-1)
         if self.for_batch is None:
-            first = tensordict.select(*self.in_keys).reshape(-1)
-            self.for_batch = self._takes_batch([first[key] for key in self.in_keys])
+            first = [flat[key] for key in self.in_keys]
+            self.for_batch = self._takes_batch(first)
+            self._check_repeats(first)
         if self.for_batch:
             action = self._of_batch([tensordict[key] for key in self.in_keys])
             return tensordict.set("action", action)
-        flat = tensordict.select(*self.in_keys).reshape(-1)
         entries = [flat[key] for key in self.in_keys]
         rows = [self._alone(entries, row) for row in range(len(flat))]
         if len({row.shape for row in rows}) > 1:
@@ -92,13 +101,52 @@ class FunctionGuide(TensorDictModuleBase):
     def _takes_batch(self, entries: Sequence[Tensor]) -> bool:
         """Return whether the function takes a batch, see the class."""
         try:
-            alone = torch.as_tensor(self._alone(entries, 0))
+            self._alone(entries, 0)
         except Exception:
             return True
+        rows = [_beside_others(entry[0]) for entry in entries]
         try:
-            twice = [torch.stack([entry[0], entry[0]]) for entry in entries]
-            both = torch.as_tensor(self.function(*twice)).cpu()
-            pair = torch.stack([alone, alone]).to(both.dtype)
-            return both.numel() == pair.numel() and torch.allclose(both.reshape(pair.shape), pair)
+            each = [torch.as_tensor(self._alone(rows, row)) for row in range(len(rows[0]))]
+            alone = torch.stack(each).double()
+            return all(self._agrees(rows, alone, order) for order in ([0, 1, 2], [2, 1, 0]))
         except Exception:
             return False
+
+    def _agrees(self, rows: Sequence[Tensor], alone: Tensor, order: list[int]) -> bool:
+        """Return whether the function gives rows together what it gives each of them alone.
+
+        Args:
+            rows: entries of the rows, [n, ...].
+            alone: the action of each row alone, [n, A].
+            order: of the rows.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of NumPy, which gets tensors here
+            together = torch.as_tensor(self.function(*(entry[order] for entry in rows)))
+        if together.numel() != alone.numel():
+            return False
+        difference = (together.cpu().reshape(alone.shape) - alone[order]).abs()
+        # NumPy and torch may add up in another order.
+        return bool((difference <= ROUNDING * alone[order].abs().amax(-1, keepdim=True)).all())
+
+    def _check_repeats(self, entries: Sequence[Tensor]) -> None:
+        """Refuse a function that gives another action when it is asked the same again."""
+        first, again = (self._first_action(entries) for _ in range(2))
+        if first.shape != again.shape or not torch.allclose(first, again, equal_nan=True):
+            raise ForeignError(
+                f"the controller {self.title} returned {shown(first)} and then {shown(again)} for "
+                "the same observation: all rows share a function, so it must not remember or draw "
+                "anything; write a class with act(observation) and reset()"
+            )
+
+    def _first_action(self, entries: Sequence[Tensor]) -> Tensor:
+        """Return the numbers of the action for the first row."""
+        if self.for_batch:
+            return torch.atleast_1d(self._of_batch(entries).detach())[:1].double().flatten()
+        return torch.as_tensor(self._alone(entries, 0)).double()
+
+
+def _beside_others(entry: Tensor) -> Tensor:
+    """Return an entry of a row, and of two quite other rows, [3, ...]."""
+    rows = [factor * entry.double() + offset for factor, offset in ROWS]
+    return torch.stack(rows).to(entry.dtype)

@@ -1,10 +1,13 @@
 """Controllers of others: what they raise or return that is no action is one sentence."""
 
+import itertools
+
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import TransformedEnv
 from worlds import continued
@@ -115,6 +118,30 @@ def test_network_that_fails_is_named():
 
     with pytest.raises(ForeignError, match=r"^the controller Broken: it raised RuntimeError: no"):
         driven(ControllerGuide(Broken()))
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        lambda x: -x[0],  # of two entries that are 0 at first
+        lambda x: (x - x.mean())[..., :1],
+        lambda x: (x / max(1.0, float(abs(x).max())))[..., :1],
+    ],
+    ids=["first entry", "less the mean", "scaled by the largest"],
+)
+def test_function_of_one_observation_does_not_mix_the_rows(action):
+    guide = ControllerGuide(action)
+    guide(TensorDict({"observation": torch.zeros(1, 2)}, [1]))
+    observations = torch.tensor([[1.0, 2.0], [40.0, -70.0]])
+    found = guide(TensorDict({"observation": observations}, [2]))["action"].flatten()
+    torch.testing.assert_close(found, torch.tensor([float(action(each)) for each in observations]))
+
+
+def test_function_that_remembers_is_refused():
+    calls = itertools.count()
+    for action in (lambda x: float(next(calls)), lambda x: x[:, :1] * 0 + next(calls)):
+        with pytest.raises(ForeignError, match=r"for the same observation: .* a class"):
+            driven(ControllerGuide(action))
 
 
 def test_function_cannot_change_what_the_agent_sees():
