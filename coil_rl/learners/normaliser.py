@@ -25,6 +25,8 @@ LIMIT = 10.0  # of a normalised number: an outlier must not become a huge input
 # An element is out of scale if its deviation is not between these two, or its mean is more than
 # that many deviations from 0; one that never changed is, beyond that number.
 SMALL, LARGE, FAR = 0.1, 10.0, 3.0
+ROUNDING = 1e-7  # of the size of an element: smaller deviations are that of float32
+TINIEST = 1e-60  # variance of an element that was always 0, in any unit
 MOST_SHOWN = 4  # elements in a message
 CHOICES = (OneHot, Categorical)  # specs of choices, of several at once too
 
@@ -126,7 +128,9 @@ class Moments(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         """Normalise values [*batch, *shape]."""
-        scaled = (values - self.mean) / (self.variance + 1e-8).sqrt()
+        # Relative, so that the unit of an element does not matter.
+        deviation = (self.variance + ROUNDING**2 * self.mean.square() + TINIEST).sqrt()
+        scaled = (values - self.mean) / deviation
         scaled = scaled.clamp(-LIMIT, LIMIT).to(values.dtype)
         return scaled if self.used is None else torch.where(self.used, scaled, values)
 

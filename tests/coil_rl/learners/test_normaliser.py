@@ -50,6 +50,20 @@ def test_moments_are_those_of_numpy_over_everything_seen():
     assert found(torch.full((2,), 1e9)).tolist() == [LIMIT, LIMIT]
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1e-3, 1e6])
+def test_normalised_numbers_are_the_same_in_any_unit(unit):
+    torch.manual_seed(0)
+    rows = torch.randn(1000, 3, dtype=torch.float64) + torch.tensor([0.0, 5.0, 0.0])
+    rows[:, 2] = 0  # never changes
+    one, other = Moments(torch.Size([3])), Moments(torch.Size([3]))
+    one.add(rows)
+    other.add(unit * rows)
+    torch.testing.assert_close(other(unit * rows), one(rows), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(
+        one(rows).std(0), torch.tensor([1.0, 1.0, 0.0]).double(), atol=1e-3, rtol=0
+    )
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_statistics_are_those_of_all_collected_observations_and_part_of_the_policy(kind):
     torch.manual_seed(0)
