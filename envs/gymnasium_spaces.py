@@ -4,6 +4,7 @@ A guide or policy of this project reads tensors of numbers. So a choice becomes 
 and nested Dict and Tuple spaces become nested keys.
 """
 
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeGuard
 
@@ -24,6 +25,10 @@ from torchrl.data import (
 from coil_rl.envs.gate import ForeignError, plain_array, shown
 
 MOST_CHOICES = 32  # of a whole number that is an action
+WATCHED = 256  # first observations, in which the range of each number is found
+# A number whose range has fewer steps of its dtype than COARSE is rounded too much to act on; fewer
+# than STILL are the rounding of the env itself.
+COARSE, STILL = 100.0, 1e-6
 
 
 class Entry:
@@ -66,6 +71,7 @@ class Entry:
                 "wrapper"
             )
         self.given = tuple(self.spec.shape)
+        self.id, self.unwatched = id, WATCHED
 
     def __call__(self, observation: Any) -> NDArray[Any]:
         """Return a copy of this entry of an observation, of the shape of `spec`.
@@ -94,12 +100,34 @@ class Entry:
         if value.dtype == self.dtype:
             converted = value.copy().reshape(self.given)
         else:
+            if self.unwatched and value.itemsize > self.dtype.itemsize:
+                self._watch(value)
             with np.errstate(over="ignore"):
                 converted = value.astype(self.dtype).reshape(self.given)
         if converted.dtype.kind == "f" and not np.isfinite(converted).all():
             wrong = float(value.reshape(-1)[~np.isfinite(converted.reshape(-1))][0])
             raise ForeignError(f"{self.title} holds {wrong}, not a finite number of {self.dtype}")
         return converted
+
+    def _watch(self, value: NDArray[Any]) -> None:
+        """Warn after the first observations if their numbers are too fine for the dtype."""
+        if self.unwatched == WATCHED:
+            self.low = self.high = value.astype(np.float64)
+        self.low, self.high = np.minimum(self.low, value), np.maximum(self.high, value)
+        self.unwatched -= 1
+        if self.unwatched or self.dtype.kind != "f":
+            return
+        with np.errstate(all="ignore"):  # of numbers that are refused anyway
+            step = np.spacing(np.maximum(abs(self.low), abs(self.high)).astype(self.dtype))
+            count = ((self.high - self.low) / step).ravel()
+        for index in np.flatnonzero((count > STILL) & (count < COARSE))[:1]:
+            low, high = self.low.flat[index], self.high.flat[index]
+            warnings.warn(
+                f"the env {self.id}: number {index} of {self.title} goes from {low} to {high}, but "
+                f"{self.dtype} has steps of {step.flat[index]:.2g} there, so agent and guide see "
+                "little of it: subtract its offset in a wrapper",
+                stacklevel=2,
+            )
 
     def _is_single(self, value: NDArray[Any]) -> bool:
         """Return whether a value is one number, which may have a dimension of its own."""

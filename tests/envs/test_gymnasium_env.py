@@ -251,6 +251,42 @@ def test_actions_of_a_space_reach_the_env(space, spec, shape):
     )
 
 
+class Place(gymnasium.Env):
+    """Moves a millimetre a step, from an offset on."""
+
+    action_space, observation_space = spaces.Discrete(2), spaces.Box(-np.inf, np.inf, (1,), float)
+
+    def __init__(self, offset, step=0.001):
+        self.offset, self.step_size = offset, step
+
+    def reset(self, *, seed=None, options=None):
+        self.place = self.offset
+        return np.array([self.place]), {}
+
+    def step(self, action):
+        self.place += self.step_size
+        return np.array([self.place]), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(
+    ("offset", "step", "coarse"),
+    [
+        (5_412_345.67, 0.001, True),
+        (1000.0, 0.001, False),
+        (5e6, 0.0, False),
+        (293.15, 1e-13, False),
+    ],
+)
+def test_numbers_too_fine_for_the_dtype_are_said(offset, step, coarse):
+    env = GymnasiumEnv(partial(Place, offset, step), max_steps=1000)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        env.rollout(300, break_when_any_done=False)
+    found = [str(each.message) for each in said if "float32 has steps of" in str(each.message)]
+    assert bool(found) == coarse
+    assert not coarse or "number 0 of the observation goes from 5412345.67" in found[0]
+
+
 def test_finished_row_stays_as_it_is():
     env = build("Echo-v0")
     carrier = env.reset()
