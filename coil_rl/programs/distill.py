@@ -15,7 +15,7 @@ def distill(config: DictConfig) -> float:
     from coil_rl.config.build import build_guides
     from coil_rl.config.start import run_configured
     from coil_rl.report.runs import read_runs
-    from coil_rl.report.table import TABLES, markdown_table
+    from coil_rl.report.table import TABLES, markdown_table, return_format
 
     table = []
     for name in build_guides(config):
@@ -38,9 +38,10 @@ def distill(config: DictConfig) -> float:
     columns = TABLES["proxies"]["columns"]
     print(markdown_table(table, {key: columns[key] for key in columns if key in table[0]}))
     worst = min(table, key=lambda row: row["reward"])
+    spec = return_format([worst["reward"], worst["guide_reward"]])
     print(
-        f"distill: made {len(table)}; the lowest mean reward is {worst['reward']:.1f}, "
-        f"that of its guide {worst['guide_reward']:.1f}"
+        f"distill: made {len(table)}; the lowest mean reward is {worst['reward']:{spec}}, "
+        f"that of its guide {worst['guide_reward']:{spec}}"
     )
     return float(worst["reward"])
 

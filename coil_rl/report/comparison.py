@@ -17,6 +17,7 @@ from coil_rl.errors import UserError
 from coil_rl.measures import Measure
 from coil_rl.report.runs import DRIVER, GUIDE, Run
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
+from coil_rl.report.table import return_format
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -181,7 +182,9 @@ class Comparison:
     @property
     def score(self) -> tuple[str, str]:
         """Name and number format of the scores."""
-        return ("reward / guide's", ".3f") if self.normalised else ("reward", ".1f")
+        if self.normalised:
+            return "reward / guide's", ".3f"
+        return "reward", return_format(group.score.mean for group in self.groups)
 
     def table(self, against: str | None = None) -> list[dict[str, Any]]:
         """Return one row per policy, guides first.

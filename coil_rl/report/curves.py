@@ -19,6 +19,7 @@ from matplotlib.ticker import EngFormatter
 from coil_rl.report import style
 from coil_rl.report.runs import CHOICE, RETURN, Run
 from coil_rl.report.statistics import Array, mean_interval
+from coil_rl.report.table import return_format
 
 Rows = Sequence[Mapping[str, object]]
 
@@ -86,7 +87,7 @@ def draw_guides(axes: Axes, guides: Mapping[str, float]) -> None:
     for (name, value), colour in zip(guides.items(), cycle(style.GUIDES), strict=False):
         axes.axhline(value, color=colour, ls=style.DASHED, lw=1.3, zorder=1.5)
         axes.annotate(
-            f"{name}\n{value:.1f}",
+            f"{name}\n{value:{return_format([value])}}",
             (1, value),
             (4, 0),
             xycoords=("axes fraction", "data"),

@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from coil_rl.files import whole_file
 from coil_rl.report import style
 from coil_rl.report.pictures import Picture
+from coil_rl.report.table import return_format
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -92,7 +93,8 @@ class Film(Picture):
             images = taken.get(name, [])[: max(1, -(-first["steps"] // self.every))]
             if images:
                 columns.append(images)
-                captions.append(f"{name}: return {first['reward']:.1f}")
+                spec = return_format([first["reward"]])
+                captions.append(f"{name}: return {first['reward']:{spec}}")
         if not columns:
             return
         frames = _side_by_side(columns, captions)

@@ -15,7 +15,7 @@ from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
-from coil_rl.report.table import TABLES, Table
+from coil_rl.report.table import RETURN_FORMAT, TABLES, Table, return_format
 
 Block = Table | str  # a table or a paragraph
 
@@ -38,7 +38,7 @@ def section(
     shown = with_cells(rows, comparison.score[1])
     for row, group in zip(shown, comparison.groups, strict=True):
         row |= _shares(row, group, columns)
-    parts = _parts(comparison, TERM, "term of the reward", ".1f")
+    parts = _parts(comparison, TERM, "term of the reward", RETURN_FORMAT)
     parts += _parts(comparison, PER_STEP, "reward of a step", ".3f")
     cases = cases_table(comparison.groups, "report_cases.csv")
     return [Table(shown, columns), *parts, cases]
@@ -143,7 +143,8 @@ def _before_to_after(curves: Sequence[Sequence[Mapping[str, float]]], key: str) 
     """Return the first and the last number of a column as a cell, means over the runs."""
     columns = [[line[key] for line in curve if not math.isnan(line[key])] for curve in curves]
     before, after = mean(column[0] for column in columns), mean(column[-1] for column in columns)
-    return f"{before:.1f} to {after:.1f}"
+    spec = return_format([before, after])
+    return f"{before:{spec}} to {after:{spec}}"
 
 
 def training(runs: Sequence[Run]) -> list[Table]:
@@ -277,9 +278,10 @@ def cases_table(groups: Sequence[Group], file: str) -> Block:
         for index, case in enumerate(group.cases):
             means = group.means(index)
             reward, completed = means["reward"], means.get("completed", 1.0)
-            row[case] = f"{reward:.1f} ({completed:.0%} completed)" if completed < 1 else reward
+            spec = return_format([reward])
+            row[case] = f"{reward:{spec}} ({completed:.0%} completed)" if completed < 1 else reward
         rows.append(row)
     columns = {"driver": ("mean reward", "")}
     for name in names:
-        columns[name] = (name, ".1f")
+        columns[name] = (name, RETURN_FORMAT)
     return Table(rows, columns)

@@ -4,7 +4,7 @@ import csv
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from itertools import chain
@@ -20,8 +20,30 @@ tabulate.MIN_PADDING = 0  # extra width of headings
 # Columns and notes by table.
 TABLES: Any = yaml.safe_load((resources.files("coil_rl.conf") / "tables.yaml").read_text("utf-8"))
 
+RETURN_FORMAT = "return"  # of a column of returns, whose unit is that of the env
+
 Rows = Sequence[Mapping[str, object]]
 Columns = Mapping[str, Sequence[str]]
+
+
+def return_format(returns: Iterable[float]) -> str:
+    """Return the number format of returns of one env, of which the largest has three digits.
+
+    At least one decimal is shown.
+
+    Args:
+        returns: that are shown beside each other.
+
+    Example:
+        >>> format(-36.38, return_format([-36.38])), format(0.12, return_format([0.12]))
+        ('-36.4', '0.120')
+    """
+    largest = max((abs(each) for each in returns if math.isfinite(each)), default=0.0)
+    if largest == 0 or largest >= 10:
+        return ".1f"
+    # From the text, in which 9.999 is 1.00e+01.
+    exponent = int(f"{largest:.2e}".partition("e")[2])
+    return f".{max(1, 2 - exponent)}f" if exponent >= -4 else ".2e"
 
 
 class Cell(NamedTuple):
@@ -65,10 +87,10 @@ class Table:
     @property
     def cells(self) -> list[list[Cell]]:
         """The cells of each row."""
-        specs = [spec for _, spec in self.columns.values()]
+        values = _values(self.rows, self.columns)
+        specs = _specs(values, self.columns)
         return [
-            [_cell(value, spec) for value, spec in zip(row, specs, strict=True)]
-            for row in _values(self.rows, self.columns)
+            [_cell(value, spec) for value, spec in zip(row, specs, strict=True)] for row in values
         ]
 
 
@@ -86,7 +108,8 @@ def markdown_table(rows: Rows, columns: Columns) -> str:
     Args:
         rows: one mapping per line. Missing keys, None and NaN become "-", booleans yes and no; text
             stays as it is, so a cell may be a formatted "31.2 ± 0.4".
-        columns: heading (with unit) and number format by key, in the order of the table.
+        columns: heading (with unit) and number format by key, in the order of the table. The format
+            `RETURN_FORMAT` is that of `return_format` for the column.
 
     Raises:
         ValueError: if no row has a column, or a number does not fit its format.
@@ -104,7 +127,7 @@ def markdown_table(rows: Rows, columns: Columns) -> str:
         | agent  |       - | yes   |
     """
     values = _values(rows, columns)
-    specs = [spec for _, spec in columns.values()]
+    specs = _specs(values, columns)
     return tabulate.tabulate(
         [
             [_escaped(_format(value, spec)) for value, spec in zip(row, specs, strict=True)]
@@ -126,6 +149,16 @@ def _values(rows: Rows, columns: Columns) -> list[list[object]]:
                 f"No row has {key!r} for the column {heading!r}; the rows have: {', '.join(keys)}."
             )
     return [[_to_python(row.get(key)) for key in columns] for row in rows]
+
+
+def _specs(values: Sequence[Sequence[object]], columns: Columns) -> list[str]:
+    """Return the number format of each column, given the values of each row."""
+    specs = [spec for _, spec in columns.values()]
+    for index, spec in enumerate(specs):
+        if spec == RETURN_FORMAT:
+            column = [row[index] for row in values]
+            specs[index] = return_format(float(each) for each in column if _is_number(each))  # type: ignore[arg-type]
+    return specs
 
 
 def _numeric(values: Sequence[Sequence[object]]) -> list[bool]:

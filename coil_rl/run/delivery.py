@@ -27,6 +27,7 @@ from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.anchor import hold_of
 from coil_rl.learners.learner import Learner
 from coil_rl.report.runs import DELIVERY
+from coil_rl.report.table import return_format
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
 from coil_rl.run.curve import EvaluationCurve
@@ -249,7 +250,8 @@ def handed_over(folder: Path) -> str | None:
     }
     if frames is not None:
         names["earlier"] = f"the policy after {int(frames):,} frames"
-    listed = ", ".join(f"{names.get(name, name)} {value:.1f}" for name, value in returns.items())
+    spec = return_format(returns.values())
+    listed = ", ".join(f"{names.get(name, name)} {value:{spec}}" for name, value in returns.items())
     title = names.get(chosen, f"the {chosen}")
     return (
         f"Handed over is {title}: mean returns in {cases} new cases of the training, whose steps "

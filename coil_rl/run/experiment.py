@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from coil_rl.errors import UserError, file_of_a_run, is_outside
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.output import decoration, progress, say
+from coil_rl.report.table import return_format
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases, guide_calls
 from coil_rl.run.curve import EvaluationCurve, Watch
@@ -273,7 +274,9 @@ class Experiment:
             "curve": self.metrics.newest(),
             "guide": guide_return,
         }
-        shown = {name: f"{value:.0f}" for name, value in returns.items() if value is not None}
+        known = {name: value for name, value in returns.items() if value is not None}
+        spec = return_format(known.values())
+        shown = {name: f"{value:{spec}}" for name, value in known.items()}
         bar.set_postfix(shown)
 
     @contextmanager

@@ -32,6 +32,7 @@ from coil_rl.output import decoration, progress, say
 from coil_rl.report import Returns, markdown_table, write_csv
 from coil_rl.report.pictures import Picture
 from coil_rl.report.statistics import mean_interval
+from coil_rl.report.table import RETURN_FORMAT, return_format
 from coil_rl.run.evaluation import EvaluationResult, evaluate_policy
 from coil_rl.run.fallback import Fallback
 from coil_rl.run.parts import TEST, EnvMaker
@@ -42,7 +43,7 @@ COLUMNS = {
     "advice": ("advice", ""),
     "actions": ("actions", ""),
     "case": ("case", ""),
-    "reward": ("reward", ".1f"),
+    "reward": ("reward", RETURN_FORMAT),
 }
 MAX_CASES = 8  # in the table for people
 ALLOWED_LOSS = 0.01  # of the guide's mean reward, for a policy that is not worse
@@ -311,9 +312,11 @@ def not_worse(policy: EvaluationResult, guide: EvaluationResult, name: str) -> s
         answer = "yes"
     elif high < margin:
         answer = "no"
+    spec = return_format([policy.mean_reward, guide.mean_reward])
+    interval = f"{low:+{spec}} to {high:+{spec}}"
     return (
         f"Not worse than {name} on these {len(policy.episodes)} cases: {answer} "
-        f"(difference of the rewards {low:+.1f} to {high:+.1f}, 95 % interval; 1 % is allowed)."
+        f"(difference of the rewards {interval}, 95 % interval; 1 % is allowed)."
     )
 
 
@@ -348,7 +351,8 @@ def report_outcome(folder: Path) -> float:
         page = read_text(folder / "evaluation.md", LARGEST_NUMBERS).rstrip()
     say(page)
     share = "" if math.isnan(completed) else f", {completed:.0%} completed"
-    say(f"{last['driver']}: mean test reward {reward:.1f}{share}; see {folder}")
+    shown = format(reward, return_format([reward]))
+    say(f"{last['driver']}: mean test reward {shown}{share}; see {folder}")
     return reward
 
 

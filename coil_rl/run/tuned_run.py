@@ -23,6 +23,7 @@ from coil_rl.guides.simple import FollowAdvice
 from coil_rl.output import decoration, progress, say
 from coil_rl.report import draw_learning_curves
 from coil_rl.report.runs import DELIVERY, EVALUATION
+from coil_rl.report.table import return_format
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
 from coil_rl.run.curve import measures
@@ -145,7 +146,8 @@ class TunedRun(Run):
                 metrics.append(row)
                 metrics.flush()
                 bar.update(tuner.cases.steps - before)
-                bar.set_postfix({"candidates": f"{row['train/return']:.1f}"})
+                shown = format(row["train/return"], return_format([row["train/return"]]))
+                bar.set_postfix({"candidates": shown})
                 self._save(tuner)
                 if STOP.requested:
                     raise KeyboardInterrupt

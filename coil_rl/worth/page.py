@@ -16,14 +16,15 @@ from coil_rl.config.written import key_of
 from coil_rl.report import markdown_table, style
 from coil_rl.report.curves import RETURNS, draw_guides, mean_curve, points
 from coil_rl.report.runs import RETURN, Run
+from coil_rl.report.table import RETURN_FORMAT, return_format
 from coil_rl.worth.arms import ARMS, TUNE
 from coil_rl.worth.outcome import Outcome
 from coil_rl.worth.verdict import Entry, Verdict, difference
 
 COLUMNS = {
     "policy": ("policy", ""),
-    "return": ("return", ".1f"),
-    "worst": ("worst case", ".1f"),
+    "return": ("return", RETURN_FORMAT),
+    "worst": ("worst case", RETURN_FORMAT),
     "failures": ("failed", ".0%"),
     "seeds": ("seeds", "d"),
     "frames": ("frames", ",.0f"),
@@ -79,9 +80,10 @@ def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> str:
     own = float(entry.returns[0].mean())
     lost = (own - late.mean) / (own - random.mean)
     kept = f"it keeps {1 - lost:.0%} of its distance from random actions"
+    spec = return_format([late.mean, own])
     return (
         f"With one step of delay on observation and action, which it was not trained with, "
-        f"{entry.name} has {late.mean:.1f} instead of {own:.1f} ({found}): {kept}."
+        f"{entry.name} has {late.mean:{spec}} instead of {own:{spec}} ({found}): {kept}."
     )
 
 

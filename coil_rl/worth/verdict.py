@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.report.statistics import mean_interval
+from coil_rl.report.table import return_format
 from coil_rl.worth.arms import GUIDE, NETWORK, OPPOSITE, PPO, RANDOM, TUNE, ZERO
 
 MATERIAL = 0.01  # of the scale
@@ -52,6 +53,11 @@ class Entry:
         return float(self.returns.mean())
 
     @property
+    def shown(self) -> str:
+        """The mean as a text."""
+        return format(self.mean, return_format([self.mean]))
+
+    @property
     def learns(self) -> bool:
         """Whether it is the policy of a training."""
         return self.name not in (GUIDE, OPPOSITE, ZERO, RANDOM, NETWORK, TUNE)
@@ -66,19 +72,22 @@ class Difference:
         low: lower end of its 95 % t interval over the cases.
         high: upper end.
         seeds: means of each pair of seeds.
+        spec: number format of the returns.
     """
 
     mean: float
     low: float
     high: float
     seeds: tuple[float, ...]
+    spec: str = ".1f"
 
     def above(self, least: float) -> bool:
         """Return whether it is clearly above 0, and at least `least`."""
         return self.low > 0 and min(self.seeds) > 0 and self.mean >= least
 
     def __str__(self) -> str:
-        return f"{self.mean:+.1f} ({self.low:+.1f} to {self.high:+.1f})"
+        mean, low, high = (f"{each:+{self.spec}}" for each in (self.mean, self.low, self.high))
+        return f"{mean} ({low} to {high})"
 
 
 def difference(one: Entry, other: Entry) -> Difference:
@@ -92,7 +101,8 @@ def difference(one: Entry, other: Entry) -> Difference:
         seeds = of_seeds - of_others
     else:
         seeds = (of_seeds[:, None] - of_others[None, :]).ravel()
-    return Difference(mean, low, high, tuple(seeds.tolist()))
+    spec = return_format([one.mean, other.mean])
+    return Difference(mean, low, high, tuple(seeds.tolist()), spec)
 
 
 @dataclass(frozen=True)
@@ -152,11 +162,12 @@ def verdict(entries: Mapping[str, Entry], failed: Sequence[str] = ()) -> Verdict
 def _nothing(best: Entry, random: Entry, entries: Mapping[str, Entry]) -> tuple[str, ...]:
     """Return the sentences where nothing is better than random actions."""
     found = difference(best, random)
+    named = {name: entries[name].shown for name in (GUIDE, OPPOSITE)}
     return (
-        f"Nothing here is clearly better than random actions ({random.mean:.1f}): neither the "
-        f"guide ({entries[GUIDE].mean:.1f}), nor its opposite ({entries[OPPOSITE].mean:.1f}), nor "
-        "what was learned in this time.",
-        f"The best is {best.name} with {best.mean:.1f}, {found} against random actions.",
+        f"Nothing here is clearly better than random actions ({random.shown}): neither the guide "
+        f"({named[GUIDE]}), nor its opposite ({named[OPPOSITE]}), nor what was learned in this "
+        "time.",
+        f"The best is {best.name} with {best.shown}, {found} against random actions.",
         "Undecided is everything: give more time (minutes=20), or look at the reward and at the "
         "guide.",
     )
@@ -168,23 +179,21 @@ def _what(use: Entry, guide: Entry, score: float, wrong: bool) -> str:
     if wrong:
         start = "Your guide is the wrong way round. "
     if use.name == GUIDE and score >= AT_BEST:
-        return f"Leave it: your guide is at {score:.2f} of what was reached ({guide.mean:.1f})."
+        return f"Leave it: your guide is at {score:.2f} of what was reached ({guide.shown})."
     if use.name == GUIDE:
         return (
-            f"Keep your guide ({guide.mean:.1f}): it is at {score:.2f} of what was reached, and "
+            f"Keep your guide ({guide.shown}): it is at {score:.2f} of what was reached, and "
             "nothing is clearly better."
         )
     if use.name == OPPOSITE:
         return (
-            f"{start}Turn its action round: the opposite has {use.mean:.1f}, the guide "
-            f"{guide.mean:.1f}."
+            f"{start}Turn its action round: the opposite has {use.shown}, the guide {guide.shown}."
         )
     if use.name == TUNE:
         return (
-            f"{start}Use your guide with the tuned numbers: {use.mean:.1f} instead of "
-            f"{guide.mean:.1f}."
+            f"{start}Use your guide with the tuned numbers: {use.shown} instead of {guide.shown}."
         )
-    return f"{start}Use {use.name}: {use.mean:.1f} (guide {guide.mean:.1f}, at {score:.2f} of it)."
+    return f"{start}Use {use.name}: {use.shown} (guide {guide.shown}, at {score:.2f} of it)."
 
 
 def _gained(use: Entry, entries: Mapping[str, Entry]) -> str:
@@ -223,7 +232,8 @@ def _undecided(use: Entry, candidates: Sequence[Entry], least: float, failed: Se
     )
     few = "Each training ran once, which says nothing about another seed."
     if seeds > 1:
-        few = f"{seeds} seeds say little about others: theirs differ by up to {spread:.1f}."
+        spec = return_format([spread])
+        few = f"{seeds} seeds say little about others: theirs differ by up to {spread:{spec}}."
     if not parts:
         return f"Undecided is what a whole training would change. {few}"
     return f"Undecided is {'; and '.join(parts)}. {few}"

@@ -71,8 +71,8 @@ def test_terms_of_the_reward_are_beside_the_sum(tmp_path):
     terms = cells(section(tmp_path)[1])
     assert terms == [
         ["term of the reward", "cone", "smooth"],
-        ["guide", "2.0", "-1.0"],
-        ["coil", "2.8", "-0.2"],
+        ["guide", "2.00", "-1.00"],
+        ["coil", "2.75", "-0.25"],
     ]
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from coil_rl.report.table import markdown_table, write_csv
+from coil_rl.report.table import RETURN_FORMAT, markdown_table, write_csv
 
 ROWS = [
     {"driver": "guide", "lap": 31.256, "crashes": 0.0, "done": True, "laps": 2},
@@ -32,6 +32,24 @@ def test_columns_choose_order_and_align_the_cells():
         == "|    2 | yes |"
     )
     assert "lap (s)" in markdown_table([], {"lap": ("lap (s)", ".2f")})
+
+
+@pytest.mark.parametrize(
+    ("returns", "expected"),
+    [
+        ([-81.73, 0.44], ["-81.7", "0.4"]),
+        ([9.996, 9.957], ["10.0", "10.0"]),
+        ([1.0, 0.9745], ["1.00", "0.97"]),
+        ([0.0123, 0.0, math.nan], ["0.0123", "0.0000", "-"]),
+        ([-8.173e-5, 2e-6], ["-8.17e-05", "2.00e-06"]),
+        ([-3.25e8], ["-325000000.0"]),
+        ([0.0], ["0.0"]),
+    ],
+)
+def test_returns_have_enough_digits_in_any_unit(returns, expected):
+    rows = [{"return": each} for each in returns]
+    lines = markdown_table(rows, {"return": ("return", RETURN_FORMAT)}).splitlines()[2:]
+    assert [line.strip("| ") for line in lines] == expected
 
 
 def test_text_cannot_break_the_table():
