@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase, is_tensor_collection
+from tensordict import NestedKey, TensorDict, TensorDictBase, is_tensor_collection, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type
@@ -51,6 +51,8 @@ class Controller:
             raise ValueError(f"a controller needs an env of one row, not {list(env.batch_size)}")
         self.env, self.policy = undisturbed(env.eval()), policy
         self.plant, self.folder = env.base_env, folder
+        guides = [part for part in self.env.transform.modules() if isinstance(part, GuideActions)]
+        self.read = {unravel_key(key) for part in (policy, *guides) for key in part.in_keys}
         self._check_read()
         self.reset()
 
@@ -72,7 +74,7 @@ class Controller:
             takes; for a TorchRL env an array of the action.
 
         Raises:
-            ValueError: if the observation does not fit the env.
+            ValueError: if the observation does not fit the env, or lacks what is read.
         """
         return self._decoded(self.act_on(self._entries(observation)))
 
@@ -109,14 +111,12 @@ class Controller:
 
     def _check_read(self) -> None:
         """Refuse a policy or guide that reads what is no part of an observation."""
-        guides = [part for part in self.env.transform.modules() if isinstance(part, GuideActions)]
-        for part in (self.policy, *guides):
-            for key in part.in_keys:
-                if isinstance(key, tuple) and key[0] == "info":
-                    raise ValueError(
-                        f"{'/'.join(key)} is read by the policy or its guide, but is no part of an "
-                        "observation"
-                    )
+        for key in self.read:
+            if isinstance(key, tuple) and key[0] == "info":
+                raise ValueError(
+                    f"{'/'.join(key)} is read by the policy or its guide, but is no part of an "
+                    "observation"
+                )
         if isinstance(self.plant, GymnasiumEnv) and self.plant.rows[0].controllers:
             names = ", ".join(self.plant.rows[0].controllers)
             warnings.warn(
@@ -152,6 +152,7 @@ class Controller:
                 names = ", ".join(map(str, (key, *others)))
                 raise ValueError(f"this env has the entries {names}; give a mapping with them")
             observation = {key: observation}
+        given = set[NestedKey]()
         for key, value in observation.items():
             if key not in spec.keys(True):
                 continue
@@ -159,9 +160,20 @@ class Controller:
                 for inner, part in value.items():
                     if (key, inner) in spec.keys(True, True):
                         _put(entries, (key, inner), part)
+                        given.add((key, inner))
             else:
                 _put(entries, key, value)
+                given.add(key)
+        self._check_given(given, entries)
         return entries
+
+    def _check_given(self, given: set[NestedKey], entries: TensorDictBase) -> None:
+        """Refuse an observation without an entry that is read, or with one that is not finite."""
+        for key in self.read.intersection(entries.keys(True, True)):
+            if key not in given:
+                raise ValueError(f"{key} is missing, which the policy or its guide reads")
+            if not entries[key].isfinite().all():
+                raise ValueError(f"{key} holds a number that is not finite")
 
     def _decoded(self, action: Tensor) -> Any:
         if isinstance(self.plant, GymnasiumEnv):

@@ -131,3 +131,7 @@ def test_cone_world_is_sent_its_steering(tmp_path):
             step, carrier = env.step_and_maybe_reset(policy(carrier))
             sent = torch.as_tensor(controller.act(observation))
             torch.testing.assert_close(sent, step["next", "executed_action"][0], rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match="cones is missing, which the policy or its guide reads"):
+        controller.act(observation.exclude("cones"))
+    with pytest.raises(ValueError, match="observation holds a number that is not finite"):
+        controller.act(observation.clone().set("observation", observation["observation"] / 0))
