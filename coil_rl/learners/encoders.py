@@ -38,7 +38,10 @@ def entry_specs(
             ", ".join(key if isinstance(key, str) else "/".join(key) for key in keys)
             for keys in (missing, available)
         ]
-        raise KeyError(f"the env has no entry {names[0]} to observe; it has {names[1]}")
+        raise KeyError(
+            f"the env has no entry {names[0]} to observe; it has {names[1]}: name "
+            "some of them by observes=[ENTRY,...], from Python by in_keys"
+        )
     shape = env.batch_size
     return [
         Unbounded((*shape, *extra[key]), device=env.device) if key in extra else spec[key]

@@ -287,8 +287,11 @@ class Experiment:
         except Exception as error:
             if not is_outside(error):
                 raise
+            kept = "there is no checkpoint yet"
+            if (self.folder / checkpoint.NEWEST).exists():
+                kept = "the last good checkpoint is kept"
             raise UserError(
-                f"{error}; the last good checkpoint is kept: correct the cause and continue with "
+                f"{error}; {kept}: correct the cause and continue with "
                 f"{resume_command(self.folder)}, or train again with other values"
             ) from error
 

@@ -15,7 +15,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
+from coil_rl.errors import NO_SPACE, UserError, file_of_a_run, is_outside
 from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.measures import Measure
@@ -320,6 +320,13 @@ class Run:
             reward = report_outcome(self.folder)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"continue with: {resume_command(self.folder)}") from None
+        except ValueError as error:  # of env or controller, before or after the training
+            if isinstance(error, UserError) or not is_outside(error):
+                raise
+            raise UserError(
+                f"{error}; what is finished is kept: correct the cause and continue with "
+                f"{resume_command(self.folder)}"
+            ) from error
         except OSError as error:
             if error.errno not in NO_SPACE:
                 raise

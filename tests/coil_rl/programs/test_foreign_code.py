@@ -63,6 +63,12 @@ class TrainingOnly(Plant):
         return answer[:4] if self.seed < 1_000_000_000 and self.time == 11 else answer
 
 
+class TableOnly(Plant):
+    def step(self, action):
+        answer = super().step(action)
+        return answer[:4] if self.np_random_seed in range(10**9, 11 * 10**8) else answer
+
+
 class Unseeded(Plant):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -134,10 +140,14 @@ def test_fault_ends_a_program_with_one_sentence(program, env, words, message, tm
     assert "Traceback" not in done.stderr
 
 
-def test_fault_in_training_says_how_to_go_on(tmp_path):
-    words = [*TINY, "method=ppo", "env.id=odd_plants:TrainingOnly", "evaluation.gif=false"]
+@pytest.mark.parametrize(
+    ("env", "kept"),
+    [("TrainingOnly", "there is no checkpoint yet"), ("TableOnly", "what is finished is kept")],
+)
+def test_fault_says_how_to_go_on(env, kept, tmp_path):
+    words = [*TINY, "method=ppo", f"env.id=odd_plants:{env}", "evaluation.gif=false"]
     done = called("train", *words, cwd=tmp_path, code=2)
-    assert "the last good checkpoint is kept" in done.stderr
+    assert f"{kept}: correct the cause and continue with coil-train resume=" in done.stderr
 
 
 def test_env_that_ignores_its_seed_and_cannot_draw_is_trained_with_warnings(tmp_path):
