@@ -27,7 +27,7 @@ from coil_rl.guides import PerRow
 from coil_rl.run.parts import TRAIN
 from coil_rl.run.policy_batch import memory_keys
 from coil_rl.run.run import Run
-from coil_rl.transforms.action_space import first_choices
+from coil_rl.transforms.action_space import ActionSpace, first_choices
 from coil_rl.transforms.normalised_action import normalising
 
 LONGEST_CHAIN = 4  # learned guides of learned guides
@@ -72,8 +72,28 @@ class LearnedGuide(TensorDictModuleBase):
                 guide = PerRow(partial(_OneRow, opened, which), all_rows.plant_keys)
         self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
         self.guide, self.first = guide, all_rows.first
+        self.folder, self.space = folder, all_rows.space
         self.requires_grad_(False)
         self.eval()
+
+    def in_space(self, space: ActionSpace) -> None:
+        """Check the action of an env.
+
+        Args:
+            space: of the actions of the env.
+
+        Raises:
+            UserError: if the policy acts between other bounds, which may be in another unit.
+        """
+        own, given = self.space.bounds, space.bounds
+        if own is None or given is None or self.space.event != space.event:
+            return  # another number of them is refused at the first action
+        if not all(torch.allclose(*pair) for pair in zip(own, given, strict=True)):
+            shown = [f"{low.tolist()} to {high.tolist()}" for low, high in (own, given)]
+            raise UserError(
+                f"run={self.folder} acts from {shown[0]}, but the action of this env goes from "
+                f"{shown[1]}: give a run in an env with the same action, or convert it by a wrapper"
+            )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` as executed by the env, and the next state of a policy with a memory."""
@@ -90,6 +110,7 @@ class _AllRows(TensorDictModuleBase):
         needs_past: whether it has such a past, so that it must not be used.
         plant_keys: entries of the env of the run.
         first: lowest numbers of the choices of the env, [n] or one; None: 0.
+        space: of the actions of the env of the run.
     """
 
     def __init__(self, config: DictConfig, run: Run, which: str) -> None:
@@ -103,6 +124,8 @@ class _AllRows(TensorDictModuleBase):
         self.in_keys, self.out_keys = list(self.policy.in_keys), ["action", *memory]
         specs = env.base_env.observation_spec
         self.plant_keys = observed(env.base_env)
+        base = env.base_env
+        self.space = ActionSpace(base.full_action_spec[base.action_key], len(base.batch_size))
         lowest = first_choices(env.base_env)
         self.first = None if lowest is None else lowest.squeeze()
         self.transforms, self.needs_past = None, False

@@ -199,6 +199,16 @@ def test_longer_run_goes_on_and_says_what_its_schedules_mean(tmp_path, capsys):
     assert "schedules over the run, such as a learning rate, go on at 80% of their way" in error
 
 
+def test_learned_guide_of_an_action_in_another_unit_is_refused(tmp_path):
+    wrapper = "_target_: gymnasium.wrappers.RescaleAction, _partial_: true"
+    percent = f"env.wrappers=[{{{wrapper}, min_action: 0, max_action: 100}}]"
+    first = coil_rl.train(ENV, frames=32, folder=tmp_path / "first", overrides=[*SHORT, percent])
+    message = r"/first acts from \[0.0\] to \[100.0\], but the action of this env goes from \[0.0\]"
+    options = {"guide": first.controller(), "folder": tmp_path / "next", "overrides": SHORT}
+    with pytest.raises(coil_rl.UserError, match=message):
+        coil_rl.train(ENV, frames=32, **options)
+
+
 def test_run_begins_from_the_policy_and_normaliser_of_another(tmp_path):
     first = coil_rl.train(
         ENV, frames=64, folder=tmp_path / "first", overrides=[*SHORT, "learner.normalise=true"]
