@@ -36,8 +36,11 @@ from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
 from coil_rl.report.runs import EVALUATION, SELECTION
+from coil_rl.run import checkpoint
+from coil_rl.run.folder import weights_file
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
 from coil_rl.run.run import HANDED_OVER
+from coil_rl.run.training import INIT
 from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_actions import UnfitActionError
@@ -294,12 +297,28 @@ def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
     check_proxies(config, guides_without_parameters(guides))
     untrained = guides_with_untrained_proxies(config) if guides else None
     learner = build.build_learner(config, env, untrained)
+    _check_init(config, learner)
     _check_batch(config, learner)
     _check_validation(config, learner)
     _check_curve(config, make_env)
     if config.logger:
         check_logger(check_node(config.logger, "logger"))
     _check_watch(config, env)
+
+
+def _check_init(config: DictConfig, learner: Learner) -> None:
+    """Raise a `UserError` if the run begins with the policy of another one that does not fit."""
+    if not config.init or (Path(config.run_dir) / INIT).exists():  # it has begun already
+        return
+    path = weights_file(Path(config.init).expanduser())
+    state = checkpoint.load(path)
+    try:
+        learner.policy.load_state_dict(state)
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"init={config.init}: its policy does not fit this run; give the method, the entries "
+            f"that it observes and the network of {path.parent / 'config.yaml'}"
+        ) from error
 
 
 def _check_batch(config: DictConfig, learner: Learner) -> None:

@@ -218,13 +218,14 @@ def test_run_begins_from_the_policy_and_normaliser_of_another(tmp_path):
     before = checkpoint.load(first.folder / "policy_last.pt")
     after = checkpoint.load(second.folder / "policies" / f"{0:012d}.pt")
     assert all(torch.equal(before[name], after[name]) for name in before)
-    with pytest.raises(coil_rl.UserError, match="does not fit the networks"):
+    with pytest.raises(coil_rl.UserError, match=r"init=.*: its policy does not fit this run"):
         coil_rl.train(
             ENV,
             frames=32,
             folder=tmp_path / "third",
             overrides=[*SHORT, "learner.hidden=[8]", f"init={first.folder}"],
         )
+    assert not (tmp_path / "third").exists()
 
 
 def test_run_from_parts_is_trained_resumed_and_reported(tmp_path):
