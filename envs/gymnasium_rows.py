@@ -2,6 +2,7 @@
 
 import inspect
 import pkgutil
+import warnings
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -168,7 +169,7 @@ class Rows(RowsInTurn):
         info: Sequence[str],
         like: Env | None = None,
     ) -> None:
-        self.info = tuple(info)
+        self.info, self.unseen = tuple(info), set(info)
         self.rows: list[Row] = [make_row(numbers[0])]
         first = self.rows[0]
         self.like = first.gate.env if like is None else like
@@ -213,12 +214,27 @@ class Rows(RowsInTurn):
         }
         for entry, array in zip(self.entries, observed, strict=True):
             found[entry.key if len(entry.key) > 1 else entry.key[0]] = array
+        if self.unseen:
+            self._look_for_info()
         for name in self.info:
             numbers = np.array([row.number_of(name) for row in rows], dtype=rows[0].dtype)
             found["info", name] = numbers.reshape(-1, 1)
         for name in rows[0].controllers:
             found["controller", name] = np.array([row.advice[name] for row in rows])
         return found
+
+    def _look_for_info(self) -> None:
+        """Warn of a name that no info has had when the first episode is over, and counts as 0."""
+        self.unseen.difference_update(*(row.info for row in self.rows))
+        if self.unseen and any(row.terminated or row.truncated for row in self.rows):
+            missing = ", ".join(sorted(self.unseen))
+            known = sorted({str(name) for row in self.rows for name in row.info})
+            warnings.warn(
+                f"the env {self.rows[0].name} had no {missing} in the info of an episode, which "
+                f"counts as 0; at its end it has {', '.join(known) or 'nothing'}",
+                stacklevel=2,
+            )
+            self.unseen.clear()
 
     def picture(self, row: int) -> NDArray[np.uint8]:
         """Return a picture of a row."""

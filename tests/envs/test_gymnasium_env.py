@@ -287,6 +287,23 @@ def test_numbers_too_fine_for_the_dtype_are_said(offset, step, coarse):
     assert not coarse or "number 0 of the observation goes from 5412345.67" in found[0]
 
 
+@pytest.mark.parametrize(("name", "said"), [("success", False), ("sucess", True)])
+def test_name_that_is_never_in_info_is_said(name, said):
+    class Ends(Place):
+        def step(self, action):
+            observation, reward, *_ = super().step(action)
+            over = self.place > 0.0025
+            return observation, reward, over, False, {"success": True} if over else {}
+
+    env = GymnasiumEnv(partial(Ends, 0.0), info=[name])
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        env.rollout(10)
+    texts = [str(each.message) for each in found]
+    expected = "had no sucess in the info of an episode, which counts as 0; at its end it has suc"
+    assert any(expected in text for text in texts) == said
+
+
 def test_finished_row_stays_as_it_is():
     env = build("Echo-v0")
     carrier = env.reset()
