@@ -401,7 +401,7 @@ def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
     [
         ("CartPol-v1", {}, "the env CartPol-v1 cannot be made: .*Did you mean: `CartPole`"),
         ("MyPlant-v0", {}, "write PACKAGE:MyPlant-v0"),
-        ("no_such_module:X-v0", {}, "No module named 'no_such_module'"),
+        ("no_such_module:X-v0", {}, "there is no module no_such_module; install its package"),
         ("CartPole-v1", {"options": {"colour": 1}}, "unexpected keyword argument 'colour'$"),
         ("CartPole-v1", {"num_envs": 0}, "num_envs=0 must be at least 1"),
         ("CartPole-v1", {"max_steps": 0}, "max_steps=0 must be at least 1"),

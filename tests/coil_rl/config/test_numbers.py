@@ -60,7 +60,7 @@ def test_node_gets_other_numbers_and_keeps_the_rest():
 def test_guide_is_built_with_other_items_of_a_list():
     make = GuideWithNumbers(composed("env=cart_pole"))
     guide = make({"weights.2": -1.0})
-    assert guide.module.keywords["weights"] == [0.1, 0.3, -1.0, 0.5]
+    assert guide.function.keywords["weights"] == [0.1, 0.3, -1.0, 0.5]
 
 
 def test_bounds_are_read_with_the_own_value():
