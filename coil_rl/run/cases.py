@@ -48,7 +48,7 @@ class TrainingCases:
     def __post_init__(self) -> None:
         self.generator = torch.Generator().manual_seed(self.seed)
         self.env: EnvBase | None = None
-        self.env_seed, self.count = 0, 0
+        self.env_seed, self.count, self.copies = 0, 0, 1
         self.taken: list[int] = []
 
     def begin(self) -> None:
@@ -58,39 +58,45 @@ class TrainingCases:
     def renew(self, count: int, copies: int = 1) -> None:
         """Draw that many new cases.
 
+        An env with their rows is made when a policy acts in them.
+
         Args:
             count: number of cases.
             copies: number of rows that have each case; row i has case `i % count`. Only an env
                 for which `can_copy` holds has more than one.
         """
         self.env_seed = int(torch.randint(SEEDS, (), generator=self.generator))
-        self.count = count
-        self._copy(copies)
+        self.count, self.copies = count, copies
+        if self.env is None:
+            self._copy(copies)
 
     def can_copy(self) -> bool:
         """Return whether several rows of the env can have the same case.
 
         They cannot where rows that begin alike draw different numbers later.
         """
-        if self.env is None:
-            self._build(SOME_ROWS)
-        seeded = seeded_env(self.env)
-        if seeded is None or seeded.draws_in_steps or self.env is None:
+        env = self._build(SOME_ROWS) if self.env is None else self.env
+        seeded = seeded_env(env)
+        if seeded is None or seeded.draws_in_steps:
             return False
-        return not any(isinstance(part, SeededGenerator) for part in self.env.modules())
+        return not any(isinstance(part, SeededGenerator) for part in env.modules())
 
-    def _copy(self, copies: int) -> None:
-        """Give each of the present cases that many rows."""
-        self._build(self.count * copies)
-        seeded = seeded_env(self.env)
+    def _copy(self, copies: int) -> EnvBase:
+        """Return an env that has each of the present cases in that many rows."""
+        if self.count == 0:
+            raise RuntimeError("there are no cases yet; call renew first")
+        env = self._build(self.count * copies)
+        seeded = seeded_env(env)
         if seeded is not None:
             seeded.different = self.count if copies > 1 else None
+        return env
 
-    def _build(self, rows: int) -> None:
-        """Make the env with that many rows, unless it has them."""
+    def _build(self, rows: int) -> EnvBase:
+        """Return the env with that many rows; it is made unless it has them."""
         if self.env is None or self.env.batch_size.numel() != rows:
             with torch.random.fork_rng():
                 self.env = self.build(rows)
+        return self.env
 
     def compared(
         self, policies: Sequence[TensorDictModuleBase], sampled: Sequence[bool] | None = None
@@ -106,14 +112,14 @@ class TrainingCases:
         """
         sampled = [False] * len(policies) if sampled is None else sampled
         if len(policies) > 1 and self._can_act_beside(policies):
-            self._copy(len(policies))
-            totals = self._acted(PoliciesBeside(policies, sampled), sampled=False)
+            env = self._copy(len(policies))
+            totals = self._acted(env, PoliciesBeside(policies, sampled), sampled=False)
             self.taken = [int(part.sum()) for part in totals.steps.split(self.count)]
             return list(totals.results()["return"].split(self.count))
-        self._copy(1)
+        env = self._copy(1)
         self.taken, returns = [], []
         for policy, samples in zip(policies, sampled, strict=True):
-            totals = self._acted(policy, sampled=samples)
+            totals = self._acted(env, policy, sampled=samples)
             self.taken.append(int(totals.steps.sum()))
             returns.append(totals.results()["return"])
         return returns
@@ -129,28 +135,27 @@ class TrainingCases:
 
     def returns(self, policy: TensorDictModuleBase) -> Tensor:
         """Return the return of a policy in each row of the present cases, [rows]."""
-        return self._acted(policy, sampled=False).results()["return"]
+        env = self._copy(self.copies)
+        return self._acted(env, policy, sampled=False).results()["return"]
 
     @torch.no_grad()
-    def _acted(self, policy: TensorDictModuleBase, *, sampled: bool) -> Totals:
+    def _acted(self, env: EnvBase, policy: TensorDictModuleBase, *, sampled: bool) -> Totals:
         """Return the totals of a policy in the rows of the present cases, and count its steps."""
-        if self.env is None:
-            raise RuntimeError("there are no cases yet; call renew first")
         totals = Totals({"return": Measure("episode_reward", "last")})
-        before = guide_calls(self.env)
+        before = guide_calls(env)
         with (
             torch.random.fork_rng(),
             progress(unit="step", desc="test", leave=False, mininterval=0.5) as bar,
         ):
-            self.env.set_seed(self.env_seed)
-            for number, part in enumerate(self.env.modules()):
+            env.set_seed(self.env_seed)
+            for number, part in enumerate(env.modules()):
                 if isinstance(part, SeededGenerator):  # of a transform: the env does not seed it
                     part.generator.manual_seed(self.env_seed + number)
             torch.manual_seed(self.env_seed)
-            for after, running in episodes(self.env, policy, sampled=sampled, tick=bar.update):
+            for after, running in episodes(env, policy, sampled=sampled, tick=bar.update):
                 totals.add(after, running)
         self.steps += int(totals.steps.sum())
-        self.calls += guide_calls(self.env) - before
+        self.calls += guide_calls(env) - before
         return totals
 
     def state_dict(self) -> dict[str, Any]:

@@ -131,10 +131,12 @@ def test_cases_of_the_cone_world_are_new_places_with_the_whole_time_limit():
 def test_rows_may_begin_in_the_same_cases(words):
     cases, _ = built(*words, "training.tests.starts=30" if "guide=zero" in words else "seed=0")
     assert cases.can_copy()
+    cases.begin()
     cases.renew(2, copies=3)
     first = cases.env.reset()["observation"].reshape(3, 2, -1)
     assert torch.equal(first[0], first[1])
     assert torch.equal(first[0], first[2])
+    cases.begin()
     cases.renew(6)
     assert len(cases.env.reset()["observation"].reshape(6, -1).unique(dim=0)) > 2
 
@@ -170,3 +172,14 @@ def test_policies_act_in_turn_where_rows_that_begin_alike_draw_other_numbers(wor
     cases.renew(2)
     first, second = cases.compared([learner.policy, learner.policy])
     assert torch.equal(first, second)
+
+
+def test_a_block_of_cases_makes_one_env():
+    cases, learner = built("env=pendulum")
+    made, build = [], cases.build
+    cases.build = lambda rows: made.append(rows) or build(rows)
+    cases.can_copy()
+    for count in (2, 3, 3):
+        cases.renew(count)
+        cases.compared([learner.policy, learner.policy])
+    assert made == [2, 4, 6]
