@@ -27,14 +27,13 @@ from coil_rl.files import write_text
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.statistics import mean_interval
 from coil_rl.run.evaluation import EvaluationResult
-from coil_rl.run.parts import TEST
+from coil_rl.run.parts import SOME_ROWS, TEST
 from coil_rl.run.policy_batch import PoliciesBeside
 from coil_rl.run.run import Run
 
 LAGS = {"0": (0, 0), "0.5": (0, 1), "1": (1, 1), "2": (2, 2)}  # least and most steps, by turns
 MISSING = (0.0, 0.1)  # share of the cones
 GUIDE = "guide"
-ROWS_OF_SPECS = 2  # of an env for its specs
 COLUMNS = {
     "label": ("trained", ""),
     "missing": ("cones missing", ".0%"),
@@ -97,7 +96,7 @@ def driven(
     """Return the episodes of the policy of each run, which are of one label."""
     runs = [late_run(folder, lags, missing, count) for folder in folders]
     trial = runs[0].trial
-    policies = [run.policy(trial.env(ROWS_OF_SPECS)) for run in runs]
+    policies = [run.policy(trial.env(SOME_ROWS)) for run in runs]
     beside = PoliciesBeside(policies, [False] * len(policies))
     result = trial.evaluation.run(trial.env(len(runs) * count), beside)
     return [result[index * count : (index + 1) * count] for index in range(len(runs))]

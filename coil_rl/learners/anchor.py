@@ -391,10 +391,8 @@ class StartTest:
 
     def _with(self, weights: tuple[float, ...]) -> Any:
         """Return a copy of the policy with some weights."""
-        policy = copy.deepcopy(self.policy)
-        hold = hold_of(policy)
-        if hold is None:
-            raise RuntimeError("the copy of an anchored policy has no weights")
+        # Copied together, so that the weights stay those of the policy.
+        policy, hold = copy.deepcopy((self.policy, self.hold))
         hold.set(weights)
         return policy
 

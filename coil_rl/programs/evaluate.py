@@ -23,7 +23,6 @@ OWN = (
     "advice",
     "fallback",
 )  # keys of `evaluation` of the command, not of the run
-SOME_ROWS = 2  # of an env for its specs; some ways to degrade advice need several
 OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
 
 
@@ -34,6 +33,7 @@ def evaluate(config: DictConfig) -> float:
     from coil_rl.config.build import assemble, env_maker, trial
     from coil_rl.config.pretrained import run_folder
     from coil_rl.run.judge import judge, report_outcome
+    from coil_rl.run.parts import SOME_ROWS
 
     torch.set_num_threads(config.threads)
     results = Path(config.run_dir)
@@ -93,7 +93,7 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
     from coil_rl.config.check import check_measures
     from coil_rl.config.saved import read_config
     from coil_rl.config.values import check_values
-    from coil_rl.run.parts import TEST
+    from coil_rl.run.parts import SOME_ROWS, TEST
 
     config = read_config(folder, "run", {"device": requested.device})
     resolved: Any = OmegaConf.to_container(requested, resolve=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from importlib import resources
 from itertools import chain
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import tabulate
 import yaml
@@ -97,7 +97,7 @@ class Table:
 def _cell(value: object, spec: str) -> Cell:
     text = _format(value, spec)
     if not _is_missing(value) and _is_number(value):
-        return Cell(text, float(value))  # type: ignore[arg-type]
+        return Cell(text, float(value))
     number = re.match(r"[-+]?\d[\d,]*(\.\d+)?", text)
     return Cell(text, float(number[0].replace(",", "")) if number else None)
 
@@ -157,7 +157,7 @@ def _specs(values: Sequence[Sequence[object]], columns: Columns) -> list[str]:
     for index, spec in enumerate(specs):
         if spec == RETURN_FORMAT:
             column = [row[index] for row in values]
-            specs[index] = return_format(float(each) for each in column if _is_number(each))  # type: ignore[arg-type]
+            specs[index] = return_format(float(each) for each in column if _is_number(each))
     return specs
 
 
@@ -202,7 +202,7 @@ def _is_missing(value: object) -> bool:
     return value is None or (isinstance(value, float) and math.isnan(value))
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 

@@ -13,12 +13,12 @@ from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, episodes
+from coil_rl.run.parts import SOME_ROWS
 from coil_rl.run.policy_batch import PoliciesBeside, memory_keys
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 SEEDS = 2**31  # seeds of cases are below
-SOME_ROWS = 2  # of an env that is only looked at; some ways to degrade advice need several
 
 
 @dataclass(eq=False)

@@ -29,6 +29,7 @@ from coil_rl.transforms.normalised_action import normalising
 TRAIN = "train"  # episodes of the training: random starts, tracks or seeds
 TEST = "test"  # cases of the table, which training never sees
 TESTS = "tests"  # new cases in which a training compares policies
+SOME_ROWS = 2  # of an env that is only looked at; some ways to degrade advice need several
 
 
 class BareEnv(Protocol):
