@@ -6,7 +6,7 @@ The same class serves the cone world and, in its own metres, the simulated robot
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -34,7 +34,7 @@ class TrackError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A closed track between two rings of cones.
+    """A closed track between two rings of cones; tracks are equal if all of their numbers are.
 
     Cars crash into the boundary curves, so all checks use these; they may overshoot the polygon
     through the cones.
@@ -92,6 +92,19 @@ class Track:
                     "between its two sides; give a start on the track, y pointing up, and list "
                     "both sides from the same place on."
                 )
+
+    @cached_property
+    def _content(self) -> tuple[str, bytes, bytes, tuple[float, ...]]:
+        return self.name, self.left.tobytes(), self.right.tobytes(), self.start
+
+    # Equal tracks, such as those of a file that is read again, share the tables of their maps.
+    def __eq__(self, other: object) -> bool:
+        """Return whether another track has the same name, cones and start."""
+        return isinstance(other, Track) and self._content == other._content
+
+    def __hash__(self) -> int:
+        """Return a hash of name, cones and start."""
+        return hash(self._content)
 
     @property
     def finish(self) -> Array:
@@ -164,7 +177,7 @@ class Track:
             )
 
 
-@lru_cache(maxsize=1024)  # tables of tracks are shared by identity
+@lru_cache(maxsize=1024)
 def begin_in_sight(track: Track, sight: float, half_angle: float) -> Track:
     """Return a track whose sides and finish line begin with the first cones seen from its start.
 

@@ -156,3 +156,9 @@ def test_places_without_a_count_are_the_starts():
     assert index.tolist() == [0, 1, 2]
     assert np.isnan(driven).all()
     assert np.array_equal(poses, [track.start for track in tracks])
+
+
+def test_tracks_are_equal_if_all_of_their_numbers_are():
+    again, other = circle_track(), circle_track(left=8 * CIRCLE)
+    assert circle_track() == again
+    assert len({circle_track(), again, other, circle_track(name="another")}) == 3
