@@ -30,7 +30,7 @@ class Measure:
         at_least: makes the measure a flag: whether the number is at least this.
         at_most: makes the measure a flag: whether the number is at most this.
         title: heading of its column; a measure without one is in the CSV files only.
-        format: of its numbers in tables.
+        format: of its numbers in tables; "auto": as they need.
 
     Raises:
         ValueError: for another reduction, or two bounds.
@@ -42,7 +42,7 @@ class Measure:
     at_least: float | None = None
     at_most: float | None = None
     title: str = ""
-    format: str = ".1f"
+    format: str = "auto"
 
     def __post_init__(self) -> None:
         if self.reduction not in REDUCTIONS:

@@ -264,10 +264,15 @@ def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
         unread = unread_controllers(config, _all_transforms(config))
         return build_bare_env(config, cases_node(config, rows, cases, count), unread)
 
+    def alone(rows: int | None, cases: str, count: int | None) -> EnvBase:
+        controllers = OmegaConf.select(config, "env.controllers") or ()
+        return build_bare_env(config, cases_node(config, rows, cases, count), set(controllers))
+
     curve = config.evaluation.curve
     return EnvMaker(
         bare,
         of_agent=of_agent,
+        alone=alone,
         disturb=partial(build_disturbances, config),
         transforms=transforms,
         guides=lambda: build_nodes_of_guides(driving_guides(config)),

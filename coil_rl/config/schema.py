@@ -42,11 +42,11 @@ def typed_as(kind: Any) -> GetPydanticSchema:
 
 
 def format_of_numbers(spec: str) -> str:
-    """Return a format for numbers, as Python's `format` takes it.
+    """Return a format for numbers, as Python's `format` takes it, or auto: as they need.
 
     Its width has at most two digits.
     """
-    if not re.fullmatch(r"[+,]?\d{0,2}(\.\d)?[efg%]?", spec):
+    if spec != "auto" and not re.fullmatch(r"[+,]?\d{0,2}(\.\d)?[efg%]?", spec):
         raise PydanticCustomError("format", "a format of numbers, such as .1f")
     return spec
 
@@ -127,7 +127,7 @@ class MeasureConfig(NodeConfig):
     at_least: float | None = None
     at_most: float | None = None
     title: str = ""
-    format: Annotated[str, AfterValidator(format_of_numbers)] = ".1f"
+    format: Annotated[str, AfterValidator(format_of_numbers)] = "auto"
 
 
 @dataclass

@@ -15,7 +15,7 @@ from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
-from coil_rl.report.table import RETURN_FORMAT, TABLES, Table, return_format
+from coil_rl.report.table import AUTO_FORMAT, TABLES, Table, fitted, return_format
 
 Block = Table | str  # a table or a paragraph
 
@@ -36,9 +36,10 @@ def section(
     """
     columns = _columns(comparison, rows, against)
     shown = with_cells(rows, comparison.score[1])
+    columns = fitted(shown, columns)
     for row, group in zip(shown, comparison.groups, strict=True):
         row |= _shares(row, group, columns)
-    parts = _parts(comparison, TERM, "term of the reward", RETURN_FORMAT)
+    parts = _parts(comparison, TERM, "term of the reward", AUTO_FORMAT)
     parts += _parts(comparison, PER_STEP, "reward of a step", ".3f")
     cases = cases_table(comparison.groups, "report_cases.csv")
     return [Table(shown, columns), *parts, cases]
@@ -283,5 +284,5 @@ def cases_table(groups: Sequence[Group], file: str) -> Block:
         rows.append(row)
     columns = {"driver": ("mean reward", "")}
     for name in names:
-        columns[name] = (name, RETURN_FORMAT)
+        columns[name] = (name, AUTO_FORMAT)
     return Table(rows, columns)

@@ -20,7 +20,7 @@ tabulate.MIN_PADDING = 0  # extra width of headings
 # Columns and notes by table.
 TABLES: Any = yaml.safe_load((resources.files("coil_rl.conf") / "tables.yaml").read_text("utf-8"))
 
-RETURN_FORMAT = "return"  # of a column of returns, whose unit is that of the env
+AUTO_FORMAT = "auto"  # of a column whose unit is that of the env: as its numbers need
 
 Rows = Sequence[Mapping[str, object]]
 Columns = Mapping[str, Sequence[str]]
@@ -109,7 +109,7 @@ def markdown_table(rows: Rows, columns: Columns) -> str:
         rows: one mapping per line. Missing keys, None and NaN become "-", booleans yes and no; text
             stays as it is, so a cell may be a formatted "31.2 ± 0.4".
         columns: heading (with unit) and number format by key, in the order of the table. The format
-            `RETURN_FORMAT` is that of `return_format` for the column.
+            `AUTO_FORMAT` is that of `return_format` for the column.
 
     Raises:
         ValueError: if no row has a column, or a number does not fit its format.
@@ -140,6 +140,18 @@ def markdown_table(rows: Rows, columns: Columns) -> str:
     )
 
 
+def fitted(rows: Rows, columns: Columns) -> dict[str, tuple[str, str]]:
+    """Return columns with a number format in place of each `AUTO_FORMAT`.
+
+    Args:
+        rows: whose numbers are shown.
+        columns: as `markdown_table` takes them.
+    """
+    specs = _specs(_values(rows, columns), columns)
+    headings = ((name, heading) for name, (heading, _) in columns.items())
+    return {name: (heading, spec) for (name, heading), spec in zip(headings, specs, strict=True)}
+
+
 def _values(rows: Rows, columns: Columns) -> list[list[object]]:
     """Return the values of each row in the order of the columns."""
     keys = dict.fromkeys(chain.from_iterable(rows))
@@ -155,7 +167,7 @@ def _specs(values: Sequence[Sequence[object]], columns: Columns) -> list[str]:
     """Return the number format of each column, given the values of each row."""
     specs = [spec for _, spec in columns.values()]
     for index, spec in enumerate(specs):
-        if spec == RETURN_FORMAT:
+        if spec == AUTO_FORMAT:
             column = [row[index] for row in values]
             specs[index] = return_format(float(each) for each in column if _is_number(each))
     return specs

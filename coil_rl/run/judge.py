@@ -32,7 +32,7 @@ from coil_rl.output import decoration, progress, say
 from coil_rl.report import Returns, markdown_table, write_csv
 from coil_rl.report.pictures import Picture
 from coil_rl.report.statistics import mean_interval
-from coil_rl.report.table import RETURN_FORMAT, return_format
+from coil_rl.report.table import AUTO_FORMAT, fitted, return_format
 from coil_rl.run.evaluation import EvaluationResult, evaluate_policy
 from coil_rl.run.fallback import Fallback
 from coil_rl.run.parts import TEST, EnvMaker
@@ -43,10 +43,10 @@ COLUMNS = {
     "advice": ("advice", ""),
     "actions": ("actions", ""),
     "case": ("case", ""),
-    "reward": ("reward", RETURN_FORMAT),
+    "reward": ("reward", AUTO_FORMAT),
 }
 MAX_CASES = 8  # in the table for people
-ALLOWED_LOSS = 0.01  # of the guide's mean reward, for a policy that is not worse
+ALLOWED_LOSS = 0.01  # of what a guide earns beyond random actions, for a policy that is not worse
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,13 @@ class Trial:
     def env(self, rows: int, advice: str = "") -> EnvBase:
         """Return the env of the policy in the cases of the test."""
         return self.make_env(rows, TEST, advice, count=self.count)
+
+    def chance(self) -> float:
+        """Return the mean reward of random actions in the cases of the test."""
+        env, policy = self.make_env.random(len(self.evaluation.cases), TEST, count=self.count)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            return evaluate_policy(env, policy, cases=self.evaluation.cases).mean_reward
 
 
 class Judgement:
@@ -257,15 +264,17 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, share: float 
         if measure.title:
             columns[name] = (measure.title, measure.format)
     count = len(trial.evaluation.cases)
-    rows = with_shares(judgement.table, judgement.counts, columns)
+    pairs = list(zip(judgement.table, judgement.counts, strict=True))
     if count > MAX_CASES:
-        rows = [row for row in rows if row["case"] == "mean"]
-    page = [markdown_table(rows, columns)]
+        pairs = [(row, counts) for row, counts in pairs if row["case"] == "mean"]
+    rows = [row for row, _ in pairs]
+    columns = fitted(rows, columns)
+    page = [markdown_table(with_shares(rows, [counts for _, counts in pairs], columns), columns)]
     if count > MAX_CASES:
         page.append(f"Means of {count} cases; all are in evaluation.csv.")
-    if has_policy and count > 1:
-        for guide in trial.guides:
-            page.append(not_worse(judgement.shown[trial.label], judgement.shown[guide], guide))
+    if has_policy and count > 1 and trial.guides:
+        chance, mine = trial.chance(), judgement.shown[trial.label]
+        page += [not_worse(mine, judgement.shown[name], name, chance) for name in trial.guides]
     if share is not None:
         page.append(f"With fallback the guide acted in {share:.1%} of the steps.")
     return "\n\n".join([*page, *trial.notes])
@@ -298,25 +307,32 @@ class PolicyAndGuides(TensorDictModuleBase):
         return tensordict.set("action", action)
 
 
-def not_worse(policy: EvaluationResult, guide: EvaluationResult, name: str) -> str:
+def not_worse(policy: EvaluationResult, guide: EvaluationResult, name: str, chance: float) -> str:
     """Return the sentence whether a policy is not worse than a guide in the same cases.
 
-    The answer is yes if the whole t interval of the difference is above minus 1 % of the guide's
-    mean reward, no if it is below.
+    The answer is yes if the whole t interval of the difference is above minus 1 % of what the guide
+    earns more or less than random actions, no if it is below. Neither depends on the zero of the
+    rewards.
+
+    Args:
+        policy: its episodes.
+        guide: its episodes, in the same cases.
+        name: of the guide.
+        chance: mean reward of random actions.
     """
     pairs = zip(policy.episodes, guide.episodes, strict=True)
     _, low, high = mean_interval([mine["reward"] - other["reward"] for mine, other in pairs])
-    margin = -ALLOWED_LOSS * abs(guide.mean_reward)
+    allowed = ALLOWED_LOSS * abs(guide.mean_reward - chance)
     answer = "undecided"
-    if low >= margin:
+    if low >= -allowed:
         answer = "yes"
-    elif high < margin:
+    elif high < -allowed:
         answer = "no"
     spec = return_format([policy.mean_reward, guide.mean_reward])
-    interval = f"{low:+{spec}} to {high:+{spec}}"
     return (
-        f"Not worse than {name} on these {len(policy.episodes)} cases: {answer} "
-        f"(difference of the rewards {interval}, 95 % interval; 1 % is allowed)."
+        f"Not worse than {name} on these {len(policy.episodes)} cases: {answer} (difference of the "
+        f"rewards {low:+{spec}} to {high:+{spec}}, 95 % interval; {allowed:{spec}} less is "
+        "allowed, 1 % of the way from random actions to the guide)."
     )
 
 

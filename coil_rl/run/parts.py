@@ -19,6 +19,7 @@ from torchrl.envs import (
     VecNorm,
     VecNormV2,
 )
+from torchrl.modules import RandomPolicy
 
 from coil_rl.envs.step_limit import limits_of
 from coil_rl.errors import UserError
@@ -47,6 +48,7 @@ class EnvMaker:
         bare: makes the env without transforms for a number of rows, a set of cases and the number
             of different cases.
         of_agent: makes it without what only guides that act alone read of it; None: it is the same.
+        alone: makes it without any controller beside it; None: it has none.
         disturb: makes the transforms that disturb the env, for a set of cases; the guides of the
             method are behind them.
         transforms: makes the transforms of the method; its argument is the name of a further kind
@@ -59,6 +61,7 @@ class EnvMaker:
     bare: BareEnv
     _: KW_ONLY
     of_agent: BareEnv | None = None
+    alone: BareEnv | None = None
     disturb: Callable[[str], Sequence[Transform]] = lambda cases: ()
     transforms: Callable[[str], Sequence[Transform]] = lambda advice: ()
     guides: Callable[[], Mapping[str, TensorDictModuleBase]] = dict
@@ -89,6 +92,22 @@ class EnvMaker:
         """
         bare = self.bare if self.of_agent is None else self.of_agent
         return self._around(bare(rows, cases, count), self.disturb(cases), advice)
+
+    def random(
+        self, rows: int, cases: str, *, count: int | None = None
+    ) -> tuple[EnvBase, RandomPolicy]:
+        """Return an env without guides, and the policy of random actions in it.
+
+        What these earn is the zero of a scale; that of the rewards themselves means nothing.
+
+        Args:
+            rows: number of rows.
+            cases: as above.
+            count: as above.
+        """
+        bare = self.bare if self.alone is None else self.alone
+        env = transformed(bare(rows, cases, count), self.disturb(cases), "disturb")
+        return env, RandomPolicy(env.full_action_spec)
 
     def around(self, env: EnvBase, advice: str = "") -> EnvBase:
         """Return any env with normalised actions and the transforms of the method.

@@ -16,15 +16,15 @@ from coil_rl.config.written import key_of
 from coil_rl.report import markdown_table, style
 from coil_rl.report.curves import RETURNS, draw_guides, mean_curve, points
 from coil_rl.report.runs import RETURN, Run
-from coil_rl.report.table import RETURN_FORMAT, return_format
+from coil_rl.report.table import AUTO_FORMAT, return_format
 from coil_rl.worth.arms import ARMS, TUNE
 from coil_rl.worth.outcome import Outcome
 from coil_rl.worth.verdict import Entry, Verdict, difference
 
 COLUMNS = {
     "policy": ("policy", ""),
-    "return": ("return", RETURN_FORMAT),
-    "worst": ("worst case", RETURN_FORMAT),
+    "return": ("return", AUTO_FORMAT),
+    "worst": ("worst case", AUTO_FORMAT),
     "failures": ("failed", ".0%"),
     "seeds": ("seeds", "d"),
     "frames": ("frames", ",.0f"),

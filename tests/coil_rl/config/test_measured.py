@@ -27,7 +27,7 @@ def test_a_measure_is_added_on_the_command_line_beside_those_of_the_env(added: l
     measures = measures_with(*added)
     assert set(measures) == {"completed", "last_reward"}
     assert measures.last_reward.reduction == "last"
-    assert measures.last_reward.format == ".1f"
+    assert measures.last_reward.format == "auto"
 
 
 @pytest.mark.parametrize("name", ["reward", "case", "driver", "steps"])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from coil_rl.report.table import RETURN_FORMAT, markdown_table, write_csv
+from coil_rl.report.table import AUTO_FORMAT, markdown_table, write_csv
 
 ROWS = [
     {"driver": "guide", "lap": 31.256, "crashes": 0.0, "done": True, "laps": 2},
@@ -48,7 +48,7 @@ def test_columns_choose_order_and_align_the_cells():
 )
 def test_returns_have_enough_digits_in_any_unit(returns, expected):
     rows = [{"return": each} for each in returns]
-    lines = markdown_table(rows, {"return": ("return", RETURN_FORMAT)}).splitlines()[2:]
+    lines = markdown_table(rows, {"return": ("return", AUTO_FORMAT)}).splitlines()[2:]
     assert [line.strip("| ") for line in lines] == expected
 
 

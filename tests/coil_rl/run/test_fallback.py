@@ -4,6 +4,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from coil_rl.report.statistics import mean_interval
+from coil_rl.report.table import return_format
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.fallback import Fallback
 from coil_rl.run.judge import not_worse
@@ -43,8 +44,11 @@ def test_guide_acts_from_a_low_value_on_until_a_high_one():
         ([80, 120, 100], "undecided"),
     ],
 )
-def test_agent_is_not_worse_if_the_whole_interval_is_above_one_percent_less(agent, answer):
-    sentence = not_worse(result_of(agent), result_of([100, 100, 100]), "guide")
+@pytest.mark.parametrize("zero", [0, -100, -1_000_000])  # that of the rewards means nothing
+def test_agent_is_not_worse_if_the_whole_interval_is_above_one_percent_less(agent, answer, zero):
+    mine, guide = ([zero + reward for reward in each] for each in (agent, [100, 100, 100]))
+    sentence = not_worse(result_of(mine), result_of(guide), "guide", chance=zero)
     assert f"Not worse than guide on these 3 cases: {answer} " in sentence
     _, low, high = mean_interval([reward - 100 for reward in agent])
-    assert f"{low:+.1f} to {high:+.1f}" in sentence
+    spec = return_format([sum(mine) / 3, sum(guide) / 3])
+    assert f"{low:+{spec}} to {high:+{spec}}" in sentence
