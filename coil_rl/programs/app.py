@@ -144,6 +144,17 @@ def check_used(used: Iterable[str], reason: str) -> None:
             )
 
 
+def check_folder(key: str) -> None:
+    """Raise a `UserError` for hydra.run.dir in a program whose files go elsewhere.
+
+    Args:
+        key: names the folder of the files.
+    """
+    for text in typed().hydra:
+        if text.lstrip("+").startswith("hydra.run.dir="):
+            raise UserError(f"{text} has no effect: the files are written to {key}=FOLDER")
+
+
 def check_run(config: DictConfig) -> None:
     """Check everything that a run needs, unless it is finished.
 

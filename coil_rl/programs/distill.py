@@ -56,6 +56,7 @@ def check(config: DictConfig) -> None:
 
     used = ("preset", "track", "env", "guide", "evaluation", "proxy")
     app.check_used(used, "a proxy is trained as the key proxy says")
+    app.check_folder("proxy.folder")
     check_values(config)
     check_proxies(config, config.guide)
     make_folder(Path(config.proxy.folder))

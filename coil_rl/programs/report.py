@@ -123,6 +123,7 @@ def check(config: DictConfig) -> None:
     from coil_rl.config.values import check_values
 
     check_values(config)
+    app.check_folder("folder")
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise app.NoSweepError(
             "a report covers several folders at once; leave out -m and write folder=[ONE,OTHER]"

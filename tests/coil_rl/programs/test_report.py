@@ -48,6 +48,18 @@ def test_report_prints_the_page_and_writes_its_files_again_and_again(sweep):
     assert all_files() == after
 
 
+@pytest.mark.parametrize(
+    ("name", "arguments", "key"),
+    [("report", ["folder=sweep"], "folder"), ("distill", [], "proxy.folder")],
+)
+def test_folder_of_hydra_is_refused_where_files_go_elsewhere(sweep, name, arguments, key):
+    before = all_files()
+    done = called(name, *arguments, "hydra.run.dir=mine", code=2)
+    sentence = f"hydra.run.dir=mine has no effect: the files are written to {key}=FOLDER"
+    assert done.stderr == f"{name}: {sentence}\n"
+    assert all_files() == before
+
+
 def test_files_have_full_precision(sweep):
     report("folder=sweep", "actions=both")
     rows = {
