@@ -108,6 +108,7 @@ class TrainingConfig(NodeConfig):
 
     learning_rate: float = 1e-3  # of PPO, at the start of a run
     normalise: Any = "auto"  # of the learner: auto | true | false
+    scale_rewards: bool = True  # of the learner, see `RewardScale`
     noise_correlation: Annotated[float, Field(ge=0, le=1)] = (
         0.0  # of the noise of continuous actions, see `Rollout`
     )

@@ -45,6 +45,8 @@ class DQN(OffPolicy):
         double: whether the network, not the target network, selects the next action.
         normalise: whether to normalise what is observed, or the entries to normalise, see
             `Normaliser`. Steps are stored as they are.
+        scale_rewards: whether rewards are divided by the running deviation of returns, see
+            `RewardScale`.
         tau: step of the target networks towards the networks after each minibatch, as a fraction.
         ratio: how often a step is sampled, on average over the run.
         learning_rate: of Adam, a number or a schedule.
@@ -85,6 +87,7 @@ class DQN(OffPolicy):
         epsilon: float | Schedule = Linear(1.0, 0.05, until=0.3),
         double: bool = True,
         normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
+        scale_rewards: bool = False,
         tau: float = 0.01,
         ratio: float = 16.0,
         learning_rate: float | Schedule = Linear(1e-3, 0.0),
@@ -109,6 +112,7 @@ class DQN(OffPolicy):
             env,
             in_keys,
             normalise=normalise,
+            scale_rewards=scale_rewards,
             tau=tau,
             ratio=ratio,
             learning_rate=learning_rate,

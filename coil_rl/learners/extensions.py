@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.normaliser import Normaliser, RawObservations, RunningStatistics
+from coil_rl.learners.reward_scale import RewardScale
 from coil_rl.learners.several_agents import SummedRewards
 
 
@@ -76,6 +77,7 @@ class Extensions(Extension):
 def extensions_of(
     env: EnvBase,
     in_keys: Sequence[NestedKey],
+    scale: RewardScale | None,
     normaliser: Normaliser | None,
     auxiliary: Sequence[Extension],
 ) -> Extensions:
@@ -84,12 +86,15 @@ def extensions_of(
     Args:
         env: the env; the rewards of several agents are summed.
         in_keys: entries that the policy observes.
+        scale: of the rewards; None: they stay as they are.
         normaliser: of the policy; None: it has none.
         auxiliary: extensions that a user adds.
     """
     extensions: list[Extension] = []
     if (reward_key := unravel_key(("next", env.reward_key))) != ("next", "reward"):
         extensions.append(SummedRewards(reward_key))
+    if scale is not None:
+        extensions.append(scale)
     if normaliser is not None:
         extensions.append(RunningStatistics(normaliser))
     extensions += auxiliary

@@ -19,6 +19,7 @@ from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.guided_steps import AGENT_ACTS, guide_may_act
 from coil_rl.learners.learner import Callback, Cases, Learner
 from coil_rl.learners.normaliser import RawObservations, normaliser
+from coil_rl.learners.reward_scale import RewardScale
 from coil_rl.learners.sampling import UNCLIPPED
 from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
@@ -52,6 +53,8 @@ class OffPolicy(Stateful, Learner):
         in_keys: entries that are observed.
         normalise: whether to normalise what is observed, or the entries to normalise, see
             `Normaliser`. Steps are stored as they are.
+        scale_rewards: whether rewards are divided by the running deviation of returns, see
+            `RewardScale`.
         tau: step of the target networks towards the networks after each minibatch, as a fraction.
         ratio: how often a step is sampled, on average over the run.
         learning_rate: of Adam, a number or a schedule.
@@ -80,6 +83,7 @@ class OffPolicy(Stateful, Learner):
         "generator",
         "pending_updates",
         "normaliser",
+        "reward_scale",
         "extensions",
     )
     minimised: tuple[str, ...]
@@ -91,6 +95,7 @@ class OffPolicy(Stateful, Learner):
         in_keys: Sequence[NestedKey],
         *,
         normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
+        scale_rewards: bool = False,
         tau: float,
         ratio: float,
         learning_rate: float | Schedule = Linear(1e-3, 0.0),
@@ -116,6 +121,7 @@ class OffPolicy(Stateful, Learner):
         check_range(0, LARGEST_SEED, seed=seed)
         check_replay(env, type(self).__name__)
         self.normaliser = normaliser(env, in_keys, normalise)
+        self.reward_scale = RewardScale(gamma) if scale_rewards else None
         self.inputs = networks.inputs_of(env, self.normaliser, anchor)
         numbers = env.action_spec.dtype.is_floating_point
         self.action_key = UNCLIPPED if anchor is not None and numbers else "action"
@@ -218,6 +224,8 @@ class OffPolicy(Stateful, Learner):
             "kept": float(self.kept),
             "learning_rate": self.learning_rate(progress),
         }
+        if self.reward_scale is not None:
+            metrics |= self.reward_scale.finish(batch, progress)
         return metrics | self.extensions.finish(batch, progress)
 
     @property
@@ -226,7 +234,9 @@ class OffPolicy(Stateful, Learner):
         return len(self.buffer) + len(self.guide_buffer)
 
     def store(self, batch: TensorDictBase) -> None:
-        """Store the steps of a batch [*B, T]."""
+        """Store the steps of a batch [*B, T], with the rewards as they are."""
+        if self.reward_scale is not None:
+            self.reward_scale.learn(batch)
         steps = batch.select(*self.stored_keys).reshape(-1)
         if not self.guide_may_act:
             self._store(steps, self.buffer)
@@ -270,6 +280,9 @@ class OffPolicy(Stateful, Learner):
             buffer.sample(due * size).view(due, size) for buffer, size in sizes.items() if size
         ]
         minibatches: TensorDictBase = torch.cat(parts, 1)
+        if self.reward_scale is not None:
+            rewards = minibatches["next", "reward"]
+            minibatches["next", "reward"] = self.reward_scale.scaled(rewards)
         if self.inputs is not None:
             minibatches["next"] = self.inputs(minibatches["next"])
             minibatches = self.inputs(minibatches)

@@ -32,6 +32,7 @@ from coil_rl.learners.lean_update import LeanUpdate
 from coil_rl.learners.learner import Callback, Cases, Learner
 from coil_rl.learners.minibatches import minibatches_of
 from coil_rl.learners.normaliser import normaliser
+from coil_rl.learners.reward_scale import RewardScale
 from coil_rl.learners.sampling import UNCLIPPED
 from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
@@ -56,6 +57,8 @@ class PPO(Stateful, Learner):
         network: architecture of both networks; None: `Mlp(hidden)`.
         normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
             the entries to normalise, see `Normaliser`.
+        scale_rewards: whether rewards are divided by the running deviation of returns, see
+            `RewardScale`.
         action_scale: initial standard deviation of the policy.
         action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
             everywhere.
@@ -103,6 +106,7 @@ class PPO(Stateful, Learner):
         hidden: Sequence[int] = (64, 64),
         network: Mlp | None = None,
         normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
+        scale_rewards: bool = False,
         action_scale: float = 0.5,
         action_gain: float = 0.01,
         squash: bool = True,
@@ -146,7 +150,8 @@ class PPO(Stateful, Learner):
         self.policy = self.build_policy(env, in_keys, network, make_actor)
         self.critic = self.build_critic(env, in_keys, network)
         memory, self.head = networks.split_memory(self.policy)
-        self.extensions = extensions_of(env, in_keys, self.normaliser, auxiliary)
+        scale = RewardScale(gamma) if scale_rewards else None
+        self.extensions = extensions_of(env, in_keys, scale, self.normaliser, auxiliary)
 
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
         self.loss = self.build_loss(clip, critic)

@@ -60,6 +60,8 @@ class SAC(OffPolicy):
         auxiliary: extensions, such as losses of the policy (`KickstartLoss`).
         normalise: whether to normalise what is observed, or the entries to normalise, see
             `Normaliser`. Steps are stored as they are.
+        scale_rewards: whether rewards are divided by the running deviation of returns, see
+            `RewardScale`.
         tau: step of the target networks towards the networks after each minibatch, as a fraction.
         ratio: how often a step is sampled, on average over the run.
         learning_rate: of Adam, a number or a schedule.
@@ -98,6 +100,7 @@ class SAC(OffPolicy):
         uncertainty: bool = False,
         auxiliary: Sequence[Extension] = (),
         normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
+        scale_rewards: bool = False,
         tau: float = 0.02,
         ratio: float = 8.0,
         learning_rate: float | Schedule = Linear(1e-3, 0.0),
@@ -130,6 +133,7 @@ class SAC(OffPolicy):
             env,
             in_keys,
             normalise=normalise,
+            scale_rewards=scale_rewards,
             tau=tau,
             ratio=ratio,
             learning_rate=learning_rate,

@@ -48,6 +48,8 @@ class TRPO(PPO):
         network: architecture of both networks, without a memory; None: `Mlp(hidden)`.
         normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
             the entries to normalise, see `Normaliser`.
+        scale_rewards: whether rewards are divided by the running deviation of returns, see
+            `RewardScale`.
         action_scale: initial standard deviation of the policy.
         action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
             everywhere.
@@ -80,6 +82,7 @@ class TRPO(PPO):
         hidden: Sequence[int] = (64, 64),
         network: Mlp | None = None,
         normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
+        scale_rewards: bool = False,
         action_scale: float = 0.5,
         action_gain: float = 0.01,
         squash: bool = True,
@@ -103,6 +106,7 @@ class TRPO(PPO):
             hidden=hidden,
             network=network,
             normalise=normalise,
+            scale_rewards=scale_rewards,
             action_scale=action_scale,
             action_gain=action_gain,
             squash=squash,

@@ -23,8 +23,8 @@ CONFIG = OmegaConf.to_container(OmegaConf.load(CONF / "learner" / "ppo_sb3.yaml"
 OPTIONS = {
     key: value
     for key, value in CONFIG["learner"].items()
-    if key not in ("_target_", "seed", "normalise")
-}  # without normaliser: the default of Stable-Baselines3 has none
+    if key not in ("_target_", "seed", "normalise", "scale_rewards")
+}  # without normaliser: the defaults of Stable-Baselines3 have none
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
