@@ -1,4 +1,6 @@
+import copy
 import gc
+import os
 import pickle
 from pathlib import Path
 
@@ -6,9 +8,13 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from hydra._internal.config_repository import ConfigRepository
+from hydra.core.config_store import ConfigStore
 from hypothesis import settings
 
+from coil_rl.config.written import SHIPPED
 from coil_rl.envs import Track, load_track
+from coil_rl.report import style
 
 LEVELS = Path(__file__).resolve().parents[2] / "shared" / "tracks"
 
@@ -35,6 +41,28 @@ def parse_each_text_once(load):
 
 
 yaml.load = parse_each_text_once(yaml.load)
+
+
+def read_each_file_once(load):
+    """Return `ConfigRepository.load_config` with a memory of the files of this project."""
+    known = {}
+
+    def load_known(self, config_path):
+        if not all(each.full_path().startswith(SHIPPED) for each in self.sources):
+            return load(self, config_path)
+        places = tuple(each.full_path() for each in self.sources)
+        if (config_path, places) not in known:
+            known[config_path, places] = load(self, config_path)
+        return copy.deepcopy(known[config_path, places])
+
+    return load_known
+
+
+ConfigRepository.load_config = read_each_file_once(ConfigRepository.load_config)
+# Hydra copies the registered configurations for every test, and changes none of them.
+ConfigStore.__deepcopy__ = lambda self, memo: self
+os.fsync = lambda descriptor: None  # no test cuts the power
+style.RESOLUTION //= 2  # most tests only look whether there is a picture
 
 
 # The files that take longest, one process each: begun last, one would keep the other waiting.
@@ -67,6 +95,7 @@ def pytest_collection_modifyitems(items):
 def pytest_collection_finish():
     """Keep the garbage collector from visiting all imported modules in each of its rounds."""
     gc.freeze()
+    gc.set_threshold(20_000, 50, 50)
 
 
 @pytest.fixture(scope="session")

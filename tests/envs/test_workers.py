@@ -196,35 +196,44 @@ def test_processes_end_with_the_env() -> None:
     assert not any(process.is_alive() for process in processes)
 
 
+# Forks a program for each signal, because imports take seconds. One that is started in the
+# background ignores SIGINT.
 PROGRAM = """
-import sys, time
+import os, signal, sys, time
 sys.path.insert(0, {tests!r})
 from test_workers import plants
-env = plants(2)
-env.reset()
-print(*[process.pid for process in env.workers.processes], flush=True)
-time.sleep(60)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+programs = []
+for _ in range({count}):
+    programs.append(os.fork())
+    if not programs[-1]:
+        env = plants(2)
+        env.reset()
+        print(os.getpid(), *[process.pid for process in env.workers.processes], flush=True)
+        time.sleep(60)
+for program in programs:
+    os.waitpid(program, 0)
 """
 
 
-@pytest.mark.parametrize("kind", ["SIGKILL", "SIGTERM", "SIGINT"])
-def test_no_process_outlives_the_program(kind) -> None:
-    program = PROGRAM.format(tests=os.path.dirname(__file__))
+def test_no_process_outlives_its_program() -> None:
+    kinds = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
     paths = os.pathsep.join(path for path in sys.path if path)
-    child = subprocess.Popen(
-        [sys.executable, "-c", program],
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM.format(tests=os.path.dirname(__file__), count=len(kinds))],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         env=os.environ | {"PYTHONPATH": paths},
     )
-    pids = [int(pid) for pid in child.stdout.readline().split()]
-    assert len(pids) == 2
-    child.send_signal(getattr(signal, kind))
-    child.wait()
-    deadline = time.monotonic() + 10
-    while any(map(_runs, pids)) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not any(map(_runs, pids))
+    for kind in kinds:
+        program, *workers = map(int, parent.stdout.readline().split())
+        assert len(workers) == 2
+        os.kill(program, kind)
+        deadline = time.monotonic() + 10
+        while any(map(_runs, [program, *workers])) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert not any(map(_runs, [program, *workers])), kind
+    assert parent.wait(10) == 0
 
 
 def _runs(pid: int) -> bool:
