@@ -44,7 +44,8 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
     """
     node = _converted(check_node(node, name, arguments))
     try:
-        built = hydra.utils.instantiate(node, **arguments, _convert_="all")
+        # In the node, because Hydra merges it with keyword arguments, which takes a while.
+        built = hydra.utils.instantiate({**node, "_convert_": "all"}, **arguments)
     except hydra.errors.InstantiationException as error:
         cause = error.__cause__
         if isinstance(cause, (UserError, ValueError, KeyError, TypeError, AttributeError, OSError)):

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import fields
+from functools import cache
 from typing import Any
 
 import torch
@@ -29,7 +30,7 @@ def check_values(config: DictConfig) -> None:
     values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     schema: Any = OmegaConf.get_type(config)
     try:
-        TypeAdapter(schema).validate_python(values)
+        _adapter(schema).validate_python(values)
     except ValidationError as error:
         for detail in error.errors():
             if detail["type"] == "unexpected_keyword_argument":
@@ -56,6 +57,12 @@ def check_values(config: DictConfig) -> None:
             raise UserError(
                 f"{name}={device} cannot be used ({problem}); take {name}=cpu"
             ) from error
+
+
+@cache
+def _adapter(schema: type) -> TypeAdapter[Any]:
+    """Return what validates values of a schema, which takes longer to make than to use."""
+    return TypeAdapter(schema)
 
 
 def _unknown_key(config: DictConfig, *path: str) -> str:
