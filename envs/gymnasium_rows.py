@@ -30,6 +30,7 @@ from coil_rl.envs.gymnasium_makers import Env
 from coil_rl.envs.gymnasium_spaces import Entry, has_whole_numbers, leaves
 from coil_rl.envs.workers import Entries
 
+MASKS = {"action_mask", "action_masks"}  # in info: which actions are possible
 # The envs of all rows of this process, to find one that two rows would share.
 _alive: MutableMapping[int, Any] = WeakValueDictionary()
 
@@ -90,6 +91,7 @@ class Row:
             _alive.pop(id(self.gate.env.unwrapped), None)
             self._open()
         self.observation, self.info = self.gate.reset(seed)
+        self._look_for_masks()
         self.values = self.gate.read(self.observation, self.entries)
         self.reward, self.terminated, self.truncated = 0.0, False, False
         self._reset_controllers()
@@ -119,6 +121,15 @@ class Row:
         self.values = self.gate.read(self.observation, self.entries)
         if not self.terminated:
             self._advise()
+
+    def _look_for_masks(self) -> None:
+        """Warn if the env says which actions are possible now, which policies do not ask."""
+        for name in MASKS & self.info.keys():
+            warnings.warn(
+                f"the env {self.name} has {name} in info, which is not used: policies and guides "
+                "choose among all actions, so the env must have an answer to each",
+                stacklevel=2,
+            )
 
     def number_of(self, name: str) -> float:
         """Return a number of info, 0 where it is missing."""
@@ -331,13 +342,19 @@ def _has_limit(env: Env) -> bool:
 
 
 def entries_of(name: str, env: Env, floats: np.dtype[Any]) -> list[Entry]:
-    """Return the entries of the observation of an env."""
+    """Return the entries of the observation of an env, which have at least one number."""
     if not isinstance(env.observation_space, spaces.Space):
         raise ValueError(
             f"the observation_space of {name} is {shown(env.observation_space)}, not a space of "
             "Gymnasium: set it in its __init__"
         )
-    return [Entry(name, path, leaf, floats) for path, leaf in leaves(env.observation_space)]
+    entries = [Entry(name, path, leaf, floats) for path, leaf in leaves(env.observation_space)]
+    if all(0 in entry.given for entry in entries):
+        raise ValueError(
+            f"the observation_space of {name} is {env.observation_space}, which has no numbers; "
+            "observe at least one, such as a constant"
+        )
+    return entries
 
 
 def _check_same_spaces(name: str, row: int, env: Env, first: Env) -> None:

@@ -209,6 +209,11 @@ def check_read(config: DictConfig, task: Iterable[str], *, trains_guides: bool) 
                 f"{text} has no effect: method={config.method.name} tunes its guide and has no "
                 "learner; leave it out"
             )
+        if _covers("training.tests", key) and key != "training" and not _tests(config):
+            raise UserError(
+                f"{text} has no effect: this run compares no policies while it trains; leave it "
+                "out, or give delivery=tested"
+            )
         if "." not in key and key not in OF_CONES:
             continue
         if not any(_covers(each, key) for each in REFERRED):
@@ -216,6 +221,12 @@ def check_read(config: DictConfig, task: Iterable[str], *, trains_guides: bool) 
         references = _references(config) if references is None else references
         if not any(_covers(each, key) for each in references):
             raise UserError(f"{text} has no effect: nothing in this run reads {key}; leave it out")
+
+
+def _tests(config: DictConfig) -> bool:
+    """Return whether a run compares policies in cases of the training."""
+    anchored = OmegaConf.select(config, "learner.anchor") is not None
+    return anchored or bool(config.method.search) or config.delivery == "tested"
 
 
 def _references(config: DictConfig) -> set[str]:

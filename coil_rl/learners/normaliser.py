@@ -217,7 +217,7 @@ def normaliser(
 
 
 class RawObservations:
-    """Warns once of observed entries that are out of scale and not normalised; changes nothing.
+    """Warns once of each observed entry that is used as it is and out of scale; changes nothing.
 
     Args:
         env: the env, for its specs.
@@ -228,20 +228,38 @@ class RawObservations:
     def __init__(
         self, env: EnvBase, in_keys: Sequence[NestedKey], normaliser: Normaliser | None
     ) -> None:
-        done = [] if normaliser is None else normaliser.in_keys
-        self.raw = [key for key in vectors_of_measurements(env, in_keys) if key not in done]
-        self.batch_dims = len(env.batch_size)
+        # Whether each is normalised: perhaps by a decision of the first batch.
+        self.used: dict[NestedKey, Tensor | None] = {}
+        vectors = vectors_of_measurements(env, in_keys)
+        moments = {}
+        if normaliser is not None:
+            moments = dict(zip(normaliser.in_keys, normaliser.moments, strict=True))
+        for key in vectors:
+            if key not in moments:
+                self.used[key] = None
+            elif moments[key].used is not None:
+                self.used[key] = moments[key].used
+        self.batch_dims, self.count = len(env.batch_size), 0
 
     def look(self, batch: TensorDictBase) -> None:
-        """Look at a batch [*B, T]; only at the first one."""
-        raw, self.raw = self.raw, []
-        for key in raw:
+        """Look at a batch [*B, T]: at the first one, the second, the fourth and so on.
+
+        What is observed may grow while a policy learns.
+        """
+        self.count += 1
+        if self.count & (self.count - 1):
+            return
+        for key, used in list(self.used.items()):
+            if used is not None and used:
+                continue
             moments = Moments(batch[key].shape[self.batch_dims + 1 :], batch[key].device)
             moments.add(batch[key])
             if found := moments.described(moments.size > LARGE):
+                del self.used[key]
+                remedy = "auto or true" if used is None else "true"
                 warnings.warn(
                     f"{_name(key)} is observed as it is, but is far out of scale for a network: "
-                    f"{', '.join(found)}; use learner.normalise=auto or true",
+                    f"{', '.join(found)}; use learner.normalise={remedy}",
                     stacklevel=2,
                 )
 

@@ -304,6 +304,27 @@ def test_name_that_is_never_in_info_is_said(name, said):
     assert any(expected in text for text in texts) == said
 
 
+def test_mask_of_actions_is_said_not_to_be_used():
+    class Masked(Place):
+        def reset(self, **options):
+            return super().reset(**options)[0], {"action_mask": np.ones(2)}
+
+    with pytest.warns(UserWarning, match="has action_mask in info, which is not used"):
+        GymnasiumEnv(partial(Masked, 0.0)).reset()
+
+
+def test_observation_without_numbers_is_refused():
+    class Blind(Place):
+        observation_space = spaces.Box(-1, 1, (0,))
+
+        def __init__(self):
+            super().__init__(0.0)
+            self.observation_space = spaces.Box(-1, 1, (0,))
+
+    with pytest.raises(ValueError, match="which has no numbers; observe at least one"):
+        GymnasiumEnv(Blind)
+
+
 def test_finished_row_stays_as_it_is():
     env = build("Echo-v0")
     carrier = env.reset()

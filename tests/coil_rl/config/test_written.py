@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 from programs import CONF, called, shipped
 
 from coil_rl import UserError, compose_train
+from coil_rl.config.written import check_read
 
 METHODS = shipped("method")
 FAST = ("coil", "dagger", "rlpd")
@@ -156,8 +157,14 @@ def test_value_that_a_learner_does_not_take_is_refused_by_its_name(tmp_path):
         ("method=dagger budget.minibatches=3", "nothing in this run reads budget.minibatches"),
         ("learner=sac training.learning_rate=1", "reads training.learning_rate; leave it out"),
         ("training.imitation_env.assignment=random", "reads training.imitation_env.assignment"),
+        ("training.tests.starts=5", "this run compares no policies while it trains"),
     ],
 )
 def test_override_that_nothing_reads_is_refused(words, message, tmp_path):
     refused = called("train", *words.split(), cwd=tmp_path, code=2).stderr
     assert message in refused
+
+
+@pytest.mark.parametrize("word", ["method=coil_anchored", "delivery=tested"])
+def test_cases_of_comparisons_are_read_where_policies_are_compared(word):
+    check_read(compose_train([word]), ["training.tests.starts=5"], trains_guides=False)

@@ -121,6 +121,28 @@ def test_raw_observations_far_out_of_scale_are_named(tmp_path):
         learned(PHYSICAL, tmp_path / "run", *ON_POLICY, "learner.normalise=false")
 
 
+class Drifting(Reactor):
+    """A reactor whose readings grow tenfold from episode to episode."""
+
+    begun = 0
+
+    def reset(self, *, seed=None, options=None):
+        self.begun += 1
+        return super().reset(seed=seed)
+
+    def seen(self):
+        return (10.0 ** min(self.begun - 1, 4) * self.state).astype(np.float32)
+
+
+def test_observations_that_leave_their_scale_later_are_named_once(tmp_path):
+    with pytest.warns(UserWarning, match="out of scale") as found:
+        learned(Drifting, tmp_path / "run", *ON_POLICY, "budget.steps=8", frames=512)
+    texts = [str(each.message) for each in found]
+    named = [text for text in texts if "far out of scale for a network: [0] mean" in text]
+    assert len(named) == 1
+    assert named[0].endswith("; use learner.normalise=true")
+
+
 def test_cone_world_and_robot_are_not_normalised():
     from coil_rl import compose_train
 
