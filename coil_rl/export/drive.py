@@ -31,7 +31,9 @@ class Policy:
         feeds = dict(self.state)
         for entry in self.contract["inputs"]:
             value = np.asarray(inputs[entry["name"]], entry["dtype"])
-            feeds[entry["name"]] = value.reshape(1, *entry["shape"])
+            if [*value.shape] != entry["shape"] or not np.isfinite(value).all():
+                raise ValueError(f"{entry['name']} must be {entry['shape']} finite numbers")
+            feeds[entry["name"]] = value[None]
         names = ["action", *(each["output"] for each in self.contract["state"])]
         action, *state = self.session.run(names, {name: feeds[name] for name in self.read})
         self.state = dict(zip(self.state, state, strict=True))

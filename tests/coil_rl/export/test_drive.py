@@ -19,7 +19,7 @@ from coil_rl.export import ExportedPolicy, drive, export_policy
 from coil_rl.run.parts import TEST
 
 SOURCE = Path(drive.__file__)
-LONGEST = 20  # statements besides imports
+LONGEST = 22  # statements besides imports
 
 
 def test_driver_is_short_and_needs_no_other_package():
@@ -83,6 +83,10 @@ def test_lap_driven_by_the_file_alone_has_the_reward_of_torch(name, tmp_path):
     carrier = run.make_env.bare(1, TEST, None).reset()
     own = exported.act({key: carrier[key][0].numpy() for key in read})
     np.testing.assert_array_equal(own, by_file(carrier))
+    inputs = {key: carrier[key][0].numpy() for key in read}
+    for wrong in (inputs[read[0]][None], np.full_like(inputs[read[0]], np.nan)):
+        with pytest.raises(ValueError, match="finite numbers"):
+            policy.act(inputs | {read[0]: wrong})
 
 
 @pytest.mark.slow
