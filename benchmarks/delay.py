@@ -142,21 +142,27 @@ def row_of(label: str, turns: str, missing: float, results: Sequence[Any]) -> di
     }
 
 
-def rows_of(labels: Mapping[str, Sequence[Path]], count: int) -> Iterator[dict[str, Any]]:
+def rows_of(
+    labels: Mapping[str, Sequence[Path]],
+    count: int,
+    late: Sequence[str] = tuple(LAGS),
+    shares: Sequence[float] = MISSING,
+) -> Iterator[dict[str, Any]]:
     """Yield the rows of all labels, those of the guide alone first.
 
     Args:
         labels: folders of runs by label.
         count: number of copies of the track.
+        late: by how many turns, names in `LAGS`.
+        shares: of the cones that are missing.
     """
     first = next(iter(labels.values()))[0]
-    for missing in MISSING:
-        for turns, lags in LAGS.items():
-            yield row_of(GUIDE, turns, missing, guide_driven(first, lags, missing, count))
+    cases = [(missing, turns) for missing in shares for turns in late]
+    for missing, turns in cases:
+        yield row_of(GUIDE, turns, missing, guide_driven(first, LAGS[turns], missing, count))
     for label, folders in labels.items():
-        for missing in MISSING:
-            for turns, lags in LAGS.items():
-                yield row_of(label, turns, missing, driven(folders, lags, missing, count))
+        for missing, turns in cases:
+            yield row_of(label, turns, missing, driven(folders, LAGS[turns], missing, count))
 
 
 def main() -> None:
@@ -164,13 +170,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="of coil-train +experiment=robot_delay")
     parser.add_argument("--count", type=int, default=20, help="copies of the track")
+    parser.add_argument("--turns", nargs="+", choices=LAGS, default=[*LAGS], help="of delay")
+    parser.add_argument("--missing", nargs="+", type=float, default=MISSING, help="share of cones")
     args = parser.parse_args()
     torch.set_num_threads(1)
     labels = runs_by_label(args.folder)
     if not labels:
         raise SystemExit(f"{args.folder} has no finished runs")
     rows: list[dict[str, Any]] = []
-    for row in rows_of(labels, args.count):
+    for row in rows_of(labels, args.count, args.turns, args.missing):
         rows.append(row)
         print(*(row[name] for name in COLUMNS), flush=True)
     page = markdown_table(rows, COLUMNS)
