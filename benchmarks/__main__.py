@@ -32,6 +32,7 @@ from benchmarks.driving import (
 from benchmarks.gymnasium_speed import measure_gymnasium
 from benchmarks.one_car import measure_one_car
 from benchmarks.process import measure_processes
+from benchmarks.slow_plant import measure_workers
 from benchmarks.timing import Row
 from benchmarks.training import (
     measure_command,
@@ -62,6 +63,7 @@ PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {
         "PPO on Gymnasium envs beside Stable-Baselines3, equal settings, CPU time",
         measure_gymnasium,
     ),
+    "workers": ("A Gymnasium env of 2 ms a step, in one process and one a core", measure_workers),
     "operators": ("Operators of 20 batched steps with advice", profile_operators),
     "command": ("coil-train with its defaults, from the command to its pictures", measure_command),
     "compiled": ("The guide's drives in steps per second, with compiled steps", measure_compiled),
@@ -83,6 +85,7 @@ GOALS = [
     ("one_car", "{cars} cars with the guide / one car in NumPy", "ratio", ">=", 500),
     ("sb3", "PPO / Stable-Baselines3 with {envs} envs", "ratio", ">=", 10),
     ("gymnasium", "PPO / Stable-Baselines3, {env}, {envs} envs", "ratio", ">=", 1.05),
+    ("workers", "{subject}, {processes} processes / one, a core", "ratio / cores", ">=", 0.9),
     ("robot", "{subject} (scans/s)", "scans/s", ">=", 1000),
     ("processes", "state per car (B), {cars} cars", "state per car (B)", "<", 2000),
 ]

@@ -188,6 +188,20 @@ def test_warnings_of_a_process_reach_the_program() -> None:
         drive(env, 1_000)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="there is no affinity")
+def test_each_process_has_a_core_if_there_are_as_many() -> None:
+    cores = os.sched_getaffinity(0)
+    for count in (len(cores), len(cores) + 1):
+        env = plants(count, rows=count)
+        env.reset()
+        own = [os.sched_getaffinity(process.pid) for process in env.workers.processes]
+        assert own == (
+            [{core} for core in sorted(cores)] if count == len(cores) else [cores] * count
+        )
+        env.close()
+    assert os.sched_getaffinity(0) == cores
+
+
 def test_processes_end_with_the_env() -> None:
     env = plants(2)
     env.reset()
