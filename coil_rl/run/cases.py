@@ -36,6 +36,7 @@ class TrainingCases:
     Attributes:
         steps: that all comparisons have taken so far.
         taken: of these the steps of each policy in the last comparison.
+        longest: number of steps of the longest episode so far, of this process.
         calls: number of actions that guides were asked for.
     """
 
@@ -50,6 +51,7 @@ class TrainingCases:
         self.env: EnvBase | None = None
         self.env_seed, self.count, self.copies = 0, 0, 1
         self.taken: list[int] = []
+        self.longest = 0
 
     def begin(self) -> None:
         """Begin a comparison: forget the env of the one before, of which nothing may be left."""
@@ -155,6 +157,7 @@ class TrainingCases:
             for after, running in episodes(env, policy, sampled=sampled, tick=bar.update):
                 totals.add(after, running)
         self.steps += int(totals.steps.sum())
+        self.longest = max(self.longest, int(totals.steps.max()))
         self.calls += guide_calls(env) - before
         return totals
 

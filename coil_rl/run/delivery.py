@@ -99,7 +99,17 @@ class Delivery:
     def reserve(self) -> int:
         """Return the frames that are kept for the test, once the start test is over.
 
-        What that test took beyond the same share is missing here.
+        They are enough for its first cases, if the start test has seen how long episodes are.
+        """
+        if not self.cases.longest:
+            return self._affordable()
+        policies = 1 + len(self._guides_of_env())
+        return max(self._affordable(), FIRST_CASES * policies * self.cases.longest)
+
+    def _affordable(self) -> int:
+        """Return the frames that the test may take.
+
+        What the start test took beyond the same share is missing here.
         """
         share = math.ceil(SHARE * self.cases.frames)
         return max(min(share, 2 * share - self.cases.steps), 0)
@@ -150,16 +160,20 @@ class Delivery:
         hold = hold_of(self.learner.policy)
         if hold is not None and bool(hold.held) and self.curve is not None:
             return {"first": checkpoint.load(self.curve.file(0))}
-        found = [part for part in self.env.modules() if isinstance(part, GuideActions)]
-        titles = guide_titles(found[0].names) if found else []
+        titles = self._guides_of_env()
         return {title: {GUIDE: torch.tensor(index)} for index, title in enumerate(titles)}
+
+    def _guides_of_env(self) -> list[str]:
+        """Return the titles of the guides in the env."""
+        found = [part for part in self.env.modules() if isinstance(part, GuideActions)]
+        return guide_titles(found[0].names) if found else []
 
     def _tested(self, candidates: Mapping[str, Any]) -> dict[str, Tensor]:
         """Return the returns of the candidates in the same new cases, [C] each.
 
         An earlier policy is left out where the frames do not allow for it.
         """
-        returns, reserve = dict[str, Tensor](), self.reserve()
+        returns, reserve = dict[str, Tensor](), self._affordable()
         policies = {
             name: policy_of(state, self.learner, self.env) for name, state in candidates.items()
         }

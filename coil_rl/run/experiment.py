@@ -108,14 +108,16 @@ class Experiment:
     def _plan(self) -> None:
         """Fix at how many updates the run ends, and what the curve keeps.
 
-        What was taken before, what tests have taken and what is kept for the last one is left out
-        of the frames. At least one further update is left.
+        The frames are rounded up to whole batches. What tests have taken, and what is kept for the
+        last one, is left out of these, so that a run with tests takes no more frames than one
+        without. At least one further update is left.
         """
         kept = 0 if self.reserve is None else self.reserve()
+        batch = self.rollout.frames
         for frames in (*self.stages, self.frames):
             if frames not in self.ends:
-                taken = self.before + self.tested + kept
-                updates = math.ceil((frames - taken) / self.rollout.frames)
+                whole = math.ceil((frames - self.before) / batch) * batch
+                updates = (whole - self.tested - kept) // batch
                 self.ends[frames] = max(updates, self.updates + 1)
         if self.curve is not None:
             known = [update for update in self.ends.values() if update <= self.all_updates]
