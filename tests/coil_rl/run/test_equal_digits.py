@@ -60,8 +60,8 @@ class Units:
 class Plant(gymnasium.Env):
     """Two numbers that the normalised action pushes; the best action depends on them."""
 
-    def __init__(self, low, high, render_mode=None):
-        self.units = Units(low, high)
+    def __init__(self, low, high, reward_unit=1.0, render_mode=None):
+        self.units, self.reward_unit = Units(low, high), reward_unit
         self.observation_space = Box(-10, 10, (2,), np.float32)
         self.action_space = Box(np.float32(low), np.float32(high), dtype=np.float32)
 
@@ -75,7 +75,8 @@ class Plant(gymnasium.Env):
         reward = -float(np.square(pushed - best(self.state)).sum())
         self.state = 0.8 * self.state + 0.3 * pushed
         self.steps += 1
-        return self.state.astype(np.float32), reward, False, self.steps >= 10, {}
+        over = self.steps >= 10
+        return self.state.astype(np.float32), self.reward_unit * reward, False, over, {}
 
 
 def best(state):
@@ -92,11 +93,11 @@ class Near:
         return self.units.own(best(observation) + 0.1)
 
 
-def run_in(folder, box, method, *overrides, frames=128):
+def run_in(folder, box, method, *overrides, frames=128, reward_unit=1.0):
     low, high = box
     words = [*TINY, *PROXY, *OPTIONS.get(method, ON_POLICY), f"proxy.folder={folder}_proxies"]
     return coil_rl.prepare(
-        partial(Plant, low, high),
+        partial(Plant, low, high, reward_unit),
         guide=None if method in WITHOUT_GUIDE else Near(Units(low, high)),
         method=method,
         frames=frames,
@@ -105,20 +106,25 @@ def run_in(folder, box, method, *overrides, frames=128):
     )
 
 
-def digits(folder, box, method, *overrides):
-    """Return the numbers of the log of a run, and the returns of its policy, normalised actions."""
-    run = run_in(folder, box, method, *overrides)
+def learned(folder, box, method, *overrides, **options):
+    """Return a run that has learned, and its actions in ten states, normalised."""
+    run = run_in(folder, box, method, *overrides, **options)
     run.begin()
     run.learn()
-    with open(folder / "metrics.csv", encoding="utf-8") as file:
+    controller, units = run.controller(), Units(*box)
+    states = np.random.default_rng(0).uniform(-1, 1, (10, 2)).astype(np.float32)
+    return run, np.ravel([units.normalised(controller.act(s)) for s in states]).tolist()
+
+
+def digits(folder, box, method, *overrides):
+    """Return the numbers of the log of a run, and the returns of its policy, normalised actions."""
+    run, actions = learned(folder, box, method, *overrides)
+    with open(run.folder / "metrics.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     numbers = {
         name: [float(row[name] or "nan") for row in rows] for name in rows[0] if "time" not in name
     }
-    controller, units = run.controller(), Units(*box)
-    states = np.random.default_rng(0).uniform(-1, 1, (10, 2)).astype(np.float32)
-    numbers["actions"] = np.ravel([units.normalised(controller.act(s)) for s in states]).tolist()
-    return numbers
+    return numbers | {"actions": actions}
 
 
 def check_equal(folder, boxes, method, *overrides):
@@ -148,6 +154,27 @@ def test_every_method_has_equal_digits_in_every_box(method, tmp_path):
     if method in FAST:
         boxes = {name: BOXES[name] for name in ("unit", "different")}
     check_equal(tmp_path, boxes, method)
+
+
+# What is added to the reward by rfc is in its unit, and there is nothing to tune.
+@pytest.mark.parametrize(
+    "method",
+    [
+        method
+        if method in ("coil_anchored", "cheq")
+        else pytest.param(method, marks=pytest.mark.slow)
+        for method in METHODS
+        if method not in ("guide", "tune", "rfc", "coil_rfc")
+    ],
+)
+def test_every_method_learns_the_same_in_every_unit_of_the_reward(method, tmp_path):
+    frames = 256  # two updates with a policy that has learned
+    found = [
+        learned(tmp_path / str(unit), BOXES["unit"], method, frames=frames, reward_unit=unit)[1]
+        for unit in (1.0, 2.0**14)
+    ]
+    assert np.ptp(found[0]) > 0
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("method", [*FAST[:3], "coil_anchored"])
