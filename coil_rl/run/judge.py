@@ -273,8 +273,10 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, share: float 
     if count > MAX_CASES:
         page.append(f"Means of {count} cases; all are in evaluation.csv.")
     if has_policy and count > 1 and trial.guides:
-        chance, mine = trial.chance(), judgement.shown[trial.label]
-        page += [not_worse(mine, judgement.shown[name], name, chance) for name in trial.guides]
+        # An env that fails with random actions costs this sentence, and not the results.
+        with decoration("the comparison with the guide"):
+            chance, mine = trial.chance(), judgement.shown[trial.label]
+            page += [not_worse(mine, judgement.shown[name], name, chance) for name in trial.guides]
     if share is not None:
         page.append(f"With fallback the guide acted in {share:.1%} of the steps.")
     return "\n\n".join([*page, *trial.notes])

@@ -143,6 +143,22 @@ def test_results_are_complete_without_a_picture_that_fails(composed, tmp_path, p
     assert (broken.seen == 1) == (place == "watch")
 
 
+def test_results_are_complete_where_an_env_fails_with_random_actions(
+    composed, tmp_path, monkeypatch
+):
+    config = composed("guide=spline", "evaluation.repeats=1", "evaluation.gif=false")
+    make_env = env_maker(config)
+
+    def fails(*_, **__):
+        raise RuntimeError("the plant has tripped")
+
+    monkeypatch.setattr(type(make_env), "random", fails)
+    with pytest.warns(UserWarning, match="comparison with the guide is left out .*has tripped"):
+        judge(trial(config, make_env), build_learner(config, make_env()).policy, tmp_path, seed=0)
+    assert "Not worse" not in (tmp_path / "evaluation.md").read_text()
+    assert (tmp_path / "evaluation.csv").exists()
+
+
 def test_mean_over_fewer_episodes_is_told_on_the_page_and_in_the_table(composed, tmp_path):
     config = composed("guide=spline", "evaluation.repeats=1", "evaluation.gif=false")
     make_env = env_maker(config)
