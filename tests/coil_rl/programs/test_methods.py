@@ -58,7 +58,8 @@ REPLAY = [
     "learner.critics=3",
 ]
 SMALL |= {
-    "coil_anchored": [*PPO, "training.tests.time_limit=0.5"],
+    # The tests take most of the frames; two updates are left.
+    "coil_anchored": [*PPO, "training.tests.time_limit=0.5", "budget.frames=256"],
     "cheq": REPLAY,
     "policy_decorator": REPLAY,
     "q_filter": REPLAY,
