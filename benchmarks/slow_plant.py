@@ -65,7 +65,7 @@ def measure_workers(args: Namespace) -> list[Row]:
 
 
 def works(workers: int) -> dict[str, Work]:
-    """Return pieces of work with an env by name.
+    """Return the functions that are timed by name: a step, a rollout, a batch.
 
     Args:
         workers: number of its processes.

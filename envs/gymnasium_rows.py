@@ -123,7 +123,7 @@ class Row:
             self._advise()
 
     def _look_for_masks(self) -> None:
-        """Warn if the env says which actions are possible now, which policies do not ask."""
+        """Warn if info has a mask of the possible actions, which policies do not read."""
         for name in MASKS & self.info.keys():
             warnings.warn(
                 f"the env {self.name} has {name} in info, which is not used: policies and guides "

@@ -70,3 +70,11 @@ class AnyEnv(SeededEnv):
             "terminated": torch.zeros_like(truncated),
         }
         return TensorDict(self.observe() | {self.reward: score} | ends, self.batch_size)
+
+
+def check_same_update(one, other, batch):
+    """Check that two learners report the same for an update with a batch."""
+    torch.manual_seed(1)
+    expected = one.update(batch.clone())
+    torch.manual_seed(1)
+    assert other.update(batch.clone()) == expected

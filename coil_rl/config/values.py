@@ -61,7 +61,7 @@ def check_values(config: DictConfig) -> None:
 
 @cache
 def _adapter(schema: type) -> TypeAdapter[Any]:
-    """Return what validates values of a schema, which takes longer to make than to use."""
+    """Return the validator of a schema, which takes longer to make than to use."""
     return TypeAdapter(schema)
 
 

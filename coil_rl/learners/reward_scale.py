@@ -56,7 +56,7 @@ class RewardScale(Extension):
         self.moments.add(returns)
 
     def scaled(self, rewards: Tensor) -> Tensor:
-        """Return rewards of any shape, divided."""
+        """Return rewards of any shape, divided by the scale."""
         return rewards / self.scale
 
     def prepare(self, batch: TensorDictBase) -> None:

@@ -37,6 +37,7 @@ from coil_rl.run.evaluation import EvaluationResult, evaluate_policy
 from coil_rl.run.fallback import Fallback
 from coil_rl.run.parts import TEST, EnvMaker
 from coil_rl.run.policy_batch import PartlySampled, traced
+from coil_rl.transforms.action_space import random_action
 
 COLUMNS = {
     "driver": ("driver", ""),
@@ -121,11 +122,15 @@ class Trial:
         return self.make_env(rows, TEST, advice, count=self.count)
 
     def chance(self) -> float:
-        """Return the mean reward of random actions in the cases of the test."""
-        env, policy = self.make_env.random(len(self.evaluation.cases), TEST, count=self.count)
+        """Return the mean reward of random actions in the cases of the test.
+
+        It is the zero of a scale; that of the rewards themselves means nothing.
+        """
+        rows = len(self.evaluation.cases)
+        env = self.make_env.plain(rows, TEST, count=self.count, controllers=False)
         with torch.random.fork_rng():
             torch.manual_seed(0)
-            return evaluate_policy(env, policy, cases=self.evaluation.cases).mean_reward
+            return evaluate_policy(env, partial(random_action, env)).mean_reward
 
 
 class Judgement:

@@ -19,7 +19,6 @@ from torchrl.envs import (
     VecNorm,
     VecNormV2,
 )
-from torchrl.modules import RandomPolicy
 
 from coil_rl.envs.step_limit import limits_of
 from coil_rl.errors import UserError
@@ -93,21 +92,19 @@ class EnvMaker:
         bare = self.bare if self.of_agent is None else self.of_agent
         return self._around(bare(rows, cases, count), self.disturb(cases), advice)
 
-    def random(
-        self, rows: int, cases: str, *, count: int | None = None
-    ) -> tuple[EnvBase, RandomPolicy]:
-        """Return an env without guides, and the policy of random actions in it.
-
-        What these earn is the zero of a scale; that of the rewards themselves means nothing.
+    def plain(
+        self, rows: int, cases: str, *, count: int | None = None, controllers: bool = True
+    ) -> EnvBase:
+        """Return an env without guides, disturbed as the run says.
 
         Args:
             rows: number of rows.
             cases: as above.
             count: as above.
+            controllers: whether it has the controllers beside it, which act in every step.
         """
-        bare = self.bare if self.alone is None else self.alone
-        env = transformed(bare(rows, cases, count), self.disturb(cases), "disturb")
-        return env, RandomPolicy(env.full_action_spec)
+        make = self.bare if controllers or self.alone is None else self.alone
+        return transformed(make(rows, cases, count), self.disturb(cases), "disturb")
 
     def around(self, env: EnvBase, advice: str = "") -> EnvBase:
         """Return any env with normalised actions and the transforms of the method.

@@ -21,7 +21,7 @@ from coil_rl.report import write_csv
 from coil_rl.run import checkpoint
 from coil_rl.run.curve import POLICIES
 from coil_rl.run.evaluation import EvaluationResult
-from coil_rl.run.parts import TEST, EnvMaker, transformed
+from coil_rl.run.parts import TEST, EnvMaker
 from coil_rl.run.weights import put_weights
 from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.worth.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, ZERO
@@ -76,16 +76,6 @@ class Acting(TensorDictModuleBase):
         return cls(env, _neutral)
 
 
-def plain_env(make_env: EnvMaker, rows: int) -> EnvBase:
-    """Return an env in the cases of the table, without a method.
-
-    Args:
-        make_env: makes the env.
-        rows: number of rows.
-    """
-    return transformed(make_env.bare(rows, TEST, None), make_env.disturb(TEST), "disturb")
-
-
 def _random(generator: torch.Generator, space: ActionSpace, batch: torch.Size) -> Tensor:
     draws = torch.rand((*batch, *space.agents, space.size), generator=generator)
     return space.random(draws.to(space.dtype))
@@ -119,9 +109,9 @@ def measure_baselines(config: DictConfig, folder: Path) -> None:
         OPPOSITE: opposite.guided(cases, TEST),
     }.items():
         rows += _rows(name, evaluation.run(env, policy))
-    env = plain_env(make_env, cases)
+    env = make_env.plain(cases, TEST)
     rows += _rows(ZERO, evaluation.run(env, Acting.zero(env)))
-    env = plain_env(make_env, cases)
+    env = make_env.plain(cases, TEST)
     rows += _rows(RANDOM, evaluation.run(env, Acting.random(env, config.seed)))
     write_csv(rows, folder / FILE)
 

@@ -16,7 +16,7 @@ from coil_rl.run.evaluation import episodes
 from coil_rl.run.parts import TEST, EnvMaker
 from coil_rl.run.rollout import Rollout
 from coil_rl.worth.arms import POINTS, SHARE, TUNE, Arm, curve_cases
-from coil_rl.worth.baselines import Acting, plain_env
+from coil_rl.worth.baselines import Acting
 
 EPISODES = 2  # whose length is measured
 LONGEST = 1000  # steps of these
@@ -117,10 +117,10 @@ def measure(config: DictConfig, overhead: float) -> Pace:
     with torch.random.fork_rng():
         env, follow = make_env.guided(EPISODES, TEST)
         length = _length(env, follow)
-        env = plain_env(make_env, EPISODES)
+        env = make_env.plain(EPISODES, TEST)
         length = max(length, _length(env, Acting.random(env)))
         guided = _step(*make_env.guided(ROWS, TEST))
-        env = plain_env(make_env, ROWS)
+        env = make_env.plain(ROWS, TEST)
         plain = _step(env, Acting.random(env))
         learning = _batch(config, make_env)
     guide = max(guided - plain, 0.0)

@@ -191,13 +191,12 @@ def test_warnings_of_a_process_reach_the_program() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="there is no affinity")
 def test_each_process_has_a_core_if_there_are_as_many() -> None:
     cores = os.sched_getaffinity(0)
-    for count in (len(cores), len(cores) + 1):
-        env = plants(count, rows=count)
+    each, more = [{core} for core in sorted(cores)], [cores] * (len(cores) + 1)
+    for expected in (each, more):
+        env = plants(len(expected), rows=len(expected))
         env.reset()
-        own = [os.sched_getaffinity(process.pid) for process in env.workers.processes]
-        assert own == (
-            [{core} for core in sorted(cores)] if count == len(cores) else [cores] * count
-        )
+        found = [os.sched_getaffinity(process.pid) for process in env.workers.processes]
+        assert found == expected
         env.close()
     assert os.sched_getaffinity(0) == cores
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import worlds
-from any_env import FLOAT64, AnyEnv
+from any_env import FLOAT64, AnyEnv, check_same_update
 from torchrl.data import Bounded, Categorical, Unbounded
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, DynamicCoil, Reinforce
@@ -85,11 +85,7 @@ def test_statistics_are_those_of_all_collected_observations_and_part_of_the_poli
     assert torch.equal(moments(other).mean, moments(learner).mean)
     other = learner_of(kind, shifted(Categorical(3, ()) if kind is DQN else None), normalise=True)
     other.load_state_dict(copy.deepcopy(learner.state_dict()))
-    batch = rollout.collect()
-    torch.manual_seed(1)
-    expected = learner.update(batch.clone())
-    torch.manual_seed(1)
-    assert other.update(batch.clone()) == expected
+    check_same_update(learner, other, rollout.collect())
 
 
 def test_batch_is_learned_from_with_the_statistics_that_collected_it():

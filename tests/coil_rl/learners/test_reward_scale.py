@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from any_env import AnyEnv
+from any_env import AnyEnv, check_same_update
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical
 
@@ -118,8 +118,4 @@ def test_batch_keeps_the_rewards_of_the_env_and_a_resumed_learner_goes_on(kind):
         assert torch.equal(batch["next", "reward"], given)
     other, _ = learner_in(kind, 1000.0, scale_rewards=True)
     other.load_state_dict(copy.deepcopy(learner.state_dict()))
-    batch = rollout.collect()
-    torch.manual_seed(1)
-    expected = learner.update(batch.clone())
-    torch.manual_seed(1)
-    assert other.update(batch.clone()) == expected
+    check_same_update(learner, other, rollout.collect())

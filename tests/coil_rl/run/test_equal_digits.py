@@ -185,6 +185,11 @@ def test_half_bounded_actions_have_equal_digits_wherever_the_bound_is(method, tm
     check_equal(tmp_path, boxes, method)
 
 
+def test_random_actions_earn_the_same_wherever_the_bound_is(tmp_path):
+    earned = [run_in(tmp_path / name, box, "coil").trial.chance() for name, box in HALF.items()]
+    assert earned == pytest.approx([earned[0]] * len(HALF), rel=1e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", FAST)
 def test_methods_of_the_fast_tests_have_equal_digits_in_the_other_boxes_too(method, tmp_path):

@@ -152,7 +152,7 @@ def test_results_are_complete_where_an_env_fails_with_random_actions(
     def fails(*_, **__):
         raise RuntimeError("the plant has tripped")
 
-    monkeypatch.setattr(type(make_env), "random", fails)
+    monkeypatch.setattr(type(make_env), "plain", fails)
     with pytest.warns(UserWarning, match="comparison with the guide is left out .*has tripped"):
         judge(trial(config, make_env), build_learner(config, make_env()).policy, tmp_path, seed=0)
     assert "Not worse" not in (tmp_path / "evaluation.md").read_text()
