@@ -379,12 +379,16 @@ class Run:
             draw_learning_curves({label: [rows]}, path, guides=guide_returns, cases=cases)
 
     def _saved_guide_returns(self) -> dict[str, float]:
-        """Return the mean return of each guide in the cases of the curve, measured once."""
+        """Return the mean return of each guide in the cases of the curve, measured once.
+
+        It is empty without such cases.
+        """
         file = self.folder / "guide_return.json"
         if file.exists():
+            names = self.trial.guides if EVALUATION in self.make_env.sizes else ()
             with file_of_a_run(file, "remove it, and the run measures it again"):
                 numbers = json.loads(read_file(file, LARGEST_NUMBERS))
-                return {name: float(numbers[name]) for name in self.trial.guides}
+                return {name: float(numbers[name]) for name in names}
         returns = guide_returns(self.make_env, self.make_env.guides())
         write_text(file, json.dumps(returns, indent=2))
         return returns

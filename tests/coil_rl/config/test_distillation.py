@@ -1,4 +1,5 @@
 import csv
+import shutil
 from pathlib import Path
 
 import pytest
@@ -78,6 +79,20 @@ def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, caps
     output = capsys.readouterr().out
     assert str(folder) in output
     assert "distill: made 1; the lowest mean reward is" in output
+
+
+def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path):
+    whole = next(proxies.glob("constant_*"))
+    stopped = tmp_path / whole.name
+    stopped.mkdir()
+    for name in ("config.yaml", "versions.json", "guide_return.json"):  # before the first checkpoint
+        shutil.copy(whole / name, stopped)
+    distill(
+        composed("guide=constant", f"proxy.folder={tmp_path}", f"run_dir={tmp_path}", name="distill")
+    )
+    resumed = torch.load(stopped / "policy_last.pt", weights_only=True)
+    for key, value in torch.load(whole / "policy_last.pt", weights_only=True).items():
+        assert torch.equal(resumed[key], value), key
 
 
 def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
