@@ -33,6 +33,7 @@ LAUNCHERS = {
 TYPED = re.compile(r"Could not override '([^']+)'")
 MERGED = re.compile(r"Error merging override (.+)")
 NO_GROUP = re.compile(r"(?:In '([^']+)': )?Could not override '([\w/]+)'\. No match")
+NO_CHOICE = "Config group override must be a string or a list"
 NO_INTEGER = re.compile(
     r"override ([\w.]+)=.*Value '([\d.eE+]+)' of type 'float' could not be converted to Integer",
     re.DOTALL,
@@ -77,6 +78,11 @@ def _not_composed(error: BaseException) -> str:
         without_package = hints.file_without_package(str(error))
         if without_package:
             return without_package
+    if str(error).startswith(NO_CHOICE):  # it does not say which group
+        return (
+            "a group takes the name of a file, not null or a number; write GROUP=NAME, "
+            "logger=none, disturb=[] or degrade=[], or leave it out"
+        )
     group = NO_GROUP.match(str(error))
     if group is not None and group[2] in hints.OF_CONES:
         return _group_of_cones(group[1], group[2])

@@ -92,6 +92,7 @@ def refusal(name, *arguments):
             "+watch.epsode.a=[reward]",
             "no key watch.epsode; watch has episode, step; did you mean episode?",
         ),
+        ("logger=null", "takes the name of a file, not null or a number; write GROUP=NAME"),
         ("~learner", "learner must be given: write learner=VALUE"),
         # types
         ("seed=abc", "seed=abc must be a whole number"),
