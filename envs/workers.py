@@ -310,18 +310,23 @@ def _in_process(serve: Callable[..., None], pipe: Connection, *arguments: Any) -
     for other in list(_open):
         other.close()
     torch.set_num_threads(1)  # threads do not survive a fork
-    with suppress(EOFError, OSError):  # the program has ended
-        serve(pipe, *arguments)
+    serve(pipe, *arguments)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)  # what the program does at its end, such as on a GPU, is not for its copies
 
 
 def _serve(pipe: Connection, make: Callable[[range], Shard], own: range) -> None:
     """Make rows, and do what the batch asks of them until it closes the pipe."""
     reply, shard = _caught(lambda: make(own))
-    pipe.send(_Reply(None, reply.fault, reply.bug, reply.warned))
-    while shard is not None:
-        name, *arguments = pipe.recv()
-        reply, _ = _caught(lambda: _done(shard, name, arguments))  # noqa: B023
-        pipe.send(reply)
+    with suppress(EOFError, OSError):  # the batch has ended
+        pipe.send(_Reply(None, reply.fault, reply.bug, reply.warned))
+        while shard is not None:
+            name, *arguments = pipe.recv()
+            reply, _ = _caught(lambda: _done(shard, name, arguments))  # noqa: B023
+            pipe.send(reply)
+    if shard is not None:
+        shard.close()
 
 
 def _done(shard: Shard, name: str, arguments: Sequence[Any]) -> Any:
@@ -364,9 +369,12 @@ def _time(pipe: Connection, make: Callable[[range], Shard], draw: Callable[[], A
                 taken.append(time.perf_counter() - began)
                 if shard.entries_of_rows()["done"].any():
                     shard.begin_rows({0: len(taken)}, {})
-            pipe.send(min(taken))  # other programs only make a step longer
+            shard.close()
+            seconds: float | None = min(taken)  # other programs only make a step longer
         except Exception:  # the same fault follows where it is told
-            pipe.send(None)
+            seconds = None
+    with suppress(OSError):  # the program has ended
+        pipe.send(seconds)
 
 
 def _ended(owner: int, pipes: Sequence[Connection], processes: Sequence[Any]) -> None:
@@ -375,8 +383,9 @@ def _ended(owner: int, pipes: Sequence[Connection], processes: Sequence[Any]) ->
         return
     for pipe in pipes:
         pipe.close()
+    latest = time.monotonic() + PATIENCE  # of all together
     for process in processes:
-        process.join(PATIENCE)
+        process.join(max(latest - time.monotonic(), 0))
         if process.is_alive():
             process.kill()
             process.join()

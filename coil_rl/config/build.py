@@ -138,7 +138,6 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         advice=list(config.evaluation.advice) if config.method.transforms else [],
         repeats=config.evaluation.repeats,
         compiled=config.compile,
-        device=config.device,
         notes=notes,
     )
 

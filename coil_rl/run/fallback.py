@@ -138,8 +138,8 @@ def make_fallback(
     values = [
         values_of(critic, after)[running.reshape(-1)] for after, running in episodes(env, guide)
     ]
-    limits = torch.cat(values).quantile(torch.tensor([LEAVE, BACK]))
-    leave, back = limits.tolist()
+    of_guide = torch.cat(values)
+    leave, back = of_guide.quantile(of_guide.new_tensor([LEAVE, BACK])).tolist()
     return Fallback(policy, critic, guide, leave, back)
 
 

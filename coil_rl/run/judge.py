@@ -98,7 +98,6 @@ class Trial:
         repeats: episodes a case with sampled actions.
         count: number of cases, if it is not the env's own.
         compiled: whether the steps of the env are compiled.
-        device: of the env.
         notes: further sentences for the page.
     """
 
@@ -114,7 +113,6 @@ class Trial:
     repeats: int = 0
     count: int | None = None
     compiled: bool = False
-    device: str = "cpu"
     notes: Sequence[str] = ()
 
     def env(self, rows: int, advice: str = "") -> EnvBase:
@@ -239,13 +237,14 @@ def _evaluate_with(
     """
     count = len(trial.evaluation.cases)
     own = (1 + repeats) * count
-    rows = torch.arange(own + len(beside) * count, device=trial.device)
-    env = trial.env(len(rows), advice)
+    total = own + len(beside) * count
+    env = trial.env(total, advice)
     if trial.compiled:
         compile_steps(env)
     watching = [] if advice else [picture for picture in trial.pictures if picture.watches]
     shown = {trial.label: 0} | {name: own + count * index for index, name in enumerate(beside)}
     if repeats:
+        rows = torch.arange(total, device=env.device)
         sampled = (rows >= count) & (rows < own)
         policy = traced(PartlySampled(policy, sampled))
     if beside:

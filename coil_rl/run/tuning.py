@@ -186,15 +186,15 @@ class Tuner:
         """Return the returns of `OWN`, `MEAN` and `BEST` in the same further new cases, [C]."""
         values = {OWN: self.own, MEAN: self.mean, BEST: self.best}
         reserve = self.cases.frames - self.cases.steps
-        found = {name: torch.empty(0) for name in values}
+        found: dict[str, list[Tensor]] = {name: [] for name in values}
         begun, count = self.cases.steps, FIRST_CASES
         while count > 0:
             new = self.returns(list(values.values()), count)
-            for (name, known), returns in zip(found.items(), new, strict=True):
-                found[name] = torch.cat([known, returns])
-            done, taken = len(found[OWN]), self.cases.steps - begun
+            for known, returns in zip(found.values(), new, strict=True):
+                known.append(returns)
+            done, taken = sum(map(len, found[OWN])), self.cases.steps - begun
             count = min(int(reserve * done / taken), MOST_CASES) - done
-        return found
+        return {name: torch.cat(returns) for name, returns in found.items()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the next generation depends on."""

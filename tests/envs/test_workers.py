@@ -229,6 +229,27 @@ for program in programs:
 """
 
 
+class Simulator(Plant):
+    """The plant with something that it must release, here a file that it removes."""
+
+    def __init__(self, file):
+        super().__init__()
+        self.file = file.with_suffix(f".{os.getpid()}_{id(self)}")
+        self.file.touch()
+
+    def close(self):
+        self.file.unlink()
+
+
+@pytest.mark.parametrize("workers", [0, 2, "auto"])
+def test_envs_are_closed_in_their_processes(workers, tmp_path) -> None:
+    env = GymnasiumEnv(Simulator, 3, options={"file": tmp_path / "licence"}, workers=workers)
+    env.reset()
+    assert len(list(tmp_path.iterdir())) >= 3
+    env.close()
+    assert not list(tmp_path.iterdir())
+
+
 def test_no_process_outlives_its_program() -> None:
     kinds = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
     paths = os.pathsep.join(path for path in sys.path if path)

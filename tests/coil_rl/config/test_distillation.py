@@ -85,10 +85,16 @@ def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path):
     whole = next(proxies.glob("constant_*"))
     stopped = tmp_path / whole.name
     stopped.mkdir()
-    for name in ("config.yaml", "versions.json", "guide_return.json"):  # before the first checkpoint
+    for name in (
+        "config.yaml",
+        "versions.json",
+        "guide_return.json",
+    ):  # before the first checkpoint
         shutil.copy(whole / name, stopped)
     distill(
-        composed("guide=constant", f"proxy.folder={tmp_path}", f"run_dir={tmp_path}", name="distill")
+        composed(
+            "guide=constant", f"proxy.folder={tmp_path}", f"run_dir={tmp_path}", name="distill"
+        )
     )
     resumed = torch.load(stopped / "policy_last.pt", weights_only=True)
     for key, value in torch.load(whole / "policy_last.pt", weights_only=True).items():

@@ -1,0 +1,67 @@
+"""Whole runs of any method in the cone world, as small as they can be."""
+
+from hydra import compose, initialize_config_module
+from programs import shipped
+
+from coil_rl.config.check import check
+from coil_rl.programs.train import train
+
+METHODS = shipped("method")
+TRACKS = ["track=generated", "track.train.count=1", "track.test.count=2"]
+TINY = [
+    *TRACKS,
+    "env.laps=1",
+    "env.time_limit=0.5",
+    "env.rate=12",
+    "evaluation.repeats=1",
+    "evaluation.gif=false",
+    "evaluation.curve.env.time_limit=0.5",
+    "logger=none",
+    "checkpoint_every=1",
+    "budget.num_envs=4",
+    "budget.steps=16",
+    "budget.frames=128",
+]
+PPO = ["learner.epochs=2", "learner.minibatches=2"]
+SMALL_PROXY = [
+    *PPO,
+    "guide=[zero,constant]",
+    "proxy.budget.frames=64",
+    "proxy.budget.num_envs=2",
+    "proxy.budget.steps=16",
+    "proxy.learner.regressor.epochs=1",
+]
+SMALL = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
+REPLAY = [
+    "learner.batch_size=8",
+    "learner.ratio=1",
+    "learner.starts=16",
+    "learner.hidden=[8]",
+    "learner.critics=3",
+]
+SMALL |= {
+    # The tests take most of the frames; two updates are left.
+    "coil_anchored": [*PPO, "training.tests.time_limit=0.5", "budget.frames=256"],
+    "cheq": REPLAY,
+    "policy_decorator": REPLAY,
+    "q_filter": REPLAY,
+    "ibrl": [*REPLAY, "learner.edit=0.2", "method.transforms.takeover.frames=32"],
+}
+SMALL["tune"] = ["tune={gain: [0.1, 2]}", "training.tests.time_limit=0.5"]
+SMALL |= {method: [*REPLAY, "method.transforms.takeover.frames=32"] for method in ("rlpd", "wsrl")}
+# Twice 64 frames of proxies, and two updates.
+DYNAMIC = [*SMALL_PROXY, "budget.frames=256"]
+SMALL |= {method: DYNAMIC for method in METHODS if method.startswith("dynamic")}
+
+
+def composed(method, folder, *overrides):
+    overrides = [f"method={method}", *SMALL.get(method, PPO), *overrides]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose("train", [*TINY, *overrides, f"run_dir={folder}"])
+
+
+def trained(folder, method, *overrides):
+    config = composed(method, folder, *overrides)
+    check(config)
+    train(config)
+    return folder
