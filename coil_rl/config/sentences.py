@@ -67,6 +67,11 @@ def _message(error: BaseException) -> str:
         return (
             "the command line cannot be composed; give each group a name, GROUP=CHOICE (see --help)"
         )
+    if str(error).startswith(NO_CHOICE):  # it does not say which group
+        return (
+            "a group takes the name of a file, not null or a number; write GROUP=NAME, "
+            "logger=none, disturb=[] or degrade=[], or leave it out"
+        )
     if isinstance(error, OverrideParseException):
         return _unreadable_override(error)
     return _not_composed(error)
@@ -78,11 +83,6 @@ def _not_composed(error: BaseException) -> str:
         without_package = hints.file_without_package(str(error))
         if without_package:
             return without_package
-    if str(error).startswith(NO_CHOICE):  # it does not say which group
-        return (
-            "a group takes the name of a file, not null or a number; write GROUP=NAME, "
-            "logger=none, disturb=[] or degrade=[], or leave it out"
-        )
     group = NO_GROUP.match(str(error))
     if group is not None and group[2] in hints.OF_CONES:
         return _group_of_cones(group[1], group[2])
