@@ -36,7 +36,8 @@ from coil_rl.report.runs import RETURN, Run
 REFERENCES = Path(__file__).parent / "references.csv"
 GUIDE = "guide"  # as a reference: the return of the intact guide
 SEEDS = {"standard": 5, "headline": 10}
-ENOUGH = 0.9  # of the frames of a task; batches are complete, so that a run may end earlier
+STANDARD_FRAMES = 60_000  # of the effort `standard`
+ENOUGH = 0.9  # of the frames of an effort; batches are complete, so that a run may end earlier
 SAME = 1e-6  # of a score that is computed again
 SCORES = {"score_guide": "guide", "score_ppo": "ppo", "score": "end"}
 NUMBERS = (
@@ -109,9 +110,11 @@ def effort(seeds: int, frames: float, reference: Reference) -> str:
         frames: of its runs.
         reference: of the task.
     """
-    if seeds < SEEDS["standard"] or frames < ENOUGH * reference.frames:
+    standard = min(STANDARD_FRAMES, reference.frames)
+    if seeds < SEEDS["standard"] or frames < ENOUGH * standard:
         return "smoke"
-    return "headline" if seeds >= SEEDS["headline"] else "standard"
+    whole = frames >= ENOUGH * reference.frames
+    return "headline" if whole and seeds >= SEEDS["headline"] else "standard"
 
 
 def benchmark_rows(task: str, runs: Sequence[Run]) -> list[dict[str, Any]]:

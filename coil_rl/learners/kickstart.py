@@ -16,7 +16,10 @@ from coil_rl.learners.extension import Extension
 from coil_rl.learners.heads import Choices
 from coil_rl.schedules import Linear, Schedule, schedule
 
-EDGE = 1e-3  # minimum distance of a guide's action from the bounds, as a fraction of half the range
+# Minimum distance of a guide's action from the bounds, as a fraction of half the range. A policy that
+# imitates an action at its bound is so far in the flat part of the squashing that nothing is left to
+# explore with, and later gradients are almost zero.
+EDGE = 0.2
 
 
 class ActionValues(Protocol):
@@ -37,7 +40,7 @@ class KickstartLoss(Extension):
         coefficient: weight of the loss, a number or a schedule.
         kind: "likelihood", behavioural cloning: -log pi(g | s); or "divergence": KL(N(g, scale) ||
             pi), which also trains the standard deviation of the policy. For bounded actions both
-            normal distributions are squashed.
+            normal distributions are squashed, and g is at most 0.8 of the way to a bound.
         scale: standard deviation of the guide for the divergence, before squashing.
         guide: index of the guide in the advice.
         advice_key: entry with the advice, [N, n_guides, A].

@@ -101,6 +101,9 @@ def test_effort_needs_both_seeds_and_frames():
     assert effort(10, 950, reference) == "headline"
     assert effort(5, 1000, reference) == "standard"
     assert effort(4, 1000, reference) == effort(10, 500, reference) == "smoke"
+    long = Reference(frames=1_000_000, level="guide", source="")
+    assert effort(10, 60_000, long) == effort(5, 1_000_000, long) == "standard"
+    assert effort(5, 50_000, long) == "smoke"
 
 
 def test_fingerprint_is_that_of_the_configuration_without_its_seeds():
