@@ -16,8 +16,8 @@ from coil_rl.learners.extension import Extension
 from coil_rl.learners.heads import Choices
 from coil_rl.schedules import Linear, Schedule, schedule
 
-# Minimum distance of a guide's action from the bounds, as a fraction of half the range. A policy that
-# imitates an action at its bound is so far in the flat part of the squashing that nothing is left to
+# Minimum distance of a guide's action from the bounds, as a fraction of half the range. A policy
+# that imitates a bound itself is so far in the flat part of the squashing that nothing is left to
 # explore with, and later gradients are almost zero.
 EDGE = 0.2
 

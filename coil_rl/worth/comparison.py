@@ -49,6 +49,7 @@ from coil_rl.worth.timing import Plan
 from coil_rl.worth.verdict import NOTHING, Entry, Verdict, verdict
 
 PLAN, TABLE, PAGE, PICTURE = "compare.json", "compare.csv", "compare.md", "compare.png"
+FOUND = "verdict.json"
 
 
 @dataclass(frozen=True)
@@ -274,6 +275,7 @@ class Comparison:
         page = page_of(found, outcome, delayed, self._steps(outcome), command)
         write_csv(outcome.rows, self.folder / TABLE)
         write_text(self.folder / PAGE, f"{page}\n")
+        write_text(self.folder / FOUND, json.dumps(found.to_dict(command), indent=2))
         with decoration(f"the picture in {self.folder}"):
             cases = base.evaluation.curve.num_envs
             if outcome.runs:

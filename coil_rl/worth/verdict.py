@@ -16,7 +16,8 @@ cases for these trainings, and says nothing about other trainings.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,6 +123,15 @@ class Verdict:
     score: float
     wrong_way_round: bool
     sentences: Sequence[str] = field(default_factory=tuple)
+
+    def to_dict(self, command: str) -> dict[str, Any]:
+        """Return it for a file, whose `score` is null where the guide has none.
+
+        Args:
+            command: that trains to the end what is recommended.
+        """
+        score = None if math.isnan(self.score) else self.score
+        return asdict(self) | {"score": score, "command": command}
 
 
 def verdict(entries: Mapping[str, Entry], failed: Sequence[str] = ()) -> Verdict:

@@ -1,6 +1,7 @@
 """`coil-compare` and `coil_rl.compare`: a pendulum, in the smallest trainings there are."""
 
 import csv
+import json
 import shlex
 import sys
 import time
@@ -52,6 +53,16 @@ def test_it_says_before_what_it_runs_and_how_to_go_on(compared):
     assert "go on with: coil-compare env=pendulum" in done.stderr
     assert "minutes=0.01 is not enough" in done.stderr
     assert f"folder={folder}" in done.stderr
+
+
+def test_verdict_is_a_file_for_programs(compared):
+    folder, _ = compared
+    found = json.loads((folder / "verdict.json").read_text())
+    assert found["sentences"] == [
+        line[3:] for line in (folder / "compare.md").read_text().splitlines()[:3]
+    ]
+    assert found["use"] in {row["policy"] for row in rows_of(folder / "compare.csv")} | {"nothing"}
+    assert found["command"].startswith("coil-train env=pendulum")
 
 
 def test_page_has_three_sentences_and_a_command_that_composes(compared):

@@ -1,0 +1,201 @@
+"""How often coil-compare is right: what it recommends, and what whole trainings gave.
+
+    python -m benchmarks.guide_benchmark.advised docs/guide_benchmark/rows.csv outputs/advised
+
+It runs coil-compare for each task and guide in a table of rows, with the frames of those rows, and
+goes on where it was stopped. What a recommendation is worth is read off the table: the end of the
+recommended method, or the return of the guide. The regret is the distance to the best of all
+methods with that guide, of plain PPO and of the guide itself, in percent of the distance from
+random actions to that best.
+"""
+
+import argparse
+import csv
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.promise import ALONE, INTACT, PPO, RANDOM
+from coil_rl.files import write_text
+from coil_rl.report import markdown_table, write_csv
+from coil_rl.worth.arms import ANCHORED, GUIDE, OPPOSITE
+from coil_rl.worth.comparison import FOUND, TABLE
+from coil_rl.worth.verdict import NOTHING
+
+Row = Mapping[str, str]
+REVERSED, DETUNED = "reversed", "detuned"
+ARMS = (INTACT, DETUNED, "half", "late", REVERSED, RANDOM)  # a placebo is enough
+TUNE = "tune"  # needs numbers to tune, which are not given here
+RULES = (GUIDE, PPO, ANCHORED)  # that say the same everywhere, to compare with
+RIGHT = (1.0, 5.0, 20.0)  # percent of regret
+OWN = Path(__file__).parent / "conf" / "task"  # tasks of other packages
+COLUMNS = {
+    "task": ("task", ""),
+    "arm": ("guide", ""),
+    "use": ("recommended", ""),
+    "value": ("whole training", ".1f"),
+    "best": ("best", ""),
+    "best_value": ("its end", ".1f"),
+    "regret": ("regret (%)", ".1f"),
+    **{f"regret_{rule}": (f"always {rule}", ".1f") for rule in RULES},
+}
+
+
+def ends(rows: Sequence[Row], task: str, arm: str) -> dict[str, float]:
+    """Return what whole trainings with a guide gave, by method; plain PPO and the guide too.
+
+    Args:
+        rows: of the guide benchmark.
+        task: name of the task.
+        arm: of the guide.
+    """
+    found = {
+        row["method"]: float(row["end"])
+        for row in rows
+        if row["task"] == task
+        and row["method"] != TUNE
+        and (row["arm"] == arm or (row["method"], row["arm"]) == (PPO, ALONE))
+    }
+    guide = [float(row["guide"]) for row in rows if row["task"] == task and row["arm"] == arm]
+    return found | {GUIDE: float(np.mean(guide))}
+
+
+def words(task: str, arm: str, folder: Path, frames: int) -> list[str]:
+    """Return the arguments of coil-compare.
+
+    Args:
+        task: name of the task.
+        arm: of the guide.
+        folder: of the comparison.
+        frames: of a whole training.
+    """
+    file = f"{arm}/{task.partition('_noisy')[0]}" if arm == DETUNED else arm
+    searched = ["hydra.searchpath=[pkg://benchmarks.guide_benchmark.conf]"]
+    own = searched if (OWN / f"{task}.yaml").exists() else []
+    return [*own, f"+task={task}", f"+arm={file}", f"budget.frames={frames}", f"folder={folder}"]
+
+
+def judged(rows: Sequence[Row], task: str, arm: str, folder: Path) -> dict[str, Any]:
+    """Return the row of a comparison: what it said, and what that is worth.
+
+    Args:
+        rows: of the guide benchmark.
+        task: name of the task.
+        arm: of the guide.
+        folder: of the comparison.
+    """
+    values = ends(rows, task, arm)
+    said = json.loads((folder / FOUND).read_text())
+    use = said["train"] or GUIDE if said["use"] == NOTHING else said["use"]
+    with (folder / TABLE).open(newline="") as file:
+        measured = {row["policy"]: float(row["return"]) for row in csv.DictReader(file)}
+    # The benchmark has no row for the opposite of a guide, nor for each method of coil-compare.
+    value = values[use] if use in values else measured[use]
+    if use == OPPOSITE:
+        values = values | {OPPOSITE: value}
+    best = max(values, key=lambda name: values[name])
+    random = next(float(row["random"]) for row in rows if row["task"] == task)
+
+    def regret(end: float) -> float:
+        return 100 * (values[best] - end) / (values[best] - random)
+
+    return {
+        "task": task,
+        "arm": arm,
+        "use": use if said["use"] == use else f"{said['use']}; to train: {use}",
+        "value": value,
+        "best": best,
+        "best_value": values[best],
+        "regret": max(regret(value), 0.0),
+        "in_table": use in values,
+        **{f"regret_{rule}": regret(values.get(rule, math.nan)) for rule in RULES},
+    }
+
+
+def page(found: Sequence[Mapping[str, Any]]) -> str:
+    """Return the page of all comparisons.
+
+    Args:
+        found: their rows.
+    """
+    titles = {"regret": "coil-compare"} | {f"regret_{rule}": f"always {rule}" for rule in RULES}
+    summary = []
+    for name, title in titles.items():
+        regrets = np.array([row[name] for row in found])
+        shares = [f"{np.mean(regrets <= share):.0%} within {share:.0f} %" for share in RIGHT]
+        summary.append(f"- **{title}**: mean regret {regrets.mean():.1f} %, {', '.join(shares)}.")
+    lines = [
+        "# What coil-compare recommends, and what whole trainings gave",
+        f"{len(found)} comparisons.",
+        "\n".join(summary),
+        markdown_table(found, COLUMNS),
+    ]
+    unknown = [f"{row['task']}, {row['arm']}" for row in found if not row["in_table"]]
+    if unknown:
+        lines.append(
+            "Not in the benchmark, so that its return after the comparison itself is taken: "
+            f"{'; '.join(unknown)}."
+        )
+    return "\n\n".join(lines) + "\n"
+
+
+def run(place: Path, arguments: Sequence[str]) -> None:
+    """Run a comparison, unless it is finished; what it prints is in log.txt, beside its folder.
+
+    Args:
+        place: its folder.
+        arguments: of coil-compare.
+
+    Raises:
+        ChildProcessError: if it fails.
+    """
+    if (place / FOUND).exists():
+        return
+    place.parent.mkdir(parents=True, exist_ok=True)
+    log = place.parent / "log.txt"
+    command = [sys.executable, "-m", "coil_rl.programs.compare", *arguments]
+    with log.open("a") as output:
+        done = subprocess.run(command, stdout=output, stderr=output, check=False)
+    if done.returncode:
+        raise ChildProcessError(f"{place} failed; see {log}")
+
+
+def main() -> None:
+    """Run the comparisons that are missing, and write the page and the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("rows", type=Path, help="table of the guide benchmark")
+    parser.add_argument("folder", type=Path, help="of the comparisons")
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="of the guides")
+    parser.add_argument("--tasks", nargs="+", help="all of the table by default")
+    parser.add_argument("--minutes", type=float, default=2.0, help="of each comparison")
+    given = parser.parse_args()
+    with given.rows.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["effort"] != "smoke"]
+    cases = sorted({(row["task"], row["arm"]) for row in rows if row["arm"] in given.arms})
+    found = []
+    for task, arm in tqdm(cases, unit="comparison"):
+        if given.tasks is not None and task not in given.tasks:
+            continue
+        place = given.folder / f"{task}_{arm}"
+        frames = max(round(float(row["frames"])) for row in rows if row["task"] == task)
+        try:
+            run(place, [f"minutes={given.minutes}", *words(task, arm, place, frames)])
+        except ChildProcessError as error:
+            parser.error(str(error))
+        found.append(judged(rows, task, arm, place))
+    if not found:
+        parser.error(f"{given.rows} has no rows of a whole training with these tasks and guides")
+    write_csv(found, given.folder / "advised.csv")
+    write_text(given.folder / "advised.md", page(found))
+    print(page(found))
+
+
+if __name__ == "__main__":
+    main()
