@@ -20,7 +20,14 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from coil_rl.envs.env_batch import SeededRows
 from coil_rl.envs.gate import ForeignError, shortened
-from coil_rl.envs.gymnasium_makers import Env, make_env, maker_of, metadata_of, name_of
+from coil_rl.envs.gymnasium_makers import (
+    Env,
+    ResetWith,
+    make_env,
+    maker_of,
+    metadata_of,
+    name_of,
+)
 from coil_rl.envs.gymnasium_rows import Row, Rows, resolved_controller
 from coil_rl.envs.gymnasium_spaces import (
     action_spec,
@@ -56,6 +63,7 @@ class GymnasiumEnv(SeededRows):
             or function, or the "MODULE:NAME" of one.
         num_envs: B, number of rows.
         options: keyword arguments of `gymnasium.make`, or of the maker.
+        reset_options: `options` of each `reset` of the env, such as where an episode begins.
         wrappers: callables that take an env and return one, applied in this order.
         max_steps: steps after which an episode is truncated, instead of the registered number. An
             env that names no number at all is truncated after 1,000, with a warning.
@@ -104,6 +112,7 @@ class GymnasiumEnv(SeededRows):
         num_envs: int = 1,
         *,
         options: Mapping[str, Any] | None = None,
+        reset_options: Mapping[str, Any] | None = None,
         wrappers: Sequence[Callable[[Env], Env]] = (),
         max_steps: int | None = None,
         seed: int = 0,
@@ -126,6 +135,8 @@ class GymnasiumEnv(SeededRows):
         if max_steps is not None:
             settings["max_episode_steps"] = max_steps
         maker = maker_of(id)
+        if reset_options:
+            wrappers = [partial(ResetWith, options=reset_options), *wrappers]
         make = partial(make_env, maker, wrappers, settings)
         drawn, every = make, cases or num_envs
         self.shown = render and "rgb_array" in metadata_of(make(), "render_modes", ())

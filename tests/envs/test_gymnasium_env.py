@@ -344,6 +344,17 @@ def test_time_limit_truncates():
     assert ends["done"].sum() == 2
 
 
+@pytest.mark.parametrize("workers", [0, 2])
+def test_episodes_begin_with_the_options_of_reset(workers):
+    env = GymnasiumEnv(
+        "CartPole-v1", 2, reset_options={"low": 0.2, "high": 0.21}, seed=1, workers=workers
+    )
+    for _ in range(3):  # also after an episode
+        first = env.rollout(200, break_when_any_done=True)["observation"][:, 0]
+        assert ((first >= 0.2) & (first <= 0.21)).all()
+    env.close()
+
+
 def test_wrappers_are_applied_in_order():
     double, shift = (
         partial(gymnasium.wrappers.TransformReward, func=func)
