@@ -100,7 +100,8 @@ def as_onnx(program: ExportedProgram, step: PolicyStep) -> bytes:
         raise NotExportableError(_reason(error)) from error
     if written is None:
         raise NotExportableError("torch.onnx gave no program")
-    return _smaller(written.model)
+    with _quiet():
+        return _smaller(written.model)
 
 
 def _smaller(model: Any) -> bytes:

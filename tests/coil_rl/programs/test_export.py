@@ -25,6 +25,7 @@ def test_export_prints_what_it_does_and_what_comes_next(exported):
     assert lines[0] == "export: 30 observations of coil in its env ..."
     assert any("the file differs from torch by at most" in line for line in lines)
     assert f"Next: coil-evaluate {RUN} exported={folder}" == lines[-1]
+    assert all(line.startswith("export: ") for line in lines[:-1])  # no notes of libraries
 
 
 def test_next_step_of_a_guide_outside_is_python():
