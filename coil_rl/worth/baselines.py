@@ -78,7 +78,7 @@ class Acting(TensorDictModuleBase):
 
 def _random(generator: torch.Generator, space: ActionSpace, batch: torch.Size) -> Tensor:
     draws = torch.rand((*batch, *space.agents, space.size), generator=generator)
-    return space.random(draws.to(space.dtype))
+    return space.random(draws.to(space.spec.device, space.dtype))
 
 
 def _neutral(space: ActionSpace, batch: torch.Size) -> Tensor:

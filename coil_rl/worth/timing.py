@@ -132,7 +132,7 @@ def _length(env: EnvBase, policy: TensorDictModuleBase) -> float:
     rows = env.batch_size.numel()
     steps = torch.zeros(rows)
     for _, running in itertools.islice(episodes(env, policy), LONGEST):
-        steps += running.reshape(rows, -1)[:, 0].float()
+        steps += running.reshape(rows, -1)[:, 0].cpu()
     return float(steps.mean())
 
 
