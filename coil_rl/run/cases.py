@@ -19,6 +19,7 @@ from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 SEEDS = 2**31  # seeds of cases are below
+LEAST_CASES = 2  # of a comparison: a placebo may give a row the advice of another row
 
 
 @dataclass(eq=False)

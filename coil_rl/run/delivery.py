@@ -29,7 +29,7 @@ from coil_rl.learners.learner import Learner
 from coil_rl.report.runs import DELIVERY
 from coil_rl.report.table import return_format
 from coil_rl.run import checkpoint
-from coil_rl.run.cases import TrainingCases
+from coil_rl.run.cases import LEAST_CASES, TrainingCases
 from coil_rl.run.curve import EvaluationCurve
 from coil_rl.run.judge import guide_titles
 from coil_rl.transforms import GuideActions
@@ -180,7 +180,7 @@ class Delivery:
         earlier = policies.pop("earlier", None)
         self.cases.begin()
         begun, count = self.cases.steps, FIRST_CASES
-        while count > 0:
+        while count >= LEAST_CASES:
             self.cases.renew(count)
             self._act(policies, returns)
             taken = self.cases.steps - begun

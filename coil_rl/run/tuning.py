@@ -20,7 +20,7 @@ from torch import Tensor
 from coil_rl.envs.limits import check_range
 from coil_rl.guides.candidates import Candidates
 from coil_rl.guides.simple import FollowAdvice
-from coil_rl.run.cases import TrainingCases
+from coil_rl.run.cases import LEAST_CASES, TrainingCases
 
 OWN, MEAN, BEST = "own", "mean", "best"  # the candidates of the test at the end
 FIRST_CASES, MOST_CASES = 4, 32  # of that test
@@ -188,7 +188,7 @@ class Tuner:
         reserve = self.cases.frames - self.cases.steps
         found: dict[str, list[Tensor]] = {name: [] for name in values}
         begun, count = self.cases.steps, FIRST_CASES
-        while count > 0:
+        while count >= LEAST_CASES:
             new = self.returns(list(values.values()), count)
             for known, returns in zip(found.values(), new, strict=True):
                 known.append(returns)

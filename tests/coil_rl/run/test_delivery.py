@@ -109,6 +109,13 @@ def test_run_with_tests_takes_no_more_frames_than_one_without(tmp_path):
     assert float(rows[-1]["frames"]) <= 1000
 
 
+@pytest.mark.parametrize("frames", [8000, 11_000])  # for three and for four cases
+def test_placebo_of_other_rows_always_has_other_rows(frames, tmp_path):
+    settings = [f"budget.frames={frames}", "degrade=[shuffled]", "training.learning_rate=0"]
+    run = trained(tmp_path / "run", "method=coil", *settings)
+    assert report(run)["cases"] in (2, 4)
+
+
 def test_learned_policy_is_handed_over_where_it_is_better(tmp_path):
     folder = trained(tmp_path / "run", "method=coil", "degrade=[random]", "guide=constant")
     found = report(folder)
