@@ -60,16 +60,15 @@ class FunctionGuide(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        flat = tensordict.select(*self.in_keys).reshape(-1)
         if self.for_batch is None:
-            first = [flat[key] for key in self.in_keys]
+            first = self._rows(tensordict)
             self.for_batch = self._takes_batch(first)
             self._check_repeats(first)
-        if self.for_batch:
+        if self.for_batch:  # traced for an export, so that nothing here may depend on the rows
             action = self._of_batch([tensordict[key] for key in self.in_keys])
             return tensordict.set("action", action)
-        entries = [flat[key] for key in self.in_keys]
-        rows = [self._alone(entries, row) for row in range(len(flat))]
+        entries = self._rows(tensordict)
+        rows = [self._alone(entries, row) for row in range(len(entries[0]))]
         if len({row.shape for row in rows}) > 1:
             shapes = ", ".join(sorted({str(list(row.shape)) for row in rows}))
             raise ForeignError(
@@ -77,6 +76,11 @@ class FunctionGuide(TensorDictModuleBase):
             )
         action = torch.as_tensor(np.stack(rows), device=tensordict.device)
         return tensordict.set("action", action.reshape(*tensordict.batch_size, *action.shape[1:]))
+
+    def _rows(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Return the entries that the function gets, with one dimension of rows."""
+        flat = tensordict.select(*self.in_keys).reshape(-1)
+        return [flat[key] for key in self.in_keys]
 
     def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
         """Return the actions for all rows."""

@@ -290,7 +290,7 @@ GROUPS = (
     "action",
     "preset",
 )  # of the cone world
-MISSING = ["+track.dir=levels", "+guide.learned.run=other"]
+MISSING = ["+track.dir=levels", "+guide.learned.run=other", "+guide.exported.file=a"]
 MISSING += [
     "+guide.controller.of=coil_rl.guides:SplineGuide",
     "+guide.recorded.file=a.csv",
