@@ -287,8 +287,9 @@ class StartTest:
     deterministically; and the new policy without a guide as it acts in training. A guide or
     opposite is held if its mean return is better by more than one standard deviation of the new
     policy's returns, and the paired t value exceeds its bar (`BARS`). The best one that passes is
-    held. Opposites are tried only where no guide passes. More cases are added until one passes, or
-    the test would take more than its share of the frames.
+    held. Opposites are tried only where no guide passes or was ahead in every case. Once some of
+    them are ahead in every case, only these go on. More cases are added until one passes, or the
+    test would take more than its share of the frames.
 
     Then lower gains of it are tried in further cases, if that share allows for them. One is taken
     if it is better by more than a standard error than the best of the gains above it.
@@ -340,26 +341,30 @@ class StartTest:
         self, guides: Sequence[Any], opposites: Sequence[Any], new: tuple[float, ...]
     ) -> tuple[float, ...]:
         """Return the weights of the best guide or opposite that passes; those of none else."""
-        done, per_case = 0, 0.0
+        done = 0
         for total in BARS:
-            more, before = total - done, self.cases.steps
-            if not self._affordable(per_case * more):
+            more = total - done
+            if not self._affordable(more * sum(map(self._length, [new, *guides, *opposites]))):
                 break
             self.cases.renew(more)
             self._act([new, *guides])
             if found := self._passing(guides, new):
                 return found
+            if ahead := self._ahead(guides, new):
+                guides, opposites = ahead, []
             self._act(opposites)
             if found := self._passing(opposites, new):
                 return found
-            done, per_case = total, (self.cases.steps - before) / more
+            if ahead := self._ahead(opposites, new):
+                guides, opposites = [], ahead
+            done = total
         return new
 
     def _best_gain(self, held: tuple[float, ...]) -> tuple[float, ...]:
         """Return the best gain of held weights; these where the frames do not allow for a test."""
         lower = [tuple(gain * value for value in held) for gain in self.anchor.gains]
         # With a lower gain episodes are assumed to be as long.
-        per_case = (1 + len(lower)) * self.steps[held] / len(self.returns[held])
+        per_case = (1 + len(lower)) * self._length(held)
         done, best = 0, held
         for total in GAIN_CASES:
             more, before = total - done, self.cases.steps
@@ -382,6 +387,8 @@ class StartTest:
 
     def _act(self, each: Sequence[tuple[float, ...]]) -> None:
         """Add the returns of the policy with each of some weights in the present cases."""
+        if not each:
+            return
         policies = [self._with(weights) for weights in each]
         found = self.cases.compared(policies, [not any(weights) for weights in each])
         for weights, returns, steps in zip(each, found, self.cases.taken, strict=True):
@@ -406,6 +413,10 @@ class StartTest:
         ]
         return max(passing, key=self._mean, default=None)
 
+    def _ahead(self, candidates: Sequence[Any], new: tuple[float, ...]) -> list[Any]:
+        """Return those weights that are better than the new policy in every case."""
+        return [each for each in candidates if (self.returns[each] > self.returns[new]).all()]
+
     def _clear(
         self, better: tuple[float, ...], worse: tuple[float, ...], errors: float | None = None
     ) -> bool:
@@ -420,6 +431,11 @@ class StartTest:
         bar = BARS[len(differences)] if errors is None else errors
         mean = float(differences.mean())
         return mean > 0 and mean > bar * float(standard_error(differences))
+
+    def _length(self, weights: tuple[float, ...]) -> float:
+        """Return the mean number of steps of the episodes with some weights; 0 before the first."""
+        known = self.returns.get(weights)
+        return 0.0 if known is None else self.steps[weights] / len(known)
 
     def _mean(self, weights: tuple[float, ...]) -> float:
         return float(self.returns[weights].mean())
