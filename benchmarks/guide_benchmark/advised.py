@@ -56,15 +56,16 @@ def ends(rows: Sequence[Row], task: str, arm: str) -> dict[str, float]:
         task: name of the task.
         arm: of the guide.
     """
-    found = {
-        row["method"]: float(row["end"])
-        for row in rows
-        if row["task"] == task
-        and row["method"] != TUNE
-        and (row["arm"] == arm or (row["method"], row["arm"]) == (PPO, ALONE))
-    }
-    guide = [float(row["guide"]) for row in rows if row["task"] == task and row["arm"] == arm]
-    return found | {GUIDE: float(np.mean(guide))}
+    found: dict[str, float] = {}
+    guides: list[float] = []
+    for row in rows:
+        if row["task"] != task or row["method"] == TUNE:
+            continue
+        if row["arm"] == arm:
+            guides.append(float(row["guide"]))
+        if row["arm"] == arm or (row["method"], row["arm"]) == (PPO, ALONE):
+            found[row["method"]] = float(row["end"])
+    return found | {GUIDE: float(np.mean(guides))}
 
 
 def words(task: str, arm: str, folder: Path, frames: int) -> list[str]:

@@ -76,7 +76,7 @@ def write_task(
     guide = float(np.mean([max(run.guide_returns.values()) for run in _guided(arms)] or [np.nan]))
     draw_learning_curves(
         curves,
-        folder / f"{task}.png",
+        folder / f"{task}.webp",
         guides={GUIDE: guide},
         title=f"{task}: with its intact guide",
     )
@@ -88,7 +88,7 @@ def write_task(
         f"Score 0 is the random guide ({rows[0]['random']:.1f}), score 1 is "
         f"{rows[0]['reference']:.1f}: {reference.source}. Percentages are of the distance from the "
         "random guide to the better of PPO and the intact guide.",
-        f"![learning curves]({task}.png)",
+        f"![learning curves]({task}.webp)",
         "## Ladder",
         markdown_table(rows, LADDER),
         f"Runs started: {len(runs) + jobs}, finished: {finished}, refused or failed: {jobs}.",

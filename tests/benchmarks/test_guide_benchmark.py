@@ -170,7 +170,7 @@ def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, monke
     assert "Smoke" in page
     assert "Runs started: 3, finished: 3" in (tmp_path / "pendulum.md").read_text()
     assert (tmp_path / "all.png").exists()
-    assert (tmp_path / "pendulum.png").exists()
+    assert (tmp_path / "pendulum.webp").exists()
 
 
 @pytest.mark.parametrize(
