@@ -3,6 +3,8 @@
 python -m pip install decisionrl==0.4.0
 """
 
+from typing import Any
+
 from decisionrl.baselines import base_stock, price_threshold_battery
 from decisionrl.envs import EnergyMicrogrid, InventoryManagement
 from decisionrl.envs.gym import to_gymnasium
@@ -28,11 +30,12 @@ class PriceThreshold:
     """
 
     def __init__(self, low: float = 0.35) -> None:
-        self.rule = price_threshold_battery(low)
+        self.rule: Any = price_threshold_battery(low)
 
     def act(self, observation: NDArray) -> NDArray:
         """Return the power [1]."""
-        return self.rule(None, observation)
+        power: NDArray = self.rule(None, observation)
+        return power
 
 
 class BaseStock:
@@ -43,8 +46,10 @@ class BaseStock:
     """
 
     def __init__(self, level: float = 9.0) -> None:
-        self.rule, self.store = base_stock(level), InventoryManagement()
+        self.rule: Any = base_stock(level)
+        self.store = InventoryManagement()
 
     def act(self, observation: NDArray) -> int:
         """Return the number of units."""
-        return self.rule(self.store, observation)
+        units: int = self.rule(self.store, observation)
+        return units
