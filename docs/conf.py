@@ -28,6 +28,7 @@ include_patterns = [
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "docs/*.md",
+    "docs/guide_benchmark/*.md",
     "docs/methods/*.md",
     "docs/notebooks/*.py",
     "paper/README.md",
