@@ -19,7 +19,7 @@ Env = gymnasium.Env[Any, Any]
 
 
 class ResetWith(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An env whose episodes all begin with some options.
+    """A wrapper that gives the same options to every reset of an env.
 
     Args:
         env: the env.
@@ -33,7 +33,7 @@ class ResetWith(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode."""
+        """Begin an episode with the options."""
         return self.env.reset(seed=seed, options=self.options | (options or {}))
 
 

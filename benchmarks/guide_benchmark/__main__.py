@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.guide_benchmark.pages import write_all, write_task
-from benchmarks.guide_benchmark.rows import benchmark_rows, check_row
+from benchmarks.guide_benchmark.rows import benchmark_rows, check_row, read_rows
 from coil_rl.errors import UserError
 from coil_rl.report import read_runs, write_csv
 from coil_rl.report.runs import failed_jobs
@@ -36,10 +36,7 @@ def added(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         check_row({name: str(value) for name, value in row.items()})
     if not file.exists():
         return list(rows)
-    with file.open(encoding="utf-8", newline="") as table:
-        known: list[dict[str, Any]] = list(csv.DictReader(table))
-    for row in known:
-        check_row(row)
+    known: list[dict[str, Any]] = [*read_rows(file)]
     new = {tuple(row[name] for name in SAME) for row in rows}
     return [row for row in known if tuple(row[name] for name in SAME) not in new] + list(rows)
 

@@ -22,17 +22,18 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.promise import ALONE, INTACT, PPO, RANDOM
+from benchmarks.guide_benchmark import picture
+from benchmarks.guide_benchmark.rows import read_rows
+from benchmarks.promise import ALONE, PPO
 from coil_rl.files import write_text
 from coil_rl.report import markdown_table, write_csv
-from coil_rl.worth.arms import ANCHORED, GUIDE, OPPOSITE
+from coil_rl.worth.arms import ANCHORED, GUIDE, OPPOSITE, TUNE
 from coil_rl.worth.comparison import FOUND, TABLE
 from coil_rl.worth.verdict import NOTHING
 
 Row = Mapping[str, str]
-REVERSED, DETUNED = "reversed", "detuned"
-ARMS = (INTACT, DETUNED, "half", "late", REVERSED, RANDOM)  # a placebo is enough
-TUNE = "tune"  # needs numbers to tune, which are not given here
+DETUNED = "detuned"
+ARMS = tuple(arm for arm in picture.ARMS if arm != "shuffled")  # one placebo is enough
 RULES = (GUIDE, PPO, ANCHORED)  # that say the same everywhere, to compare with
 RIGHT = (1.0, 5.0, 20.0)  # percent of regret
 OWN = Path(__file__).parent / "conf" / "task"  # tasks of other packages
@@ -59,7 +60,7 @@ def ends(rows: Sequence[Row], task: str, arm: str) -> dict[str, float]:
     found: dict[str, float] = {}
     guides: list[float] = []
     for row in rows:
-        if row["task"] != task or row["method"] == TUNE:
+        if row["task"] != task or row["method"] == TUNE:  # the comparisons have no numbers to tune
             continue
         if row["arm"] == arm:
             guides.append(float(row["guide"]))
@@ -95,10 +96,8 @@ def judged(rows: Sequence[Row], task: str, arm: str, folder: Path) -> dict[str, 
     values = ends(rows, task, arm)
     said = json.loads((folder / FOUND).read_text())
     use = said["train"] or GUIDE if said["use"] == NOTHING else said["use"]
-    with (folder / TABLE).open(newline="") as file:
-        measured = {row["policy"]: float(row["return"]) for row in csv.DictReader(file)}
     # The benchmark has no row for the opposite of a guide, nor for each method of coil-compare.
-    value = values[use] if use in values else measured[use]
+    value = values[use] if use in values else _measured(folder, use)
     if use == OPPOSITE:
         values = values | {OPPOSITE: value}
     best = max(values, key=lambda name: values[name])
@@ -118,6 +117,12 @@ def judged(rows: Sequence[Row], task: str, arm: str, folder: Path) -> dict[str, 
         "in_table": use in values,
         **{f"regret_{rule}": regret(values.get(rule, math.nan)) for rule in RULES},
     }
+
+
+def _measured(folder: Path, name: str) -> float:
+    """Return the mean return of a policy in a comparison itself."""
+    with (folder / TABLE).open(newline="") as file:
+        return next(float(row["return"]) for row in csv.DictReader(file) if row["policy"] == name)
 
 
 def page(found: Sequence[Mapping[str, Any]]) -> str:
@@ -177,8 +182,10 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", help="all of the table by default")
     parser.add_argument("--minutes", type=float, default=2.0, help="of each comparison")
     given = parser.parse_args()
-    with given.rows.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["effort"] != "smoke"]
+    try:
+        rows = [row for row in read_rows(given.rows) if row["effort"] != "smoke"]
+    except (OSError, ValueError, csv.Error) as error:
+        parser.error(str(error))
     cases = sorted({(row["task"], row["arm"]) for row in rows if row["arm"] in given.arms})
     found = []
     for task, arm in tqdm(cases, unit="comparison"):
@@ -194,8 +201,9 @@ def main() -> None:
     if not found:
         parser.error(f"{given.rows} has no rows of a whole training with these tasks and guides")
     write_csv(found, given.folder / "advised.csv")
-    write_text(given.folder / "advised.md", page(found))
-    print(page(found))
+    text = page(found)
+    write_text(given.folder / "advised.md", text)
+    print(text)
 
 
 if __name__ == "__main__":

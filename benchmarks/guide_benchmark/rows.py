@@ -240,6 +240,23 @@ def check_row(row: Mapping[str, str]) -> None:
         raise ValueError(f"{place}: the versions of {', '.join(missing)} are missing")
 
 
+def read_rows(file: Path) -> list[dict[str, str]]:
+    """Return the checked rows of a table.
+
+    Args:
+        file: the table.
+
+    Raises:
+        OSError: if it cannot be read.
+        ValueError: if a row is not valid.
+    """
+    with file.open(encoding="utf-8", newline="") as table:
+        rows = list(csv.DictReader(table))
+    for row in rows:
+        check_row(row)
+    return rows
+
+
 def _check_numbers(
     place: str, row: Mapping[str, str], numbers: Mapping[str, float], reference: Reference
 ) -> None:

@@ -125,7 +125,7 @@ class Verdict:
     sentences: Sequence[str] = field(default_factory=tuple)
 
     def to_dict(self, command: str) -> dict[str, Any]:
-        """Return it for a file, whose `score` is null where the guide has none.
+        """Return the verdict as a dictionary for a file; without a score of the guide it has None.
 
         Args:
             command: that trains to the end what is recommended.
