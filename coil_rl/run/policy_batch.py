@@ -33,7 +33,10 @@ def is_tensors(policy: TensorDictModuleBase) -> bool:
 
     It has no memory within an episode, either.
     """
-    tensors = {name for name, _ in [*policy.named_parameters(), *policy.named_buffers()]}
+    # A part that stands in two places has two names, as in the state.
+    parameters = policy.named_parameters(remove_duplicate=False)
+    buffers = policy.named_buffers(remove_duplicate=False)
+    tensors = {name for name, _ in [*parameters, *buffers]}
     return tensors == set(policy.state_dict()) and not memory_keys(policy)
 
 

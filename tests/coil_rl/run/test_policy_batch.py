@@ -1,4 +1,5 @@
 import copy
+from functools import partial
 
 import pytest
 import torch
@@ -20,6 +21,7 @@ from coil_rl.run.policy_batch import (
 from coil_rl.transforms import DiscreteActions
 
 KEYS = ["observation", "guide_action"]
+MAKE = {"ppo": PPO, "anchored": partial(PPO, anchor=Anchor()), "sac": SAC, "dqn": DQN}
 
 
 def observations(env):
@@ -27,7 +29,7 @@ def observations(env):
     return TensorDict({"observation": torch.rand(15, 20), "guide_action": advice}, [15])
 
 
-@pytest.mark.parametrize("learner", ["ppo", "sac", "dqn", "forest"])
+@pytest.mark.parametrize("learner", ["ppo", "anchored", "sac", "dqn", "forest"])
 def test_batch_of_policies_acts_like_each_of_them(learner):
     env = cones(*([DiscreteActions()] if learner == "dqn" else []))
     states = []
@@ -39,7 +41,7 @@ def test_batch_of_policies_acts_like_each_of_them(learner):
             imitation.regressor.fit(torch.rand(30, 20), torch.rand(30, 1))
             states.append(copy.deepcopy(policy.state_dict()))
     else:
-        policy = {"ppo": PPO, "sac": SAC, "dqn": DQN}[learner](env, KEYS).policy
+        policy = MAKE[learner](env, KEYS).policy
         states = [perturbed(policy, seed) for seed in range(3)]
     rows = observations(env)
     batch = policy_batch(policy, states)
@@ -53,10 +55,10 @@ def test_batch_of_policies_acts_like_each_of_them(learner):
 
 
 @pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
-@pytest.mark.parametrize("learner", [PPO, SAC, DQN])
+@pytest.mark.parametrize("learner", MAKE)
 def test_recorded_policy_acts_and_draws_like_the_policy(learner, kind):
-    env = cones(*([DiscreteActions()] if learner is DQN else []))
-    policy = learner(env, KEYS).policy
+    env = cones(*([DiscreteActions()] if learner == "dqn" else []))
+    policy = MAKE[learner](env, KEYS).policy
     assert is_tensors(policy)
     recorded, actions = TracedPolicy(policy), []
     for each in (policy, recorded):
