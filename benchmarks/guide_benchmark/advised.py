@@ -135,8 +135,10 @@ def page(found: Sequence[Mapping[str, Any]]) -> str:
     summary = []
     for name, title in titles.items():
         regrets = np.array([row[name] for row in found])
+        regrets = regrets[~np.isnan(regrets)]  # a table may lack the row of a method
         shares = [f"{np.mean(regrets <= share):.0%} within {share:.0f} %" for share in RIGHT]
-        summary.append(f"- **{title}**: mean regret {regrets.mean():.1f} %, {', '.join(shares)}.")
+        mean = f"mean regret {regrets.mean():.1f} %, {', '.join(shares)}" if len(regrets) else "-"
+        summary.append(f"- **{title}**, of {len(regrets)}: {mean}.")
     lines = [
         "# What coil-compare recommends, and what whole trainings gave",
         f"{len(found)} comparisons.",

@@ -362,23 +362,22 @@ class StartTest:
 
     def _best_gain(self, held: tuple[float, ...]) -> tuple[float, ...]:
         """Return the best gain of held weights; these where the frames do not allow for a test."""
-        lower = [tuple(gain * value for value in held) for gain in self.anchor.gains]
-        # With a lower gain episodes are assumed to be as long.
-        per_case = (1 + len(lower)) * self._length(held)
+        tried = [held] + [tuple(gain * value for value in held) for gain in self.anchor.gains]
+        length = self._length(held)  # with a lower gain episodes are assumed to be as long
         done, best = 0, held
         for total in GAIN_CASES:
-            more, before = total - done, self.cases.steps
-            if not self._affordable(per_case * more):
+            more = total - done
+            if not self._affordable(more * sum(self._length(each) or length for each in tried)):
                 break
-            if done == 0:
-                del self.returns[held]  # all gains are compared in the same new cases
+            if done == 0:  # all gains are compared in the same new cases
+                del self.returns[held], self.steps[held]
             self.cases.renew(more)
-            self._act([held, *lower])
+            self._act(tried)
             best = held
-            for each in lower:
+            for each in tried[1:]:
                 if self._clear(each, best, GAIN_ERRORS):
                     best = each
-            done, per_case = total, (self.cases.steps - before) / more
+            done = total
         return best
 
     def _affordable(self, steps: float) -> bool:

@@ -70,8 +70,17 @@ def test_page_has_the_share_of_right_recommendations(tmp_path):
     ]
     found = [advised.judged(ROWS, "plant", "intact", folder) for folder in folders]
     text = advised.page(found)
-    assert "**coil-compare**: mean regret 18.8 %, 50% within 1 %" in text
-    assert "**always ppo**: mean regret 25.0 %" in text
+    assert "**coil-compare**, of 2: mean regret 18.8 %, 50% within 1 %" in text
+    assert "**always ppo**, of 2: mean regret 25.0 %" in text
+
+
+def test_mean_regret_of_a_method_is_over_the_guides_it_has_rows_for(tmp_path):
+    rows = [row for row in ROWS if (row["method"], row["arm"]) != ("coil_anchored", "reversed")]
+    folder = comparison(tmp_path / "it", "ppo", "ppo", ppo=60)
+    found = [advised.judged(rows, "plant", arm, folder) for arm in ("intact", "reversed")]
+    text = advised.page(found)
+    assert "**always coil_anchored**, of 1: mean regret 12.5 %" in text
+    assert "nan" not in text.partition("|")[0]
 
 
 def test_arguments_name_the_file_of_a_detuned_guide_and_the_folder_of_foreign_tasks(tmp_path):
