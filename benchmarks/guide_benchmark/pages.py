@@ -48,6 +48,17 @@ ALL = {
     "worst": ("worst task (%)", "+.1f"),
     "lowest": ("lowest - guide, worst task (%)", "+.1f"),
 }
+METHODS = {
+    "method": ("method", ""),
+    "tasks": ("tasks", "d"),
+    "pairs": ("pairs of task and guide", "d"),
+    "gain": ("gains", "d"),
+    "even": ("even", "d"),
+    "loss": ("losses", "d"),
+    "difference": ("end - better of guide and PPO (%)", "+.1f"),
+    "worst": ("worst pair (%)", "+.1f"),
+    "where": ("which it is", ""),
+}
 EDGE = (
     f"Large: the mean over tasks; small: each task. What lies beyond {LIMIT:.0f} % is at the edge."
 )
@@ -115,7 +126,9 @@ def write_all(folder: Path, rows: Sequence[Row]) -> str:
     summary = summarised(rows)
     if summary:
         draw(rows, folder / "all.png")
-        lines += ["![all tasks](all.png)", EDGE, markdown_table(summary, ALL)]
+        lines += ["![all tasks](all.png)", EDGE]
+        lines += ["## By method, the fewest losses first", markdown_table(by_method(rows), METHODS)]
+        lines += ["## By guide and method", markdown_table(summary, ALL)]
     counts = Counter(row["verdict"] for row in rows if row["arm"] != ALONE)
     lines.append(
         f"{counts['gain']} gains, {counts['even']} even (undecided), {counts['loss']} losses. "
@@ -142,6 +155,26 @@ def summarised(rows: Sequence[Row]) -> list[Row]:
         _summary(arm, method, groups[arm, method])
         for arm, method in sorted(groups, key=lambda key: (ARMS.index(key[0]), key[1]))
     ]
+
+
+def by_method(rows: Sequence[Row]) -> list[Row]:
+    """Return a row for each method over all tasks and guides, with the fewest losses first.
+
+    Args:
+        rows: of all tasks.
+    """
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        if row["arm"] in ARMS:
+            groups.setdefault(row["method"], []).append(row)
+    found = []
+    for method, own in groups.items():
+        worst = min(own, key=lambda row: row["difference"])
+        found.append(
+            _summary("", method, own)
+            | {"pairs": len(own), "where": f"{worst['task']}, {worst['arm']}"}
+        )
+    return sorted(found, key=lambda row: (row["loss"] / row["pairs"], -row["difference"]))
 
 
 def _summary(arm: str, method: str, rows: Sequence[Row]) -> Row:

@@ -13,6 +13,7 @@ from hydra import compose, initialize_config_module
 from programs import TINY_ARM, called
 
 from benchmarks.guide_benchmark import __main__ as program
+from benchmarks.guide_benchmark.pages import by_method
 from benchmarks.guide_benchmark.rows import (
     COLUMNS,
     Reference,
@@ -152,6 +153,26 @@ def test_scores_are_0_for_the_random_guide_and_1_for_the_reference(folder):
     assert math.isnan(arms["ppo", "alone"]["difference"])
     assert {row["effort"] for row in rows} == {"smoke"}
     assert all(tuple(row) == COLUMNS for row in rows)
+
+
+def test_methods_are_ordered_by_their_share_of_losses_and_name_their_worst_pair():
+    names = ("method", "task", "arm", "verdict", "difference")
+    rows = [
+        dict(zip(names, row, strict=True)) | {"score": 0.0, "lowest": math.nan}
+        for row in [
+            ("coil", "one", "intact", "loss", -9.0),
+            ("coil", "one", "random", "even", 1.0),
+            ("coil", "two", "intact", "even", 3.0),
+            ("tune", "one", "intact", "loss", -2.0),
+            ("ppo", "one", "alone", "", math.nan),
+        ]
+    ]
+    coil, tune = by_method(rows)
+    assert (coil["method"], coil["pairs"], coil["tasks"]) == ("coil", 3, 2)
+    assert (coil["gain"], coil["even"], coil["loss"]) == (0, 2, 1)
+    assert (coil["worst"], coil["where"]) == (-9.0, "one, intact")
+    assert coil["difference"] == pytest.approx(-5 / 3)
+    assert (tune["method"], tune["loss"]) == ("tune", 1)
 
 
 def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, monkeypatch, capsys):
