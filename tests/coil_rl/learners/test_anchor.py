@@ -9,7 +9,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Anchor, Gru, Reinforce
-from coil_rl.learners.anchor import BARS, Hold, StartTest, hold_of
+from coil_rl.learners.anchor import BARS, PROMISING, Hold, StartTest, hold_of
 from coil_rl.learners.sampling import UNCLIPPED
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions, Takeover
@@ -224,10 +224,11 @@ class Returns:
         of: returns the return in each case for the weights, as a list.
         frames: of the run.
         noise: deviation of the returns from case to case, the same for all policies.
+        spread: further deviation, of each policy its own.
     """
 
-    def __init__(self, of, frames=10**6, noise=1.0):
-        self.of, self.frames, self.steps, self.noise = of, frames, 0, noise
+    def __init__(self, of, frames=10**6, noise=1.0, spread=0.2):
+        self.of, self.frames, self.steps, self.noise, self.spread = of, frames, 0, noise, spread
         self.sampled, self.generator = {}, torch.Generator().manual_seed(0)
 
     def begin(self):
@@ -244,7 +245,7 @@ class Returns:
             weights = tuple(policy.weight.tolist())
             self.sampled[weights] = samples
             spread = torch.randn(len(self.cases), generator=self.generator)
-            returns.append(self.of(weights) + self.cases + 0.2 * spread)
+            returns.append(self.of(weights) + self.cases + self.spread * spread)
         return returns
 
 
@@ -321,12 +322,32 @@ def test_start_test_ends_when_it_would_take_more_than_its_share():
 def test_start_test_takes_no_more_than_its_share_after_its_first_cases(gain, frames):
     cases = Returns(lambda weights: gain * weights[0], frames=frames)
     decided(None, cases=cases)
-    assert cases.steps <= max(600, 0.05 * frames)
+    assert cases.steps <= max(600, PROMISING * 0.05 * frames)
+
+
+def test_guide_that_is_ahead_in_every_case_gets_more_cases():
+    """Four cases are too few for this lead, and eight take 0.067 of the frames."""
+    held, most = 0, 0
+    for seed in range(20):
+        cases = Returns(lambda weights: 3 * max(weights[0], 0), frames=24_000, spread=0.8)
+        cases.generator.manual_seed(seed)
+        held += decided(None, cases=cases, gains=())[0] == [1]
+        most = max(most, cases.steps)
+    assert held >= 15
+    assert 0.05 * 24_000 < most <= 0.08 * 24_000
+
+
+def test_two_equal_differences_are_not_enough():
+    """The lead is always 20, and the returns of two cases lie about 10 apart."""
+    cases = Returns(lambda weights: 20 * weights[0], noise=10.0, spread=0.0)
+    weights, numbers, _ = decided(None, cases=cases)
+    assert weights == [1]
+    assert numbers["start/cases"] == 4
 
 
 def test_lower_gains_are_not_tried_where_the_share_does_not_allow_for_them():
     cases = Returns(lambda weights: 100 - 60 * abs(weights[0] - 0.5) if weights[0] else 0)
-    cases.frames = 30_000
+    cases.frames = 18_000
     weights, numbers, _ = decided(None, cases=cases)
     assert weights == [1], "four cases of three gains would take 1,200 steps more"
     assert numbers["start/guide"] == pytest.approx(70, abs=2), "of the cases that there are"
@@ -347,6 +368,5 @@ def test_gains_are_not_tried_for_choices():
 
 
 def test_bars_are_quantiles_of_the_t_distribution():
-    tails = {2: 0.005, 4: 0.005, 8: 0.005, 12: 0.01}
-    for count, bar in BARS.items():
-        assert stats.t.ppf(1 - tails[count], count - 1) == pytest.approx(bar, abs=0.06)
+    for count, tail in {4: 0.005, 8: 0.005, 12: 0.01}.items():
+        assert stats.t.ppf(1 - tail, count - 1) == pytest.approx(BARS[count], abs=0.06)
