@@ -3,23 +3,28 @@
 They hold for the parts of this project, and can be used for those of any other one.
 """
 
+import warnings
 from collections.abc import Callable
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs, step_mdp
 
+from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.transforms import GuideActions, set_progress
 from coil_rl.transforms.action_space import ActionSpace, first_choices, nested_key
+from coil_rl.transforms.guide_actions import unfit_action
 
 
 def check_env(env: EnvBase, steps: int = 10) -> None:
     """Check an env in training mode.
 
     Data fits the specs, numbers are finite, the same seed gives the same rollout, a step leaves the
-    data before it alone, and a partial reset leaves the other rows alone.
+    data before it alone, and a partial reset leaves the other rows alone. A Gymnasium env whose
+    observations lie outside of its `observation_space` is a warning, as some published ones leave
+    their bounds a little.
 
     Args:
         env: the env, with or without transforms.
@@ -29,9 +34,12 @@ def check_env(env: EnvBase, steps: int = 10) -> None:
         AssertionError: if data does not fit the specs, by `check_env_specs`.
         ValueError: for the first other property that does not hold; it names the entry.
     """
+    base = env.base_env if isinstance(env, TransformedEnv) else env
     set_progress(env.train(), 0.0)
     check_env_specs(env)
     _check_rollouts(env, steps)
+    if isinstance(base, GymnasiumEnv):
+        _look_at_bounds(base, steps)
     data = env.rand_action(env.reset())
     copy = data.clone()
     env.step(data)
@@ -39,7 +47,7 @@ def check_env(env: EnvBase, steps: int = 10) -> None:
         if not torch.equal(value, data[key]):
             raise ValueError(f"a step changed {key} of the data before it; write new tensors")
     if env.batch_size and env.batch_size[0] > 1:
-        _check_partial_reset(env.base_env if isinstance(env, TransformedEnv) else env)
+        _check_partial_reset(base)
 
 
 def _check_rollouts(env: EnvBase, steps: int) -> None:
@@ -61,6 +69,22 @@ def _check_rollouts(env: EnvBase, steps: int) -> None:
             raise ValueError(
                 f"the same seed gives other values of {key}; "
                 "draw random numbers from a seeded generator"
+            )
+
+
+def _look_at_bounds(env: GymnasiumEnv, steps: int) -> None:
+    """Warn of each entry of the observation that is outside of its space."""
+    rollout = env.rollout(steps, break_when_any_done=False)
+    for entry in env.entries:
+        parts = [rollout[entry.key], rollout["next", *entry.key]]
+        values = torch.cat([part.reshape(-1, *entry.given) for part in parts])
+        found = entry.outside(values.cpu().numpy())
+        if found is not None:
+            index, value, low, high = found
+            warnings.warn(
+                f"number {index} of {entry.title} is {value:g}, but the observation_space of "
+                f"{entry.id} has it from {low:g} to {high:g}; correct its bounds, or the number",
+                stacklevel=3,
             )
 
 
@@ -228,8 +252,8 @@ def _recorded_rollout(env: EnvBase, steps: int) -> TensorDictBase:
             recorded = TensorDict.stack([episode[:shortest] for episode in episodes])
     if len(recorded.batch_size) != 2 or len(recorded) < 2:
         raise ValueError(
-            "check_guide needs an env with one batch dimension of at least 2 rows, "
-            f"not {env.batch_size}"
+            "check_guide needs an env with one batch dimension of at least 2 rows, not "
+            f"{list(env.batch_size)}; make it with more, such as GymnasiumEnv(ID, num_envs=2)"
         )
     return recorded
 
@@ -260,14 +284,19 @@ class _AskedGuide:
             self.env.full_action_spec[action_key], 1, self.env.base_env.first_choices
         )
 
-    def check_action(self, _: object, __: object, written: TensorDictBase) -> None:
+    def check_action(self, guide: nn.Module, _: object, written: TensorDictBase) -> None:
         """Raise a `ValueError` for an invalid action; a forward hook of the guide."""
-        action, space = written[self.action_key], self.space
-        space.check_advice(action, written.batch_size)
+        action, batch, space = written[self.action_key], written.batch_size, self.space
+        try:
+            space.check_advice(action, batch)
+        except ValueError as error:
+            raise unfit_action("guide", guide, action, batch, space, str(error)) from None
         if space.continuous and not action.is_floating_point():
-            raise ValueError(f"is of {action.dtype}, but the env's of {space.spec.dtype}")
+            raise ValueError(
+                f"the guide's action is of {action.dtype}, but the env's of {space.spec.dtype}"
+            )
         if space.bounds is not None and not torch.equal(action, action.clamp(*space.bounds)):
-            raise ValueError("lies outside the bounds of the env's action")
+            raise ValueError("the guide's action lies outside the bounds of the env's action")
 
     def advice(self, begin: int = 0, reset_at: int | None = None) -> Tensor:
         """Return the advice at each step, [B, T - begin].

@@ -109,6 +109,28 @@ class Entry:
             raise ForeignError(f"{self.title} holds {wrong}, not a finite number of {self.dtype}")
         return converted
 
+    def outside(self, values: NDArray[Any]) -> tuple[int, float, float, float] | None:
+        """Return where numbers are farthest outside the bounds of the space; None if nowhere.
+
+        Bounds are rounded as the numbers were.
+
+        Args:
+            values: of this entry, [n, *shape].
+
+        Returns:
+            The index of the number in the entry, its value, and its bounds.
+        """
+        if not isinstance(self.space, spaces.Box):
+            return None
+        bounds = (self.space.low, self.space.high)
+        low, high = (bound.ravel().astype(self.dtype).astype(np.float64) for bound in bounds)
+        numbers = values.reshape(len(values), -1).astype(np.float64)
+        excess = np.maximum(low - numbers, numbers - high)
+        if not excess.size or excess.max() <= 0:
+            return None
+        row, index = np.unravel_index(excess.argmax(), excess.shape)
+        return int(index), float(numbers[row, index]), float(low[index]), float(high[index])
+
     def _watch(self, value: NDArray[Any]) -> None:
         """Warn after the first observations if their numbers are too fine for the dtype."""
         if self.unwatched == WATCHED:

@@ -71,7 +71,7 @@ def test_files_that_are_named_or_linked_are_there():
         assert (SOURCE / name).is_file(), name
 
 
-@pytest.mark.parametrize("program", PROGRAMS, ids=["from Python", "parts", "checks"])
+@pytest.mark.parametrize("program", PROGRAMS, ids=["from Python", "parts", "checks", "Gymnasium"])
 def test_python_runs_as_printed(program, folder, tmp_path, monkeypatch):
     assert len([line for line in program.splitlines() if line]) <= 11
     monkeypatch.chdir(tmp_path)

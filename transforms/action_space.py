@@ -170,6 +170,25 @@ class ActionSpace:
                 )
             raise ValueError(f"is neither an index below {max(self.choices)} nor a one-hot vector")
 
+    def unfit_row(self, action: Tensor, batch: torch.Size) -> tuple[int, Tensor, str]:
+        """Return the first row of a guide's action that does not fit, and why, without the batch.
+
+        Args:
+            action: of the guide, [*batch, ...].
+            batch: of the action.
+
+        Returns:
+            The number of the row, its action, and what `check_advice` says of it; of row 0 if each
+            row alone would fit.
+        """
+        rows = action.reshape(batch.numel(), *action.shape[len(batch) :])
+        for number, row in enumerate(rows):
+            try:
+                self.check_advice(row, torch.Size([]))
+            except ValueError as error:
+                return number, row, str(error)
+        return 0, rows[0], "does not fit the env"
+
     def _indices(self, action: Tensor, batch: torch.Size) -> Tensor | None:
         """Return the choices of a guide as indices [*batch, *agents, n].
 

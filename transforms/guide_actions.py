@@ -43,6 +43,28 @@ class UnfitActionError(ValueError):
         self.problem = problem
 
 
+def unfit_action(
+    name: str, guide: nn.Module, action: Tensor, batch: torch.Size, space: ActionSpace, problem: str
+) -> Exception:
+    """Return the error for the action of a guide that does not fit the env.
+
+    A guide with a method `unfit(action, batch, space, problem)` returns its own error, so that a
+    controller is told what it returned itself, which has no batch.
+
+    Args:
+        name: of the guide.
+        guide: the guide.
+        action: that it wrote.
+        batch: of the action.
+        space: of its actions.
+        problem: says why, as the end of a sentence.
+    """
+    if hasattr(guide, "unfit"):
+        error: Exception = guide.unfit(action, batch, space, problem)  # type: ignore[operator]
+        return error
+    return UnfitActionError(name, problem)
+
+
 class Guides(TensorDictModuleBase):
     """Several guides as one module that writes their actions side by side.
 
@@ -439,15 +461,16 @@ class GuideActions(ActionTransform):
         It is checked in the first step; that of a guide with the attribute `foreign`, the code of
         somebody else, in every step.
         """
+        guide = self.guides.guides[name]
         try:
-            foreign = getattr(self.guides.guides[name], "foreign", False)
+            foreign = getattr(guide, "foreign", False)
             # An exported function cannot raise.
             if (name not in self._checked or foreign) and not torch.compiler.is_exporting():
                 self.guide_space.check_advice(action, batch)
                 self._checked.add(name)
             advice = self.guide_space.advice(action, batch)
         except ValueError as error:
-            raise UnfitActionError(name, str(error)) from None
+            raise unfit_action(name, guide, action, batch, self.guide_space, str(error)) from None
         if self.given_units is None:
             return advice
         return self.action_space.clamp(self.given_units.normalise(advice))

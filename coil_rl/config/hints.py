@@ -58,8 +58,10 @@ def similar(given: str, known: Iterable[str]) -> str:
 def where(key: str, root: Any) -> str:
     """Return `; did you mean KEY?` for a key that is in another place of the configuration.
 
+    A key that exists is in its place already: only what it is to hold does not fit.
+
     Args:
-        key: the full key that does not exist.
+        key: the full key that was typed.
         root: the whole configuration.
     """
     if not isinstance(root, DictConfig):
@@ -67,6 +69,8 @@ def where(key: str, root: Any) -> str:
     group, _, last = key.rpartition(".")
     wanted = {last, OTHER_NAMES.get(last, last)}
     found = [full for full in _keys(root) if full.rpartition(".")[2] in wanted]
+    if key in found:
+        return ""
     # A key of the group that was typed is more likely than one of another.
     first = group.partition(".")[0]
     found.sort(key=lambda full: (full.partition(".")[0] != first, full.count(".")))

@@ -215,7 +215,7 @@ def _check_target(target: Any, name: str, path: Path) -> None:
     else:
         raise UserError(
             f"{entry}, which could run code; if you know the folder and the package, allow it with "
-            f"trust=[{package:.100}] on the command line"
+            f'trust=[{package:.100}] on the command line, or trust=["{package:.100}"] in Python'
         )
 
 

@@ -22,9 +22,11 @@ from coil_rl.export.files import OPSET
 from coil_rl.export.parity import Parity
 from coil_rl.export.step import ADVICE, Entry, PolicyStep
 from coil_rl.files import LARGEST_TABLE, read_text
+from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.normaliser import Normaliser
 from coil_rl.run.controller import Controller
-from coil_rl.run.delivery import handed_over
+from coil_rl.run.delivery import GuideActs
+from coil_rl.run.reasons import handed_over
 from coil_rl.run.run import Run
 
 PACKAGES = ("coil-rl", "torch", "onnx", "onnxscript", "onnxruntime")
@@ -69,7 +71,7 @@ def describe(
             name: {"sha256": checksum(content), "bytes": len(content)}
             for name, content in contents.items()
         },
-        "policy": _policy(run, which),
+        "policy": _policy(run, which, guide_itself(controller, step)),
         "env": {"title": title_of(plant), "control_rate": _rate(plant)},
         "batch": "any number of rows; the first dimension of every input and output",
         "inputs": [_input(entry, plant, step, known) for entry in step.inputs],
@@ -103,7 +105,22 @@ def title_of(plant: Any) -> str:
     return type(plant).__name__
 
 
-def _policy(run: Run, which: str) -> dict[str, Any]:
+def guide_itself(controller: Controller, step: PolicyStep) -> str | None:
+    """Return the name of the guide that acts in place of a learned policy; None for a policy.
+
+    A run may have handed over its guide, see `coil_rl.run.delivery`, or have no other policy.
+
+    Args:
+        controller: of the run.
+        step: what is exported of it.
+    """
+    policy = controller.policy
+    if isinstance(policy, GuideActs):
+        policy = policy.advised
+    return step.guides[int(policy.guide)] if isinstance(policy, FollowAdvice) else None
+
+
+def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
     sentence = handed_over(run.folder) if run.file_of(which) == "best" else None
     method = run.settings.get("method") or {}
     return {
@@ -113,6 +130,7 @@ def _policy(run: Run, which: str) -> dict[str, Any]:
         "frames": run.budget.frames,
         "which": which,
         "chosen": sentence or f"the {run.file_of(which)} policy of the training",
+        "acts": "a learned policy" if guide is None else f"guide {guide} itself, no learned policy",
         "actions": "deterministic",
     }
 

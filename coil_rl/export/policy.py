@@ -75,10 +75,16 @@ class ExportedPolicy:
             takes; for a TorchRL env an array.
 
         Raises:
-            ValueError: for an observation that does not fit the contract.
+            ValueError: for an observation that does not fit the contract, and for a `guide_action`
+                where no guide is outside.
         """
         inputs = {}
         entries = [entry for entry in self.contract["inputs"] if entry["name"] != ADVICE]
+        place = self.contract["guide"]["place"]
+        if guide_action is not None and place != "outside":
+            raise ValueError(
+                f"this policy takes no guide_action: its guide is {place}; leave guide_action out"
+            )
         for entry in self.contract["inputs"]:
             if entry["name"] == ADVICE:
                 value = _advice(observation, guide_action)
@@ -94,7 +100,14 @@ class ExportedPolicy:
 
         Args:
             inputs: by name, [1, ...] each.
+
+        Raises:
+            ValueError: for an input that is missing.
         """
+        for entry in self.contract["inputs"]:
+            if entry["name"] not in inputs:
+                names = ", ".join(each["name"] for each in self.contract["inputs"])
+                raise ValueError(f"the input {entry['name']} is missing; give {names}")
         action, *state = self.session({**inputs, **self.state})
         self.state = dict(zip(self.state, state, strict=True))
         return action
@@ -147,13 +160,17 @@ def _found(observation: Any, entry: Mapping[str, Any], *, only: bool) -> Any:
             path = source["path"]
     elif only and not isinstance(observation, Mapping):
         path = []
+    missing = isinstance(observation, Mapping) and not path
     for part in path:
         try:
             observation = observation[part]
-        except (IndexError, KeyError, TypeError) as error:
-            raise ValueError(
-                f"the observation lacks {entry['name']}; the policy reads it, see its contract.json"
-            ) from error
+        except (IndexError, KeyError, TypeError):
+            missing = True
+            break
+    if missing:
+        raise ValueError(
+            f"the observation lacks {entry['name']}; the policy reads it, see its contract.json"
+        )
     if source is not None and source["choices"]:
         return _one_hot(observation, entry)
     return observation

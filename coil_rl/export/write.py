@@ -13,7 +13,7 @@ from typing import Any
 from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
 from coil_rl.export.contract import CONTRACT, DRIVER, ONNX, TORCH
-from coil_rl.export.describe import describe
+from coil_rl.export.describe import describe, guide_itself
 from coil_rl.export.files import as_onnx, as_torch, traced
 from coil_rl.export.parity import LIMIT, WITH_GUIDE, Parity, compare, expected
 from coil_rl.export.policy import ExportedPolicy
@@ -89,7 +89,25 @@ def export_policy(
     )
     _save(Path(folder), contents, contract)
     say(f"export: {parity}")
+    _say_if_guide(run, guide_itself(controller, step), outside)
     return ExportedPolicy(folder)
+
+
+def _say_if_guide(run: Run, guide: str | None, outside: str | None) -> None:
+    """Say that a run with a learned policy has handed over its guide instead.
+
+    Args:
+        run: of the policy.
+        guide: that acts; None: a policy does.
+        outside: why the guides are outside; None if they are not.
+    """
+    if guide is None or run.make_learner is None:
+        return
+    passed = "" if outside is None else ", and its file only passes guide_action on"
+    say(
+        f"export: what the run handed over is guide {guide} itself, not a learned policy{passed}; "
+        'policy=last exports the last learned policy, which="last" in Python'
+    )
 
 
 def _recorded(run: Run, controller: Controller, count: int, seed: int) -> Recording:

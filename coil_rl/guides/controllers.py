@@ -27,11 +27,11 @@ from torch import nn
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
-from coil_rl.envs.gate import ForeignError, Predictor, action_array, foreign, predicts
+from coil_rl.envs.gate import ForeignError, Predictor, action_array, foreign, predicts, shown
 from coil_rl.errors import did_you_mean
 from coil_rl.files import LARGEST_TABLE, read_text
 from coil_rl.guides.functions import FunctionGuide
-from coil_rl.transforms.action_space import nested_key
+from coil_rl.transforms.action_space import ActionSpace, nested_key
 
 # Other minus signs, as text programs write them: hyphens, the sign itself, and dashes.
 MINUS = str.maketrans(dict.fromkeys("\u2010\u2011\u2212\u2013\u2014\ufe63\uff0d", "-"))
@@ -81,6 +81,7 @@ class PerRow(TensorDictModuleBase):
         self.make, self.objects = make, dict[int, Any]()
         self.title = title or getattr(getattr(make, "func", make), "__name__", repr(make))
         self.steps = dict[int, int]()  # of the running episode, by row
+        self.asked: list[int] = []  # rows of the last call
         # whether the last restored state held those of the objects; else new episodes begin
         self.continues = True
 
@@ -88,6 +89,7 @@ class PerRow(TensorDictModuleBase):
         """Write the action."""
         flat = tensordict.reshape(-1)
         rows, starts = (flat[key].flatten().tolist() for key in ("row", "is_init"))
+        self.asked = rows
         observations = zip(*(flat[key].cpu().numpy().copy() for key in self.read), strict=True)
         actions: list[NDArray[Any]] = []
         for row, start, observed in zip(rows, starts, observations, strict=True):
@@ -114,6 +116,14 @@ class PerRow(TensorDictModuleBase):
             return action_array(answer)
         except ForeignError as error:
             raise ForeignError(f"{self._place(row)}: {error}") from error
+
+    def unfit(
+        self, action: torch.Tensor, batch: torch.Size, space: ActionSpace, _: str
+    ) -> ForeignError:
+        """Return the error for an action that does not fit the env, see `unfit_action`."""
+        number, returned, problem = space.unfit_row(action, batch)
+        place = self._place(self.asked[number])
+        return ForeignError(f"{place}: act returned {shown(returned)}, which {problem}")
 
     def _place(self, row: int) -> str:
         """Return the class of the controller, with the row and the step."""
@@ -215,6 +225,14 @@ class ControllerGuide(TensorDictModuleBase):
         """Write the action; what the controller raises is a `ForeignError`."""
         with foreign(f"the controller {self.title}", "it"):
             return self.guide(tensordict)
+
+    def unfit(
+        self, action: torch.Tensor, batch: torch.Size, space: ActionSpace, problem: str
+    ) -> ForeignError:
+        """Return the error for an action that does not fit the env, see `unfit_action`."""
+        if isinstance(self.guide, (PerRow, FunctionGuide)):
+            return self.guide.unfit(action, batch, space, problem)
+        return ForeignError(f"the controller {self.title}: its action {problem}")
 
 
 def _of_class(

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coil_rl.envs.gate import ForeignError, action_array, foreign, shown
-from coil_rl.transforms.action_space import nested_key
+from coil_rl.transforms.action_space import ActionSpace, nested_key
 
 # Factor and offset of a row, and of two others that a function for a batch must not mix with it:
 # one of its size, and one beyond all limits of a sum or a maximum.
@@ -76,6 +76,16 @@ class FunctionGuide(TensorDictModuleBase):
             )
         action = torch.as_tensor(np.stack(rows), device=tensordict.device)
         return tensordict.set("action", action.reshape(*tensordict.batch_size, *action.shape[1:]))
+
+    def unfit(
+        self, action: Tensor, batch: torch.Size, space: ActionSpace, problem: str
+    ) -> ForeignError:
+        """Return the error for an action that does not fit the env, see `unfit_action`."""
+        if self.for_batch:
+            return ForeignError(f"the controller {self.title}: its action {problem}")
+        number, returned, problem = space.unfit_row(action, batch)
+        place = f"the controller {self.title} (row {number})"
+        return ForeignError(f"{place}: it returned {shown(returned)}, which {problem}")
 
     def _rows(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Return the entries that the function gets, with one dimension of rows."""

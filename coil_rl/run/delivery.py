@@ -21,13 +21,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.errors import file_of_a_run
-from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
+from coil_rl.files import write_text
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.anchor import hold_of
 from coil_rl.learners.learner import Learner
 from coil_rl.report.runs import DELIVERY
-from coil_rl.report.table import return_format
+from coil_rl.report.statistics import mean_interval
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import LEAST_CASES, TrainingCases
 from coil_rl.run.curve import EvaluationCurve
@@ -126,7 +125,7 @@ class Delivery:
         chosen = max(means, key=lambda name: means[name])
         cases = len(returns["last"])
         checkpoint.save(candidates[chosen], self.folder / "policy_best.pt")
-        self._report(chosen, means, cases, earlier)
+        self._report(chosen, returns, earlier)
         guides = [mean for name, mean in means.items() if name not in ("last", "earlier")]
         numbers = (
             means["last"],
@@ -202,15 +201,17 @@ class Delivery:
         for name, more in zip(policies, found, strict=True):
             returns[name] = torch.cat([returns.get(name, more.new_empty(0)), more])
 
-    def _report(
-        self, chosen: str, means: Mapping[str, float], cases: int, earlier: Path | None
-    ) -> None:
+    def _report(self, chosen: str, returns: Mapping[str, Tensor], earlier: Path | None) -> None:
         """Write which policy is handed over, and why."""
+        ahead = None
+        if chosen != "last":
+            ahead = mean_interval((returns[chosen] - returns["last"]).tolist())
         report = {
             "policy": chosen,
-            "cases": cases,
+            "cases": len(returns["last"]),
             "steps": self.cases.steps,
-            "returns": means,
+            "returns": {name: float(values.mean()) for name, values in returns.items()},
+            "ahead": ahead,  # of the last policy: mean difference, with its 95 % t interval
             "frames": int(earlier.stem) if chosen == "earlier" and earlier is not None else None,
         }
         write_text(self.folder / DELIVERY, json.dumps(report, indent=2))
@@ -240,34 +241,3 @@ def guide_of(state: Mapping[str, Any], env: EnvBase) -> GuideActs | None:
         env: with the transforms of the run.
     """
     return GuideActs(env, int(state[GUIDE])) if GUIDE in state else None
-
-
-def handed_over(folder: Path) -> str | None:
-    """Return the sentence that says what a run handed over and why; None without a test.
-
-    Raises:
-        UserError: if the file is damaged.
-    """
-    file = folder / DELIVERY
-    if not file.exists():
-        return None
-    with file_of_a_run(file, "remove it, and the sentence is left out"):
-        report = json.loads(read_file(file, LARGEST_NUMBERS))
-        returns = {str(name): float(value) for name, value in report["returns"].items()}
-        chosen, cases, frames = str(report["policy"]), int(report["cases"]), report["frames"]
-    names = {
-        "last": "the last policy",
-        "earlier": "an earlier policy",
-        "first": "the first policy",
-        "tuned": "the tuned guide",
-        "best_candidate": "the best candidate",
-    }
-    if frames is not None:
-        names["earlier"] = f"the policy after {int(frames):,} frames"
-    spec = return_format(returns.values())
-    listed = ", ".join(f"{names.get(name, name)} {value:{spec}}" for name, value in returns.items())
-    title = names.get(chosen, f"the {chosen}")
-    return (
-        f"Handed over is {title}: mean returns in {cases} new cases of the training, whose steps "
-        f"are among its frames: {listed}."
-    )

@@ -21,6 +21,7 @@ from coil_rl.run.cases import TrainingCases, guide_calls
 from coil_rl.run.curve import EvaluationCurve, Watch
 from coil_rl.run.folder import check_same
 from coil_rl.run.metrics import Metrics
+from coil_rl.run.reasons import start_test
 from coil_rl.run.rollout import Rollout
 from coil_rl.run.stopping import STOP, resume_command
 
@@ -161,6 +162,8 @@ class Experiment:
         self.metrics.describe(self.identity)
         if self.updates == 0:
             first = self._measure({})
+            if (sentence := start_test(first)) is not None:
+                say(sentence, error=True)
             self.frames_before = self.before + self.tested
             first |= self._taken()
         self._plan()

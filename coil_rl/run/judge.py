@@ -265,8 +265,8 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, share: float 
     if not trial.advice:
         del columns["advice"]
     for name, measure in trial.evaluation.measures.items():
-        if measure.title:
-            columns[name] = (measure.title, measure.format)
+        if heading := measure.heading(name):
+            columns[name] = (heading, measure.format)
     count = len(trial.evaluation.cases)
     pairs = list(zip(judgement.table, judgement.counts, strict=True))
     if count > MAX_CASES:
@@ -327,7 +327,13 @@ def not_worse(policy: EvaluationResult, guide: EvaluationResult, name: str, chan
         chance: mean reward of random actions.
     """
     pairs = zip(policy.episodes, guide.episodes, strict=True)
-    _, low, high = mean_interval([mine["reward"] - other["reward"] for mine, other in pairs])
+    differences = [mine["reward"] - other["reward"] for mine, other in pairs]
+    if not any(differences):
+        return (
+            f"Not worse than {name} on these {len(differences)} cases: yes, the return is the same "
+            "in each of them."
+        )
+    _, low, high = mean_interval(differences)
     allowed = ALLOWED_LOSS * abs(guide.mean_reward - chance)
     answer = "undecided"
     if low >= -allowed:

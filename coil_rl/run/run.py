@@ -26,7 +26,7 @@ from coil_rl.report.runs import DELIVERY, EVALUATION, read_curve
 from coil_rl.run import checkpoint
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import Watch
-from coil_rl.run.delivery import guide_of, handed_over
+from coil_rl.run.delivery import guide_of
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.experiment import PUT_BACK
 from coil_rl.run.fallback import Fallback, make_fallback
@@ -45,6 +45,7 @@ from coil_rl.run.guide_returns import guide_returns
 from coil_rl.run.judge import Evaluation, Trial, judge, report_outcome
 from coil_rl.run.next_step import next_step
 from coil_rl.run.parts import TRAIN, EnvMaker
+from coil_rl.run.reasons import handed_over, start_test
 from coil_rl.run.stopping import resume_command
 from coil_rl.run.training import training_of
 from coil_rl.run.weights import put_weights
@@ -316,7 +317,7 @@ class Run:
                 report_changed_versions(self.folder)
             policy = self.learn(resumed=resumed) if self.has_agent else None
             fallback = self.make_fallback(policy) if self.fallback else None
-            judge(self._trial_with_reason(), policy, self.folder, self.seed, fallback)
+            judge(self._trial_with_reasons(), policy, self.folder, self.seed, fallback)
             reward = report_outcome(self.folder)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"continue with: {resume_command(self.folder)}") from None
@@ -438,16 +439,18 @@ class Run:
         put_weights(policy, state, path)
         return policy
 
-    def _trial_with_reason(self) -> Trial:
-        """Return the trial with a note on which policy was handed over, and why.
+    def _trial_with_reasons(self) -> Trial:
+        """Return the trial with notes on the tests of the training. Its guides drive once."""
+        notes = [*self.trial.notes, *self.reasons()]
+        return replace(self.trial, guide_results=self._guide_results, notes=notes)
 
-        Its guides drive once.
-        """
-        trial = replace(self.trial, guide_results=self._guide_results)
-        reason = handed_over(self.folder) if self.chosen == "best" else None
-        if reason is None:
-            return trial
-        return replace(trial, notes=[*trial.notes, reason])
+    def reasons(self) -> list[str]:
+        """Return the sentences on the tests of the training; none for a run without tests."""
+        rows = read_curve(self.folder / "metrics.csv") if self.has_agent else []
+        found = [start_test(rows[0])] if rows else []
+        if self.chosen == "best":
+            found.append(handed_over(self.folder))
+        return [sentence for sentence in found if sentence is not None]
 
     def _guide_results(
         self, evaluation: Evaluation, pictures: Sequence[Picture]

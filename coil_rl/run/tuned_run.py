@@ -107,6 +107,14 @@ class TunedRun(Run):
             )
         return self.load_policy(self.make_env())
 
+    def reasons(self) -> list[str]:
+        """Return the sentence on the test, and the one with the numbers of the guide."""
+        found = super().reasons()
+        values = read_tuned(self.folder, self.numbers)
+        if values is not None:
+            found.append(numbers_sentence(values, {each.name: each.own for each in self.numbers}))
+        return found
+
     def _env_of(self, candidates: Candidates) -> Any:
         """Return what makes the env in which candidates act."""
         (name,) = self.make_env.guides()
@@ -238,6 +246,17 @@ class TunedRun(Run):
     def _numbers_of(self, row: Mapping[str, float]) -> Values:
         """Return the numbers around which candidates were drawn after a row of the log."""
         return {number.name: row[f"tune/number/{number.name}"] for number in self.numbers}
+
+
+def numbers_sentence(values: Values, own: Values) -> str:
+    """Return the sentence that says which numbers a guide got.
+
+    Args:
+        values: by name.
+        own: those that it had.
+    """
+    listed = (f"{name} {value:.4g} (its own {own[name]:.4g})" for name, value in values.items())
+    return f"The guide's numbers: {', '.join(listed)}; all digits are in {TUNED}."
 
 
 def read_tuned(folder: Path, numbers: Sequence[Number]) -> Values | None:

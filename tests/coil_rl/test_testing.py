@@ -1,13 +1,18 @@
 """Each contract check finds its defect in a part that is broken on purpose."""
 
+import warnings
+
+import gymnasium
 import numpy as np
 import pytest
 import torch
 import worlds
+from gymnasium import spaces
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.data import Unbounded
-from torchrl.envs import PendulumEnv, TensorDictPrimer, Transform
+from torchrl.envs import PendulumEnv, TensorDictPrimer, Transform, TransformedEnv
 
+from coil_rl import GymnasiumEnv, NormalisedAction
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import PerRow, RandomGuide, SplineGuide
 from coil_rl.testing import check_env, check_guide, check_transform
@@ -216,6 +221,55 @@ class ResetsAll(ConeTrackEnv):
 def test_defect_of_an_env_is_found(make, message):
     with pytest.raises(ValueError, match=message):
         check_env(make(), steps=4)
+
+
+class Tank(gymnasium.Env):
+    """A level that may be beyond the bounds of its space.
+
+    Args:
+        level: its largest value, m.
+    """
+
+    action_space = spaces.Box(0.0, 1.0, (1,))
+    observation_space = spaces.Dict(
+        {"level": spaces.Box(0.0, 0.1, (2,), np.float64), "free": spaces.Box(-np.inf, np.inf)}
+    )
+
+    def __init__(self, level=0.1):
+        self.level = level
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return {"level": np.zeros(2), "free": np.array([1e9], np.float32)}, {}
+
+    def step(self, action):
+        self.steps += 1
+        observation = {"level": np.array([0.0, self.level]), "free": np.array([-1e9], np.float32)}
+        return observation, 0.0, False, self.steps >= 20, {}
+
+
+def test_observation_outside_of_its_space_is_said():
+    said = (
+        r"number 1 of the observation\.level is 1e\+09, but the observation_space of Tank has it "
+        r"from 0 to 0\.1; correct its bounds"
+    )
+    with pytest.warns(UserWarning, match=said) as caught:
+        check_env(GymnasiumEnv(Tank, 2, options={"level": 1e9}), steps=4)
+    assert len(caught) == 1
+    with pytest.warns(UserWarning, match=said):
+        check_env(
+            TransformedEnv(GymnasiumEnv(Tank, options={"level": 1e9}), NormalisedAction()), steps=4
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(GymnasiumEnv(Tank, 2), steps=4)
+
+
+def test_check_of_a_guide_says_how_to_make_more_rows():
+    lean = PerRow(lambda: OneNumber(), ["level"])
+    with pytest.raises(ValueError, match=r"not \[1\]; make it with more, .*num_envs=2\)"):
+        check_guide(lean, GymnasiumEnv(Tank))
 
 
 def test_envs_with_and_without_a_batch_pass():

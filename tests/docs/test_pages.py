@@ -54,6 +54,13 @@ def test_programs_and_targets_of_make_exist(page):
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
 
 
+def test_installation_names_the_extras_and_the_wheel():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    code = code_of(DOCS / "install.md")
+    assert {*project["optional-dependencies"]} <= {*code.splitlines()}
+    assert f"coil_rl-{project['version']}-py3-none-any.whl[" in code
+
+
 def toctree_entries(page):
     trees = re.findall(r"^```\{toctree\}\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.M)
     lines = [line for tree in trees for line in tree.splitlines()]

@@ -433,6 +433,11 @@ def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
     [
         ("CartPol-v1", {}, "the env CartPol-v1 cannot be made: .*Did you mean: `CartPole`"),
         ("MyPlant-v0", {}, "write PACKAGE:MyPlant-v0"),
+        ("cart_poles.Cart", {}, "colon between them; write cart_poles:Cart$"),
+        ("outside_package.install.Room", {}, "write outside_package.install:Room$"),
+        ("outside_package.nothing.Room", {}, "write PACKAGE:outside_package.nothing.Room$"),
+        ("odd_parts:Plan", {}, "registers none of this name; did you mean Plain\\?$"),
+        ("gymnasium:CartPol-v1", {}, "; did you mean CartPole-v1\\?$"),
         ("no_such_module:X-v0", {}, "there is no module no_such_module; install its package"),
         ("CartPole-v1", {"options": {"colour": 1}}, "unexpected keyword argument 'colour'$"),
         ("CartPole-v1", {"num_envs": 0}, "num_envs=0 must be at least 1"),

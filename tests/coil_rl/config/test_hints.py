@@ -41,6 +41,13 @@ def test_mistake_is_answered_by_what_to_write(typed, hint):
     assert len(refused.splitlines()) == 1
 
 
+def test_key_that_was_typed_is_no_hint():
+    words = ["env=gym", "env.id=CartPole-v1", "guide=controller", "env.options={sutton: true}"]
+    refused = called("train", *words, code=2).stderr
+    assert "there is no key env.options.sutton" in refused
+    assert refused.endswith("+env.options.sutton=VALUE adds it\n")
+
+
 def test_unknown_argument_of_a_part_is_not_said_to_be_added_by_a_plus():
     assert "adds it" not in called("train", "learner.lr=0.1", code=2).stderr
 

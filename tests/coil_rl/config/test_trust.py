@@ -202,7 +202,7 @@ def test_target_is_refused_wherever_it_is(key, saved, tmp_path):
         (
             "env.x",
             {"_target_": "my_package.Part"},
-            r"allow it with trust=\[my_package\] on the command line",
+            r'trust=\[my_package\] on the command line, or trust=\["my_package"\] in Python$',
         ),
         (
             "env.x",

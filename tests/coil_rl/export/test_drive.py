@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from exported_sums import write
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
@@ -19,7 +21,7 @@ from coil_rl.export import ExportedPolicy, drive, export_policy
 from coil_rl.run.parts import TEST
 
 SOURCE = Path(drive.__file__)
-LONGEST = 22  # statements besides imports
+LONGEST = 28  # statements besides imports
 
 
 def test_driver_is_short_and_needs_no_other_package():
@@ -30,11 +32,41 @@ def test_driver_is_short_and_needs_no_other_package():
             imported |= {alias.name for alias in node.names}
         if isinstance(node, ast.ImportFrom):
             imported.add(node.module)
-    others = {name for name in imported if name not in sys.stdlib_module_names}
+    packages = {name.partition(".")[0] for name in imported}
+    others = packages - sys.stdlib_module_names
     assert others == {"numpy", "onnxruntime"}
     left_out = (ast.Expr, ast.Import, ast.ImportFrom)  # docstrings and imports
     nodes = [node for node in ast.walk(tree) if isinstance(node, ast.stmt)]
     assert sum(not isinstance(node, left_out) for node in nodes) <= LONGEST
+
+
+def copied(folder):
+    """Return the module of the driver that lies in a folder."""
+    spec = importlib.util.spec_from_file_location("copied", folder / SOURCE.name)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("inputs", "message"),
+    [
+        ({"observation": [1.0, 2.0]}, "guide_action is missing; give"),
+        (
+            {"observation": [1.0, 2.0], "advice": [1.0]},
+            "guide_action is missing, advice is no input; give",
+        ),
+        ({"observation": [1.0, 2.0], "guide_action": [1.0], "reward": 0.0}, "reward is no input"),
+        ([1.0, 2.0], "observation is missing, guide_action is missing; give"),
+    ],
+)
+def test_inputs_that_the_contract_does_not_name_are_named(inputs, message, tmp_path):
+    shutil.copy(SOURCE, write(tmp_path) / SOURCE.name)
+    policy = copied(tmp_path).Policy()
+    with pytest.raises(ValueError, match=message) as caught:
+        policy.act(inputs)
+    assert str(caught.value).endswith("give a dictionary of observation, guide_action")
+    assert policy.act({"observation": [2.0, 3.0], "guide_action": [10.0]}) == 16.0
 
 
 def driven(env, act, most):
@@ -58,10 +90,7 @@ def test_lap_driven_by_the_file_alone_has_the_reward_of_torch(name, tmp_path):
     config.env.laps = 1
     run = assemble(config, folder)
     export_policy(run, tmp_path, observations=300)
-    spec = importlib.util.spec_from_file_location("copied", tmp_path / SOURCE.name)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    policy, controller = module.Policy(), run.controller()
+    policy, controller = copied(tmp_path).Policy(), run.controller()
     read = [entry["name"] for entry in policy.contract["inputs"]]
 
     def by_file(carrier):

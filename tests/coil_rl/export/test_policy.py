@@ -1,79 +1,15 @@
 """An exported policy in onnxruntime: its contract is checked, and so is what it is given."""
 
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
-from onnx import TensorProto, helper
+from exported_sums import model, write
 
 import coil_rl
-from coil_rl.export.contract import CONTRACT, FORMAT, ONNX, VERSION, checksum
+from coil_rl.export.contract import CONTRACT, ONNX, VERSION, checksum
 from coil_rl.export.policy import ExportedPolicy
-
-Change = Callable[[dict], None]
-
-
-def model() -> bytes:
-    """Return a file that adds the observation, the advice and what it remembers: their sum."""
-    rows = [("observation", 2), ("guide_action", 1), ("state.sum", 1)]
-    inputs = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["b", size]) for name, size in rows
-    ]
-    outputs = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["b", 1])
-        for name in ("action", "next.sum")
-    ]
-    axes = helper.make_tensor("axes", TensorProto.INT64, [1], [1])
-    nodes = [
-        helper.make_node("ReduceSum", ["observation", "axes"], ["total"], keepdims=1),
-        helper.make_node("Add", ["total", "guide_action"], ["advised"]),
-        helper.make_node("Add", ["advised", "state.sum"], ["action"]),
-        helper.make_node("Identity", ["action"], ["next.sum"]),
-    ]
-    graph = helper.make_graph(nodes, "sum", inputs, outputs, [axes])
-    opset = [helper.make_opsetid("", 20)]
-    return helper.make_model(graph, opset_imports=opset, ir_version=9).SerializeToString()
-
-
-def write(folder: Path, change: Change = lambda contract: None) -> Path:
-    """Write the file and its contract, perhaps changed, and return the folder."""
-    content = model()
-    contract = {
-        "format": FORMAT,
-        "version": VERSION,
-        "files": {ONNX: {"sha256": checksum(content), "bytes": len(content)}},
-        "env": {"title": "Sum"},
-        "inputs": [
-            {"name": "observation", "key": ["observation"], "shape": [2], "dtype": "float32"},
-            {"name": "guide_action", "key": ["guide_action"], "shape": [1], "dtype": "float32"},
-        ],
-        "outputs": [
-            {
-                "name": "action",
-                "shape": [1],
-                "dtype": "float32",
-                "space": {"shape": [1], "dtype": "float64"},
-            }
-        ],
-        "state": [
-            {
-                "input": "state.sum",
-                "output": "next.sum",
-                "shape": [1],
-                "dtype": "float32",
-                "first": 1.0,
-            }
-        ],
-        "guide": {"place": "outside", "names": ["sum"], "reason": "it is Python"},
-    }
-    change(contract)
-    folder.mkdir(exist_ok=True)
-    (folder / ONNX).write_bytes(content)
-    (folder / CONTRACT).write_text(json.dumps(contract))
-    return folder
 
 
 def test_file_of_the_test_is_valid():
@@ -100,6 +36,7 @@ def test_state_goes_from_step_to_step_until_a_reset(tmp_path):
         ([1.0, np.nan], 0.0, "observation holds a number that is not finite"),
         (["a", "b"], 0.0, "observation holds <U1, but must hold numbers"),
         ({"other": [1.0, 2.0]}, 0.0, "the observation lacks observation"),
+        ({"guide_action": [1.0]}, 0.0, "the observation lacks observation"),
         ([1.0, 2.0], None, "the guide of this policy is outside"),
         ([1.0, 2.0], [1.0, 2.0], r"guide_action has the shape \[2\], but must have \[1\]"),
     ],
@@ -107,12 +44,24 @@ def test_state_goes_from_step_to_step_until_a_reset(tmp_path):
 def test_observation_that_does_not_fit_is_refused(observation, advice, message, tmp_path):
     def names_both(contract):
         contract["inputs"][0]["from"] = {"path": [], "choices": [], "start": []}
-        if isinstance(observation, dict):
+        if isinstance(observation, dict) and "other" in observation:
             contract["inputs"][0]["from"]["path"] = ["observation"]
 
     policy = ExportedPolicy(write(tmp_path, names_both))
     with pytest.raises(ValueError, match=message):
         policy.act(observation, advice)
+
+
+def test_inputs_that_do_not_fit_the_contract_are_named(tmp_path):
+    def inside(contract):
+        contract["guide"] = {"place": "inside", "names": ["sum"]}
+
+    policy = ExportedPolicy(write(tmp_path))
+    with pytest.raises(ValueError, match="guide_action is missing; give observation, guide_action"):
+        policy.act_on({"observation": np.zeros((1, 2), np.float32)})
+    policy = ExportedPolicy(write(tmp_path, inside))
+    with pytest.raises(ValueError, match="takes no guide_action: its guide is inside; leave"):
+        policy.act([1.0, 2.0], [1.0])
 
 
 def test_choices_are_encoded_as_the_contract_says(tmp_path):

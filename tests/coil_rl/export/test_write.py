@@ -14,6 +14,8 @@ from programs import shipped
 import coil_rl
 from coil_rl.export import write
 from coil_rl.export.contract import CONTRACT, DRIVER, ONNX, TORCH
+from coil_rl.run import checkpoint
+from coil_rl.run.delivery import GUIDE
 
 METHODS = shipped("method")
 OBSERVATIONS = 30
@@ -78,6 +80,24 @@ def test_python_guide_is_an_input_in_the_unit_of_the_env(tmp_path, capsys):
         return part.given_units.denormalise(normalised).numpy()
 
     same_actions(run, policy, rooms(), heard)
+
+
+@pytest.mark.parametrize("guide", ["PI", "proportional"])
+def test_guide_that_was_handed_over_is_said_to_be_no_policy(guide, tmp_path, capsys):
+    folder = learned(
+        tmp_path / "run", "coil", "delivery=tested", guide=f"thermostat.control:{guide}"
+    )
+    checkpoint.save({GUIDE: torch.tensor(0)}, folder / "policy_best.pt")
+    run = coil_rl.open_run(folder)
+    policy = coil_rl.export_policy(run, tmp_path / "exported", observations=OBSERVATIONS)
+    said = capsys.readouterr().out
+    assert "what the run handed over is guide controller itself, not a learned policy" in said
+    assert ("its file only passes guide_action on" in said) == (guide == "PI")
+    assert "policy=last exports the last learned policy" in said
+    assert policy.contract["policy"]["acts"] == "guide controller itself, no learned policy"
+    last = coil_rl.export_policy(run, tmp_path / "last", which="last", observations=OBSERVATIONS)
+    assert last.contract["policy"]["acts"] == "a learned policy"
+    assert "itself" not in capsys.readouterr().out
 
 
 @pytest.mark.slow

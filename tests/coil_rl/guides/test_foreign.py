@@ -18,7 +18,6 @@ from coil_rl.guides import ControllerGuide, PerRow, RecordedGuide
 from coil_rl.learners import PPO
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
-from coil_rl.transforms.guide_actions import UnfitActionError
 
 STEP = 3  # at which a controller does what it is told
 
@@ -93,8 +92,9 @@ def test_fault_of_a_controller_is_one_sentence_with_its_place(answer, message):
     ],
 )
 def test_fault_of_a_function_is_one_sentence(id, answer, message):
-    with pytest.raises((ForeignError, UnfitActionError), match=message) as caught:
+    with pytest.raises(ForeignError, match=message) as caught:
         driven(ControllerGuide(answer), id)
+    assert str(caught.value).startswith("the controller <lambda>")
     assert "\n" not in str(caught.value)
 
 
@@ -107,8 +107,29 @@ def test_action_is_checked_at_every_step():
             self.calls += 1
             return self.calls  # an index, and no index of the env from the third call on
 
-    with pytest.raises(UnfitActionError, match="is neither an index below 2"):
+    place = (
+        r"^the controller Drifts \(row 0, step 2\): act returned \[2\], which is neither an index"
+    )
+    with pytest.raises(ForeignError, match=place):
         driven(ControllerGuide(Drifts()), "CartPole-v1")
+
+
+@pytest.mark.parametrize("guide", [ControllerGuide, lambda thing: PerRow(lambda: thing)])
+def test_action_of_another_shape_is_that_of_the_controller_without_the_batch(guide):
+    class Two:
+        def act(self, observation):
+            return [1.0, 2.0]
+
+    with pytest.raises(
+        ForeignError, match=r"\(row 0, step 0\): act returned \[1.0, 2.0\]"
+    ) as caught:
+        driven(guide(Two()))
+    assert str(caught.value).endswith("which has the shape [2], but must have [1]")
+
+
+def test_action_of_a_network_that_does_not_fit_names_the_network():
+    with pytest.raises(ForeignError, match=r"^the controller Identity: its action has the shape"):
+        driven(ControllerGuide(nn.Identity()))
 
 
 def test_network_that_fails_is_named():

@@ -15,7 +15,7 @@ from coil_rl.guides.simple import FollowAdvice
 from coil_rl.report.runs import DELIVERY
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
-from coil_rl.run.delivery import GUIDE, Delivery, GuideActs, handed_over
+from coil_rl.run.delivery import GUIDE, Delivery, GuideActs
 from coil_rl.run.parts import TESTS
 
 pytest.importorskip("gymnasium.envs.classic_control")
@@ -69,7 +69,11 @@ def test_guide_is_handed_over_where_nothing_better_was_learned(guide_wins):
     assert guide["driver"] == "guide"
     assert agent["reward"] == guide["reward"]
     page = (guide_wins / "evaluation.md").read_text()
-    assert "Handed over is the guide: mean returns in" in page
+    assert "Handed over is the guide itself, and nothing that was learned: mean returns in" in page
+    assert "the return is the same in each of them" in page
+    mean, low, high = found["ahead"]
+    assert mean == pytest.approx(found["returns"]["guide"] - found["returns"]["last"], rel=1e-4)
+    assert low <= mean <= high
     listed = called("report", f"folder={guide_wins.parent}").stdout
     assert "whose steps are among their frames: guide 1." in listed
 
@@ -147,10 +151,6 @@ def test_run_without_a_guide_in_its_env_compares_its_own_policies(tmp_path):
     folder = trained(tmp_path / "run", "method=ppo")
     assert set(report(folder)["returns"]) <= {"last", "earlier"}
     assert math.isnan(float(rows_of(folder / "metrics.csv")[-1]["delivery/guide"]))
-
-
-def test_sentence_needs_a_test(tmp_path):
-    assert handed_over(tmp_path) is None
 
 
 def test_killed_run_ends_with_the_same_files(tmp_path):

@@ -37,7 +37,6 @@ def test_guide_acts_from_a_low_value_on_until_a_high_one():
     ("agent", "answer"),
     [
         ([101, 102, 103], "yes"),
-        ([100, 100, 100], "yes"),
         ([99.5, 99.5, 99.5], "yes"),
         ([98.5, 98.5, 98.5], "no"),
         ([90, 91, 92], "no"),
@@ -52,3 +51,10 @@ def test_agent_is_not_worse_if_the_whole_interval_is_above_one_percent_less(agen
     _, low, high = mean_interval([reward - 100 for reward in agent])
     spec = return_format([sum(mine) / 3, sum(guide) / 3])
     assert f"{low:+{spec}} to {high:+{spec}}" in sentence
+
+
+def test_agent_with_the_returns_of_its_guide_has_no_interval():
+    sentence = not_worse(result_of([100, 90]), result_of([100, 90]), "guide", chance=0)
+    assert sentence == (
+        "Not worse than guide on these 2 cases: yes, the return is the same in each of them."
+    )

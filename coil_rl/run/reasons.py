@@ -1,0 +1,84 @@
+"""Sentences that say why a run did what it did: its start test, and what it handed over."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+from coil_rl.errors import file_of_a_run
+from coil_rl.files import LARGEST_NUMBERS, read_file
+from coil_rl.learners.anchor import StartTest
+from coil_rl.report.runs import DELIVERY
+from coil_rl.report.table import return_format
+
+POLICIES = {
+    "last": "the last policy",
+    "earlier": "an earlier policy",
+    "first": "the first policy",
+    "tuned": "the tuned guide",
+    "best_candidate": "the best candidate",
+}
+
+
+def start_test(row: Mapping[str, float]) -> str | None:
+    """Return the sentences that say which guide an anchored policy holds; None without a test.
+
+    Args:
+        row: of `metrics.csv`, that of the state before the first update.
+    """
+    guide, opposite, new, cases, weight = (row.get(name, math.nan) for name in StartTest.names)
+    if math.isnan(cases):
+        return None
+    returns = {"the guide": guide, "its opposite": opposite, "the new policy": new}
+    known = {name: value for name, value in returns.items() if not math.isnan(value)}
+    spec = return_format(known.values())
+    listed = ", ".join(f"{name} {value:{spec}}" for name, value in known.items())
+    if weight:
+        title = "guide" if weight > 0 else "opposite of the guide"
+        gain = ""
+        if abs(weight) != 1:
+            gain = f" at {abs(weight):g} of its distance from the middle of the action's range"
+        outcome = f"The {title} is held{gain}, and the policy starts there."
+    elif max(known.values()) > new:
+        outcome = (
+            "None is held, as no difference is large and certain enough in these cases, so the "
+            "policy learns without the advice; with more frames the test has more cases."
+        )
+    else:
+        outcome = "None is better than the new policy, so it learns without the advice."
+    return f"Start test, mean returns in {cases:.0f} new cases: {listed}. {outcome}"
+
+
+def handed_over(folder: Path) -> str | None:
+    """Return the sentence that says what a run handed over and why; None without a test.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        UserError: if the file is damaged.
+    """
+    file = folder / DELIVERY
+    if not file.exists():
+        return None
+    with file_of_a_run(file, "remove it, and the sentence is left out"):
+        report = json.loads(read_file(file, LARGEST_NUMBERS))
+        returns = {str(name): float(value) for name, value in report["returns"].items()}
+        chosen, cases, frames = str(report["policy"]), int(report["cases"]), report["frames"]
+        ahead = [float(value) for value in report.get("ahead") or ()]
+    names = dict(POLICIES)
+    if frames is not None:
+        names["earlier"] = f"the policy after {int(frames):,} frames"
+    spec = return_format(returns.values())
+    listed = ", ".join(f"{names.get(name, name)} {value:{spec}}" for name, value in returns.items())
+    title = names.get(chosen, f"the {chosen} itself, and nothing that was learned")
+    sentence = (
+        f"Handed over is {title}: mean returns in {cases} new cases of the training, whose steps "
+        f"are among its frames: {listed}"
+    )
+    if ahead:
+        mean, low, high = (f"{value:+{spec}}" for value in ahead)
+        sentence += f"; it is {mean} ahead of the last policy ({low} to {high}, 95 % interval)"
+    if chosen not in names and "last" in returns:
+        return f"{sentence}. With policy=last the last policy is evaluated."
+    return f"{sentence}."

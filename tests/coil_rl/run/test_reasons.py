@@ -1,0 +1,62 @@
+"""Sentences on the tests of a run: what an anchored policy holds, and what is handed over."""
+
+import json
+import math
+
+import pytest
+
+from coil_rl.errors import UserError
+from coil_rl.learners.anchor import StartTest
+from coil_rl.report.runs import DELIVERY
+from coil_rl.run.reasons import handed_over, start_test
+
+
+def row(*numbers):
+    return dict(zip(StartTest.names, numbers, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "parts"),
+    [
+        ((-20, math.nan, -90, 4, 1), ["guide -20.0, the new policy -90.0", "The guide is held,"]),
+        ((-90, -20, -80, 2, -1), ["opposite -20.0", "The opposite of the guide is held,"]),
+        ((-20, math.nan, -90, 4, 0.5), ["held at 0.5 of its distance from the middle"]),
+        ((-50, -95, -90, 4, 0), ["None is held", "with more frames the test has more cases"]),
+        ((-95, -96, -90, 4, 0), ["None is better than the new policy"]),
+    ],
+)
+def test_start_test_says_what_is_held_and_why(numbers, parts):
+    sentence = start_test(row(*numbers))
+    assert sentence.startswith(f"Start test, mean returns in {numbers[3]} new cases: ")
+    assert "nan" not in sentence
+    for part in parts:
+        assert part in sentence
+
+
+def test_run_without_tests_has_no_sentences(tmp_path):
+    assert start_test({"frames": 0.0}) is None
+    assert start_test(row(*[math.nan] * 5)) is None
+    assert handed_over(tmp_path) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "part"),
+    [
+        ({}, "Handed over is the last policy: mean returns in 6 new cases"),
+        ({"policy": "earlier", "frames": 4096}, "Handed over is the policy after 4,096 frames"),
+        ({"policy": "spline"}, "Handed over is the spline itself, and nothing that was learned"),
+        ({"policy": "spline", "ahead": [4.0, -1.0, 9.0]}, "it is +4.00 ahead of the last policy"),
+        ({"policy": "spline"}, "With policy=last the last policy is evaluated."),
+    ],
+)
+def test_handing_over_is_said_with_its_reason(changes, part, tmp_path):
+    returns = {"last": 1.0, "spline": 5.0}
+    report = {"policy": "last", "cases": 6, "returns": returns, "frames": None} | changes
+    (tmp_path / DELIVERY).write_text(json.dumps(report))
+    assert part in handed_over(tmp_path)
+
+
+def test_damaged_file_is_one_sentence(tmp_path):
+    (tmp_path / DELIVERY).write_text("{")
+    with pytest.raises(UserError, match="remove it, and the sentence is left out"):
+        handed_over(tmp_path)
