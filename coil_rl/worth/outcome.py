@@ -1,5 +1,6 @@
 """The results of a comparison, read from its folder."""
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,9 +10,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from coil_rl.files import LARGEST_NUMBERS, read_file
 from coil_rl.report.curves import points
 from coil_rl.report.runs import RETURN, Run, read_runs
 from coil_rl.run.next_step import still_rising
+from coil_rl.run.reasons import POLICIES
+from coil_rl.run.tuned_run import TUNED
 from coil_rl.worth.arms import GUIDE, OPPOSITE, TUNE
 from coil_rl.worth.baselines import NAME, read_baselines
 from coil_rl.worth.verdict import Entry
@@ -96,6 +100,11 @@ def _learned_row(
     last = [run.curve[-1] for run in runs]
     seconds = [run.seconds for run in runs if run.seconds is not None]
     notes = [f"a seed failed: {reasons[0]}"] if reasons else []
+    guides = [run.handed_over for run in runs if run.handed_over not in ("", *POLICIES)]
+    if entry.name != TUNE and guides:
+        notes.append(f"{len(guides)} of {len(runs)} seeds hand over the guide itself")
+    if numbers := tuned_numbers(runs):
+        notes.append(f"{numbers} by seed")
     if entry.rising:
         notes.append("still rising")
     firsts = [points(run.curve, RETURN)[0, 1] for run in runs if len(points(run.curve, RETURN))]
@@ -106,6 +115,20 @@ def _learned_row(
         "first": float(np.mean(firsts)) if firsts else math.nan,
         "note": "; ".join(notes),
     }
+
+
+def tuned_numbers(runs: Sequence[Run]) -> str:
+    """Return the numbers that tuning gave a guide, as a text: of each number those of all seeds.
+
+    Args:
+        runs: of one arm; nothing is returned if they tuned nothing.
+    """
+    files = [run.folder / TUNED for run in runs]
+    found = [json.loads(read_file(file, LARGEST_NUMBERS)) for file in files if file.exists()]
+    names = found[0] if found else ()
+    return ", ".join(
+        f"{name} {' / '.join(f'{float(values[name]):.3g}' for values in found)}" for name in names
+    )
 
 
 def _failures(tables: Sequence[pd.DataFrame]) -> float:

@@ -81,9 +81,10 @@ def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> str:
     lost = (own - late.mean) / (own - random.mean)
     kept = f"it keeps {1 - lost:.0%} of its distance from random actions"
     spec = return_format([late.mean, own])
+    which = f"{entry.name} of the first seed" if len(entry.returns) > 1 else entry.name
     return (
         f"With one step of delay on observation and action, which it was not trained with, "
-        f"{entry.name} has {late.mean:{spec}} instead of {own:{spec}} ({found}): {kept}."
+        f"{which} has {late.mean:{spec}} instead of {own:{spec}} ({found}): {kept}."
     )
 
 

@@ -235,18 +235,23 @@ def _undecided(use: Entry, candidates: Sequence[Entry], least: float, failed: Se
         parts.append(f"where {_listed(rising)} would end, still rising")
     if failed:
         parts.append(f"what {_listed(failed)} would have reached, which failed")
-    seeds = max(len(each.returns) for each in candidates)
-    spread = max(
-        (float(np.ptp(each.returns.mean(1))) for each in candidates if len(each.returns) > 1),
-        default=math.nan,
-    )
+    several = [each for each in candidates if len(each.returns) > 1]
     few = "Each training ran once, which says nothing about another seed."
-    if seeds > 1:
-        spec = return_format([spread])
-        few = f"{seeds} seeds say little about others: theirs differ by up to {spread:{spec}}."
+    if several:
+        widest = max(several, key=_between_seeds)
+        spread = _between_seeds(widest)
+        few = (
+            f"{len(widest.returns)} seeds say little about others: those of {widest.name} differ "
+            f"by {spread:{return_format([spread])}}, the most here."
+        )
     if not parts:
         return f"Undecided is what a whole training would change. {few}"
     return f"Undecided is {'; and '.join(parts)}. {few}"
+
+
+def _between_seeds(entry: Entry) -> float:
+    """Return how far the means of the seeds of an entry lie apart."""
+    return float(np.ptp(entry.returns.mean(1)))
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -62,7 +62,7 @@ def test_anchored_policy_is_recommended_where_it_is_best():
     assert found.use == found.train == "coil_anchored"
     assert "+41.0" in found.sentences[1]
     assert "+76.0" in found.sentences[1]
-    assert "theirs differ by up to 10.0" in found.sentences[2]
+    assert "those of ppo differ by 10.0, the most here" in found.sentences[2]
 
 
 def test_what_is_not_clearly_worse_is_undecided():
