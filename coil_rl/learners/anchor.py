@@ -44,7 +44,7 @@ ADVISED = 0.9  # probability of the advised one of several options at a choice w
 # difference must exceed: quantiles of the t distribution, 0.5 % of one tail up to 8 cases, and 1 %
 # at the last. Two cases have no such quantile of use; theirs was chosen on eight tasks.
 BARS = {2: 20.0, 4: 5.8, 8: 3.5, 12: 2.7}
-PROMISING = 1.6  # shares that the start test may take with what is ahead in every case, or held
+PROMISING = 1.6  # shares that the start test may take while something is ahead in every case
 GAIN_CASES = (4, 12)  # numbers of cases after which the comparison of gains may end
 GAIN_ERRORS = 1.0  # standard errors by which a lower gain must be better: any of them is usable
 
@@ -59,8 +59,8 @@ class Anchor:
         gains: further values of w that the start test tries, from the highest to the lowest.
         choice_weight: of an advised option: 0 for none; with 1 the option has a probability of 0.9
             at first. In DQN the share of the range of the values that the advised action gains.
-        share: of the frames of the run that the start test may take, and 1.6 times this share with
-            what is ahead in every case, or held. Its first cases may take more.
+        share: of the frames of the run that the start test may take, and 1.6 times this share while
+            something is ahead in every case. Its first cases may take more.
         advice_key: entry with the advice, [*batch, n_guides, A].
 
     Raises:
@@ -294,8 +294,8 @@ class StartTest:
     them are ahead in every case, only these go on. More cases are added until one passes, or the
     test would take more than its share of the frames; what is ahead in every case may take more.
 
-    Then lower gains of it are tried in further cases, if that larger share allows for them. One is
-    taken if it is better by more than a standard error than the best of the gains above it.
+    Then lower gains of it are tried in further cases, if the share allows for them. One is taken if
+    it is better by more than a standard error than the best of the gains above it.
 
     Args:
         anchor: the settings.
@@ -372,7 +372,7 @@ class StartTest:
         for total in GAIN_CASES:
             more = total - done
             steps = more * sum(self._length(each) or length for each in tried)
-            if not self._affordable(steps, PROMISING):
+            if not self._affordable(steps):
                 break
             if done == 0:  # all gains are compared in the same new cases
                 del self.returns[held], self.steps[held]

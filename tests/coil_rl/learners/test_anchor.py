@@ -347,7 +347,7 @@ def test_two_equal_differences_are_not_enough():
 
 def test_lower_gains_are_not_tried_where_the_share_does_not_allow_for_them():
     cases = Returns(lambda weights: 100 - 60 * abs(weights[0] - 0.5) if weights[0] else 0)
-    cases.frames = 18_000
+    cases.frames = 30_000
     weights, numbers, _ = decided(None, cases=cases)
     assert weights == [1], "four cases of three gains would take 1,200 steps more"
     assert numbers["start/guide"] == pytest.approx(70, abs=2), "of the cases that there are"
