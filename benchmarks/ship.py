@@ -19,8 +19,8 @@ from coil_rl.files import write_text
 from coil_rl.plain_yaml import read_yaml, yaml_of
 from coil_rl.report.runs import DELIVERY
 from coil_rl.report.table import markdown_table
-from coil_rl.run.reasons import handed_over
 from coil_rl.run.folder import COMMAND, CONFIG
+from coil_rl.run.reasons import handed_over
 
 PLACE = Path(__file__).parents[1] / "coil_rl" / "policies"
 EVALUATION = "evaluation.csv"
