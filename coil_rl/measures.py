@@ -29,7 +29,7 @@ class Measure:
         where: key of a flag; only the steps with it count.
         at_least: makes the measure a flag: whether the number is at least this.
         at_most: makes the measure a flag: whether the number is at most this.
-        title: heading of its column; None: its name; empty: it is in the CSV files only.
+        title: heading of its column; a measure without one is in the CSV files only.
         format: of its numbers in tables; "auto": as they need.
 
     Raises:
@@ -41,7 +41,7 @@ class Measure:
     where: str | tuple[str, ...] | None = None
     at_least: float | None = None
     at_most: float | None = None
-    title: str | None = None
+    title: str = ""
     format: str = "auto"
 
     def __post_init__(self) -> None:
@@ -56,14 +56,6 @@ class Measure:
     ) -> Measure:
         """Return a measure from values of a YAML file, in which keys are lists."""
         return cls(_key(entry), where=None if where is None else _key(where), **options)
-
-    def heading(self, name: str) -> str:
-        """Return the heading of its column in tables; empty if it has none.
-
-        Args:
-            name: of the measure.
-        """
-        return name if self.title is None else self.title
 
     def pool(self, values: Sequence[float]) -> float:
         """Return the mean of the episodes that have a number, see `denominators`.

@@ -127,7 +127,7 @@ class MeasureConfig(NodeConfig):
     where: Any = None
     at_least: float | None = None
     at_most: float | None = None
-    title: str | None = None
+    title: str = ""
     format: Annotated[str, AfterValidator(format_of_numbers)] = "auto"
 
 

@@ -75,9 +75,8 @@ def _columns(
     for group in comparison.groups:
         for name, measure in group.measures.items():
             has_column = name in ("completed", "crashed") or name.startswith(PER_STEP)
-            heading = measure.heading(name)
-            if heading and not has_column:
-                columns[name] = (heading, measure.format)
+            if measure.title and not has_column:
+                columns[name] = (measure.title, measure.format)
     columns["needs_guide"] = ("guide at test time", "")
     return columns
 

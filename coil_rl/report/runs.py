@@ -143,7 +143,7 @@ def _read_run(folder: Path) -> Run:
     if not path.exists():
         return run
     with file_of_a_run(path, f"remove the file and write it again by coil-train resume={folder}"):
-        shown = [name for name, measure in measures.items() if measure.heading(name)]
+        shown = [name for name, measure in measures.items() if measure.title]
         evaluation = _read_evaluation(path, shown)
     path = folder / "metrics.csv"
     with file_of_a_run(path, RESTORE):

@@ -265,8 +265,8 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, share: float 
     if not trial.advice:
         del columns["advice"]
     for name, measure in trial.evaluation.measures.items():
-        if heading := measure.heading(name):
-            columns[name] = (heading, measure.format)
+        if measure.title:
+            columns[name] = (measure.title, measure.format)
     count = len(trial.evaluation.cases)
     pairs = list(zip(judgement.table, judgement.counts, strict=True))
     if count > MAX_CASES:

@@ -122,10 +122,3 @@ def test_mean_of_returns_is_not_a_number_if_one_is_not():
     assert math.isnan(rows[-1]["reward"])
     shown = with_shares(rows, counts, {"reward": ("reward", ".1f")})
     assert shown[-1]["reward"] == "- (1 of 2)"
-
-
-@pytest.mark.parametrize(
-    ("title", "heading"), [(None, "power"), ("power (W)", "power (W)"), ("", "")]
-)
-def test_column_of_a_measure_has_its_title_or_its_name(title, heading):
-    assert Measure("reward", title=title).heading("power") == heading
