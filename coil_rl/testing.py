@@ -73,7 +73,7 @@ def _check_rollouts(env: EnvBase, steps: int) -> None:
 
 
 def _look_at_bounds(env: GymnasiumEnv, steps: int) -> None:
-    """Warn of each entry of the observation that is outside of its space."""
+    """Warn of each entry of the observation with a number outside of its space."""
     rollout = env.rollout(steps, break_when_any_done=False)
     for entry in env.entries:
         parts = [rollout[entry.key], rollout["next", *entry.key]]

@@ -164,7 +164,7 @@ def _similar(module: str, name: str) -> str:
 
 
 def _is_module(name: str) -> bool:
-    """Return whether there is a module of a name, without an import of it or its packages."""
+    """Return whether a module exists, without importing it or its packages."""
     first, *others = name.split(".")
     with suppress(ImportError, ValueError):
         spec = find_spec(first)

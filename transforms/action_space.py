@@ -171,7 +171,7 @@ class ActionSpace:
             raise ValueError(f"is neither an index below {max(self.choices)} nor a one-hot vector")
 
     def unfit_row(self, action: Tensor, batch: torch.Size) -> tuple[int, Tensor, str]:
-        """Return the first row of a guide's action that does not fit, and why, without the batch.
+        """Return the first row whose action does not fit the env, and the reason.
 
         Args:
             action: of the guide, [*batch, ...].

@@ -289,10 +289,11 @@ class StartTest:
     All compared policies act in the same new cases: each guide alone and its opposite, both
     deterministically; and the new policy without a guide as it acts in training. A guide or
     opposite is held if its mean return is better by more than one standard deviation of the new
-    policy's returns, and the paired t value exceeds its bar (`BARS`). The best one that passes is
-    held. Opposites are tried only where no guide passes or was ahead in every case. Once some of
-    them are ahead in every case, only these go on. More cases are added until one passes, or the
-    test would take more than its share of the frames; what is ahead in every case may take more.
+    policy's returns, and by more than a number of standard errors of the difference (`BARS`). The
+    best one that passes is held. Opposites are tried only where no guide passes or was ahead in
+    every case. Once some of them are ahead in every case, only these go on. More cases are added
+    until one passes, or the test would take more than its share of the frames; what is ahead in
+    every case may take more.
 
     Then lower gains of it are tried in further cases, if the share allows for them. One is taken if
     it is better by more than a standard error than the best of the gains above it.
@@ -386,7 +387,12 @@ class StartTest:
         return best
 
     def _affordable(self, steps: float, shares: float = 1.0) -> bool:
-        """Return whether the test may take that many further steps, with that many shares."""
+        """Return whether the frames of the test allow for further steps.
+
+        Args:
+            steps: how many.
+            shares: of the frames that the test may take, see `Anchor.share`.
+        """
         return self.cases.steps + steps <= shares * self.anchor.share * self.cases.frames
 
     def _act(self, each: Sequence[tuple[float, ...]]) -> None:
@@ -418,7 +424,7 @@ class StartTest:
         return max(passing, key=self._mean, default=None)
 
     def _ahead(self, candidates: Sequence[Any], new: tuple[float, ...]) -> list[Any]:
-        """Return those weights that are better than the new policy in every case."""
+        """Return the candidates with a higher return than the new policy in every case."""
         return [each for each in candidates if (self.returns[each] > self.returns[new]).all()]
 
     def _clear(
@@ -442,7 +448,7 @@ class StartTest:
         return mean > 0 and mean > bar * error
 
     def _length(self, weights: tuple[float, ...]) -> float:
-        """Return the mean number of steps of the episodes with some weights; 0 before the first."""
+        """Return the mean number of steps of an episode with some weights; 0 before the first."""
         known = self.returns.get(weights)
         return 0.0 if known is None else self.steps[weights] / len(known)
 

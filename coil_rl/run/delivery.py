@@ -125,7 +125,7 @@ class Delivery:
         chosen = max(means, key=lambda name: means[name])
         cases = len(returns["last"])
         checkpoint.save(candidates[chosen], self.folder / "policy_best.pt")
-        self._report(chosen, returns, earlier)
+        self._report(chosen, means, returns, earlier)
         guides = [mean for name, mean in means.items() if name not in ("last", "earlier")]
         numbers = (
             means["last"],
@@ -201,7 +201,13 @@ class Delivery:
         for name, more in zip(policies, found, strict=True):
             returns[name] = torch.cat([returns.get(name, more.new_empty(0)), more])
 
-    def _report(self, chosen: str, returns: Mapping[str, Tensor], earlier: Path | None) -> None:
+    def _report(
+        self,
+        chosen: str,
+        means: Mapping[str, float],
+        returns: Mapping[str, Tensor],
+        earlier: Path | None,
+    ) -> None:
         """Write which policy is handed over, and why."""
         ahead = None
         if chosen != "last":
@@ -210,7 +216,7 @@ class Delivery:
             "policy": chosen,
             "cases": len(returns["last"]),
             "steps": self.cases.steps,
-            "returns": {name: float(values.mean()) for name, values in returns.items()},
+            "returns": means,
             "ahead": ahead,  # of the last policy: mean difference, with its 95 % t interval
             "frames": int(earlier.stem) if chosen == "earlier" and earlier is not None else None,
         }

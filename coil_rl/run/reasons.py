@@ -1,4 +1,4 @@
-"""Sentences that say why a run did what it did: its start test, and what it handed over."""
+"""Sentences on the tests of a run: which guide its policy holds, and what is handed over."""
 
 import json
 import math

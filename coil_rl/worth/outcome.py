@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from coil_rl.errors import file_of_a_run
 from coil_rl.files import LARGEST_NUMBERS, read_file
 from coil_rl.report.curves import points
 from coil_rl.report.runs import RETURN, Run, read_runs
@@ -124,11 +125,15 @@ def tuned_numbers(runs: Sequence[Run]) -> str:
         runs: of one arm; nothing is returned if they tuned nothing.
     """
     files = [run.folder / TUNED for run in runs]
-    found = [json.loads(read_file(file, LARGEST_NUMBERS)) for file in files if file.exists()]
-    names = found[0] if found else ()
-    return ", ".join(
-        f"{name} {' / '.join(f'{float(values[name]):.3g}' for values in found)}" for name in names
-    )
+    found: list[dict[str, float]] = []
+    for file in filter(Path.exists, files):
+        with file_of_a_run(file, "remove the folder of this training, and repeat the command"):
+            numbers = json.loads(read_file(file, LARGEST_NUMBERS))
+            found.append({str(name): float(value) for name, value in numbers.items()})
+    texts = []
+    for name in found[0] if found else ():
+        texts.append(f"{name} {' / '.join(f'{values[name]:.3g}' for values in found)}")
+    return ", ".join(texts)
 
 
 def _failures(tables: Sequence[pd.DataFrame]) -> float:

@@ -125,7 +125,7 @@ class Verdict:
     sentences: Sequence[str] = field(default_factory=tuple)
 
     def to_dict(self, command: str) -> dict[str, Any]:
-        """Return the verdict as a dictionary for a file; without a score of the guide it has None.
+        """Return the verdict as a dictionary that JSON can hold: a missing score is None.
 
         Args:
             command: that trains to the end what is recommended.
@@ -250,7 +250,7 @@ def _undecided(use: Entry, candidates: Sequence[Entry], least: float, failed: Se
 
 
 def _between_seeds(entry: Entry) -> float:
-    """Return how far the means of the seeds of an entry lie apart."""
+    """Return the difference between the best and the worst mean of a seed."""
     return float(np.ptp(entry.returns.mean(1)))
 
 

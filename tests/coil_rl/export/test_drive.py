@@ -21,7 +21,7 @@ from coil_rl.export import ExportedPolicy, drive, export_policy
 from coil_rl.run.parts import TEST
 
 SOURCE = Path(drive.__file__)
-LONGEST = 28  # statements besides imports
+LONGEST = 22  # statements besides imports
 
 
 def test_driver_is_short_and_needs_no_other_package():
@@ -32,8 +32,7 @@ def test_driver_is_short_and_needs_no_other_package():
             imported |= {alias.name for alias in node.names}
         if isinstance(node, ast.ImportFrom):
             imported.add(node.module)
-    packages = {name.partition(".")[0] for name in imported}
-    others = packages - sys.stdlib_module_names
+    others = {name for name in imported if name not in sys.stdlib_module_names}
     assert others == {"numpy", "onnxruntime"}
     left_out = (ast.Expr, ast.Import, ast.ImportFrom)  # docstrings and imports
     nodes = [node for node in ast.walk(tree) if isinstance(node, ast.stmt)]
@@ -48,24 +47,11 @@ def copied(folder):
     return module
 
 
-@pytest.mark.parametrize(
-    ("inputs", "message"),
-    [
-        ({"observation": [1.0, 2.0]}, "guide_action is missing; give"),
-        (
-            {"observation": [1.0, 2.0], "advice": [1.0]},
-            "guide_action is missing, advice is no input; give",
-        ),
-        ({"observation": [1.0, 2.0], "guide_action": [1.0], "reward": 0.0}, "reward is no input"),
-        ([1.0, 2.0], "observation is missing, guide_action is missing; give"),
-    ],
-)
-def test_inputs_that_the_contract_does_not_name_are_named(inputs, message, tmp_path):
+def test_input_that_is_missing_is_named(tmp_path):
     shutil.copy(SOURCE, write(tmp_path) / SOURCE.name)
     policy = copied(tmp_path).Policy()
-    with pytest.raises(ValueError, match=message) as caught:
-        policy.act(inputs)
-    assert str(caught.value).endswith("give a dictionary of observation, guide_action")
+    with pytest.raises(ValueError, match=r"guide_action must be \[1\] finite numbers"):
+        policy.act({"observation": [1.0, 2.0]})
     assert policy.act({"observation": [2.0, 3.0], "guide_action": [10.0]}) == 16.0
 
 
