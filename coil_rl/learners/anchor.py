@@ -60,7 +60,7 @@ class Anchor:
         choice_weight: of an advised option: 0 for none; with 1 the option has a probability of 0.9
             at first. In DQN the share of the range of the values that the advised action gains.
         share: of the frames of the run that the start test may take, and 1.6 times this share while
-            something is ahead in every case. Its first cases may take more.
+            something is ahead in every case, or for lower gains. Its first cases may take more.
         advice_key: entry with the advice, [*batch, n_guides, A].
 
     Raises:
@@ -295,8 +295,9 @@ class StartTest:
     until one passes, or the test would take more than its share of the frames; what is ahead in
     every case may take more.
 
-    Then lower gains of it are tried in further cases, if the share allows for them. One is taken if
-    it is better by more than a standard error than the best of the gains above it.
+    Then lower gains of it are tried in further cases. One is taken if it is better by more than a
+    standard error than the best of the gains above it, or, where the test would take more than its
+    share, by the number of standard errors with which a guide is held.
 
     Args:
         anchor: the settings.
@@ -373,7 +374,11 @@ class StartTest:
         for total in GAIN_CASES:
             more = total - done
             steps = more * sum(self._length(each) or length for each in tried)
-            if not self._affordable(steps):
+            if self._affordable(steps):
+                errors = GAIN_ERRORS
+            elif self._affordable(steps, PROMISING):
+                errors = BARS[total]
+            else:
                 break
             if done == 0:  # all gains are compared in the same new cases
                 del self.returns[held], self.steps[held]
@@ -381,7 +386,7 @@ class StartTest:
             self._act(tried)
             best = held
             for each in tried[1:]:
-                if self._clear(each, best, GAIN_ERRORS):
+                if self._clear(each, best, errors):
                     best = each
             done = total
         return best

@@ -225,6 +225,8 @@ def progress(finished: int, started: int, refused: int = 0) -> str:
     jobs = ""
     if refused:
         jobs = f" {refused} jobs of the sweeps were refused or failed, see failed_jobs.txt."
+    if finished == started == 1:
+        return f"The one run that was started is finished.{jobs}"
     if finished == started:
         return f"All {started} runs that were started are finished.{jobs}"
     return (

@@ -347,10 +347,28 @@ def test_two_equal_differences_are_not_enough():
 
 def test_lower_gains_are_not_tried_where_the_share_does_not_allow_for_them():
     cases = Returns(lambda weights: 100 - 60 * abs(weights[0] - 0.5) if weights[0] else 0)
-    cases.frames = 30_000
+    cases.frames = 18_000
     weights, numbers, _ = decided(None, cases=cases)
     assert weights == [1], "four cases of three gains would take 1,200 steps more"
     assert numbers["start/guide"] == pytest.approx(70, abs=2), "of the cases that there are"
+
+
+def test_lower_gains_beyond_the_share_must_pass_the_bars():
+    """Both lower gains are better by about three standard errors of four cases."""
+    taken = {}
+    for frames in (24_000, 200_000):
+        found = []
+        for seed in range(20):
+            cases = Returns(lambda weights: 100 + 0.4 * (weights[0] < 1) if weights[0] else 0)
+            cases.frames = frames
+            cases.generator.manual_seed(seed)
+            found.append(decided(None, cases=cases)[0] != [1])
+            assert cases.steps <= PROMISING * 0.05 * frames
+        taken[frames] = sum(found)
+    assert taken[24_000] <= 5
+    assert taken[200_000] >= 15
+    much_better = Returns(lambda weights: 130 - 60 * weights[0] if weights[0] else 0, frames=24_000)
+    assert decided(None, cases=much_better)[0] == [0.5]
 
 
 def test_lower_gain_is_taken_only_if_it_is_better():
