@@ -67,7 +67,7 @@ class Anchor:
         ValueError: for a value out of range.
     """
 
-    reach: float = 0.5
+    reach: float = 1.0
     gains: Sequence[float] = (0.75, 0.5)
     choice_weight: float = 0.5
     share: float = 0.05
