@@ -250,18 +250,20 @@ def test_envs_are_closed_in_their_processes(workers, tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_no_process_outlives_its_program() -> None:
+def test_no_process_outlives_its_program(tmp_path) -> None:
+    errors = tmp_path / "errors"
     kinds = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
     paths = os.pathsep.join(path for path in sys.path if path)
     parent = subprocess.Popen(
         [sys.executable, "-c", PROGRAM.format(tests=os.path.dirname(__file__), count=len(kinds))],
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        stderr=errors.open("w"),
         env=os.environ | {"PYTHONPATH": paths},
     )
     for kind in kinds:
         program, *workers = map(int, parent.stdout.readline().split())
         assert len(workers) == 2
+        assert _runs(program), errors.read_text()
         os.kill(program, kind)
         deadline = time.monotonic() + 10
         while any(map(_runs, [program, *workers])) and time.monotonic() < deadline:
