@@ -95,7 +95,8 @@ class TracedPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the `action`."""
-        entries = [tensordict[key] for key in self.in_keys]
+        # The traced operations are those for one layout in memory.
+        entries = [tensordict[key].contiguous() for key in self.in_keys]
         kind = exploration_type(), len(entries[0])
         if kind not in self.traced:
             self.traced[kind] = record(self._actions, entries)

@@ -70,6 +70,22 @@ def test_recorded_policy_acts_and_draws_like_the_policy(learner, kind):
     assert len(recorded.traced) == 1
 
 
+@pytest.mark.parametrize("choices", [False, True])
+@pytest.mark.parametrize("learner", ["ppo", "anchored"])
+def test_recorded_policy_takes_any_layout_in_memory(learner, choices):
+    env = cones(*([DiscreteActions()] if choices else []))
+    policy = MAKE[learner](env, KEYS).policy
+    rows = observations(env)
+    turned = rows.apply(lambda entry: entry.movedim(0, -1).contiguous().movedim(-1, 0))
+    assert not turned["guide_action"].is_contiguous() or not choices
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        expected = policy(rows.clone())["action"]
+        for each in ([rows, turned], [turned, rows]):
+            recorded = TracedPolicy(policy)
+            for part in each:
+                torch.testing.assert_close(recorded(part.copy())["action"], expected)
+
+
 @pytest.mark.parametrize("options", [{}, {"squash": False}, {"anchor": Anchor()}])
 def test_rows_of_a_partly_sampled_policy_are_those_of_the_policy_to_the_bit(options):
     env = cones()
