@@ -1,8 +1,10 @@
 """README.md: its files are there, its commands and its Python run, at toy size."""
 
+import csv
 import re
 import shlex
 import sys
+from collections import Counter
 
 import pytest
 from programs import ROOT, called
@@ -58,18 +60,40 @@ def test_commands_run_as_printed(folder):
         assert "guide" in done.stdout
 
 
-def test_numbers_of_the_table_are_those_of_the_page_that_it_names():
-    page = (ROOT / "docs" / "methods" / "coil_anchored.md").read_text()
-    rows = re.findall(
-        r"^\| (\w+) \| (\w+) \| \d+ \| ([-.\d]+) \| ([-.\d]+) \| ([-.\d]+)", page, re.M
-    )
-    measured = {(task, arm): [round(float(cell)) for cell in cells] for task, arm, *cells in rows}
-    names = {"MountainCarContinuous": "mountain_car", "Pendulum": "pendulum", "Acrobot": "acrobot"}
-    names |= {"CartPole, a poor rule": "cart_pole", "LunarLanderContinuous": "lunar_lander"}
-    for name, task in names.items():
+TASKS = {
+    "MountainCarContinuous": "mountain_car",
+    "Pendulum": "pendulum",
+    "LunarLanderContinuous": "lunar_lander",
+    "a car between cones": "cones",
+    "CartPole, a poor rule": "cart_pole",
+    "Acrobot": "acrobot",
+    "a microgrid with a battery": "energy_microgrid",
+}
+
+
+def test_numbers_of_the_table_are_those_of_the_benchmark():
+    with (ROOT / "docs" / "guide_benchmark" / "rows.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["method"] == "coil_anchored"]
+    measured = {(row["task"], row["arm"]): row for row in rows}
+    for name, task in TASKS.items():
         [cells] = re.findall(rf"^\| {name} \|(.*)\|$", README, flags=re.M)
-        alone, *pairs = cells.replace("*", "").split("|")
-        assert int(alone) == measured[task, "intact"][1]
+        alone, *pairs = cells.split("|")
+        check_number(alone, measured[task, "intact"]["ppo"])
         for arm, pair in zip(("intact", "reversed", "random"), pairs, strict=True):
-            guide, _, anchored = measured[task, arm]
-            assert [int(cell) for cell in pair.split(",")] == [guide, anchored], (task, arm)
+            row = measured[task, arm]
+            guide, end = pair.split(",")
+            check_number(guide, row["guide"])
+            check_number(end.strip("* "), row["end"])
+            mark = {"gain": "**", "loss": "*", "even": ""}[row["verdict"]]
+            assert end.strip() == f"{mark}{end.strip('* ')}{mark}", (task, arm)
+    verdicts = Counter(row["verdict"] for row in rows)
+    text = " ".join(README.split())
+    assert f"Of all {len(rows)} pairs of task and guide, {verdicts['gain']} are better" in text
+    assert f"{verdicts['even']} are not distinguishable" in text
+    assert f"and {verdicts['loss']} are worse" in text
+
+
+def check_number(shown, value):
+    """Check that a number of the README is a value, rounded to its last digit."""
+    digits = len(shown.strip().partition(".")[2])
+    assert float(shown) == round(float(value), digits)
