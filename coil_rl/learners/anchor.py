@@ -44,7 +44,8 @@ ADVISED = 0.9  # probability of the advised one of several options at a choice w
 # difference must exceed: quantiles of the t distribution, 0.5 % of one tail up to 8 cases, and 1 %
 # at the last. Two cases have no such quantile of use; theirs was chosen on eight tasks.
 BARS = {2: 20.0, 4: 5.8, 8: 3.5, 12: 2.7}
-PROMISING = 1.6  # shares that the start test may take while something is ahead in every case
+# Shares that the start test may take while something is ahead in every case, or for lower gains.
+PROMISING = 1.6
 GAIN_CASES = (4, 12)  # numbers of cases after which the comparison of gains may end
 GAIN_ERRORS = 1.0  # standard errors by which a lower gain must be better: any of them is usable
 

@@ -208,7 +208,14 @@ class Delivery:
         returns: Mapping[str, Tensor],
         earlier: Path | None,
     ) -> None:
-        """Write which policy is handed over, and why."""
+        """Write which policy is handed over, and why.
+
+        Args:
+            chosen: name of the policy that is handed over.
+            means: of the returns, by name.
+            returns: of each policy in each case, by name.
+            earlier: file of the best kept policy; None: there is none.
+        """
         ahead = None
         if chosen != "last":
             ahead = mean_interval((returns[chosen] - returns["last"]).tolist())
