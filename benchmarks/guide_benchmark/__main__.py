@@ -3,7 +3,8 @@
     python -m benchmarks.guide_benchmark outputs/experiments/guide_benchmark
 
 Each folder in it has the runs of one task. With `--add FILE` the rows join a table that exists; a
-row of the same task, method, arm and configuration is replaced.
+row of the same task, method, arm and configuration is replaced. The page that holds all tasks is
+then of the whole table.
 """
 
 import argparse
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.guide_benchmark.pages import write_all, write_task
-from benchmarks.guide_benchmark.rows import benchmark_rows, check_row, read_rows
+from benchmarks.guide_benchmark.rows import benchmark_rows, check_row, numbers_of, read_rows
 from coil_rl.errors import UserError
 from coil_rl.report import read_runs, write_csv
 from coil_rl.report.runs import failed_jobs
@@ -36,7 +37,7 @@ def added(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         check_row({name: str(value) for name, value in row.items()})
     if not file.exists():
         return list(rows)
-    known: list[dict[str, Any]] = [*read_rows(file)]
+    known: list[dict[str, Any]] = [numbers_of(row) for row in read_rows(file)]
     new = {tuple(row[name] for name in SAME) for row in rows}
     return [row for row in known if tuple(row[name] for name in SAME) not in new] + list(rows)
 
@@ -78,13 +79,12 @@ def main() -> None:
     pages = given.pages or given.folder / "pages"
     try:
         rows = measured(given.folder, pages)
-        table = added(given.add, rows) if given.add else []
+        table = added(given.add, rows) if given.add else rows
     except (ValueError, UserError, csv.Error) as error:
         parser.error(str(error))
-    write_csv(rows, pages / "rows.csv")
-    if given.add:
-        write_csv(table, given.add)
-    print(write_all(pages, rows))
+    for file in {pages / "rows.csv", given.add or pages / "rows.csv"}:
+        write_csv(table, file)
+    print(write_all(pages, table))
 
 
 if __name__ == "__main__":

@@ -135,7 +135,8 @@ def write_all(folder: Path, rows: Sequence[Row]) -> str:
         "Means are over tasks; score 0 is the random guide, score 1 the reference of the task."
     )
     tasks = sorted({row["task"] for row in rows})
-    lines.append("Tasks: " + ", ".join(f"[{task}]({task}.md)" for task in tasks) + ".")
+    pages = [f"[{task}]({task}.md)" if (folder / f"{task}.md").exists() else task for task in tasks]
+    lines.append("Tasks: " + ", ".join(pages) + ".")
     text = "\n\n".join(lines) + "\n"
     write_text(folder / "README.md", text)
     return text

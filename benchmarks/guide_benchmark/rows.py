@@ -257,6 +257,12 @@ def read_rows(file: Path) -> list[dict[str, str]]:
     return rows
 
 
+def numbers_of(row: Mapping[str, str]) -> dict[str, Any]:
+    """Return a checked row of a table with numbers in place of their text."""
+    numbers = {name: float(row[name]) for name in NUMBERS}
+    return {**row, **numbers, "seeds": int(row["seeds"])}
+
+
 def _check_numbers(
     place: str, row: Mapping[str, str], numbers: Mapping[str, float], reference: Reference
 ) -> None:

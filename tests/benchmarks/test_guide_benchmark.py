@@ -21,6 +21,7 @@ from benchmarks.guide_benchmark.rows import (
     check_row,
     effort,
     fingerprint,
+    read_rows,
     references,
 )
 from coil_rl.config.check import check_parts
@@ -192,6 +193,20 @@ def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, monke
     assert "Runs started: 3, finished: 3" in (tmp_path / "pendulum.md").read_text()
     assert (tmp_path / "all.png").exists()
     assert (tmp_path / "pendulum.webp").exists()
+
+
+def test_page_of_all_tasks_is_of_the_whole_table_that_rows_join(folder, tmp_path, monkeypatch):
+    file = tmp_path / "table.csv"
+    shutil.copyfile(ROWS, file)
+    pages = tmp_path / "pages"
+    words = ["guide_benchmark", str(folder), "--pages", str(pages), "--add", str(file)]
+    monkeypatch.setattr(sys, "argv", words)
+    program.main()
+    assert len(read_rows(file)) == len(read_rows(ROWS)) + 3
+    assert (pages / "rows.csv").read_bytes() == file.read_bytes()
+    page = (pages / "README.md").read_text()
+    assert "acrobot, cart_pole" in page  # without a page here
+    assert "[pendulum](pendulum.md)" in page
 
 
 @pytest.mark.parametrize(
