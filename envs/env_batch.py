@@ -20,10 +20,10 @@ from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
-from coil_rl.envs.gate import LIMIT, foreign
+from coil_rl.envs.gate import foreign
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.envs.seeded_env import SeededEnv
-from coil_rl.envs.step_limit import names_limit, warn_of_limit
+from coil_rl.envs.step_limit import limit_of, warn_of_limit
 
 SEEDS = 2**31  # seeds of drawn episodes are below
 REMEMBERED = 20_000  # steps; a longer episode is not repeated when a state is restored
@@ -333,7 +333,7 @@ class EnvBatch(SeededRows):
             raise ValueError(
                 f"{name} must have one action, it has {', '.join(map(str, one.action_keys))}"
             )
-        limit = None if names_limit(one) else LIMIT
+        limit = limit_of(one)
         super().__init__(
             [_EnvRow(env, number, limit) for number, env in enumerate(envs)],
             num_envs,

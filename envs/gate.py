@@ -15,14 +15,30 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
+from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-LIMIT = 1_000  # steps; of an episode of an env that names no limit of its own
+LIMIT = 1_000  # steps; of an episode of an env that has no wrapper which ends it
 # Attributes in which envs keep the largest number of steps of an episode themselves.
 OWN_LIMITS = ("max_steps", "max_episode_steps", "_max_episode_steps", "horizon")
+
+
+def limit_by_attributes(env: Any, names: Sequence[str] = OWN_LIMITS) -> int:
+    """Return the steps after which an episode is truncated if the env has not ended it.
+
+    An attribute may be another thing than it seems, such as the horizon of a predictive controller.
+    So it only makes the limit longer.
+
+    Args:
+        env: of any library.
+        names: of the attributes.
+    """
+    values = (getattr(env, name, None) for name in names)
+    numbers = [value for value in values if isinstance(value, Real) and math.isfinite(value)]
+    return max([LIMIT, *map(math.ceil, numbers)])
 
 
 class ForeignError(ValueError):
@@ -283,9 +299,9 @@ class EnvGate:
         if self.limit is None or self.steps < self.limit:
             return False
         warnings.warn(
-            f"the env {self.name} names no largest number of steps, and an episode did not end "
-            f"within {self.limit:,}: episodes are truncated there (env.max_steps=NUMBER sets "
-            "another limit)",
+            f"an episode of the env {self.name} did not end within {self.limit:,} steps, and no "
+            "TimeLimit ends it: episodes are truncated there (env.max_steps=NUMBER sets another "
+            "limit)",
             stacklevel=2,
         )
         return True

@@ -51,8 +51,9 @@ class GymnasiumEnv(SeededRows):
     `observation`, or one entry a key of a Dict space (nested as there; a Tuple has the keys "0",
     "1", ...). A Box is a tensor of `dtype`, but uint8 stays uint8; Discrete and MultiDiscrete are
     one-hot vectors of `dtype`, MultiBinary is one of 0 and 1; texts are left out. Actions are
-    bounded or unbounded for a Box (and clamped to its bounds), indices from 0 for Discrete [B],
-    MultiDiscrete [B, n] and a Box of a few whole numbers [B, n], and 0 or 1 for MultiBinary.
+    bounded or unbounded for a Box (and clamped to its bounds; a matrix is a vector), indices from 0
+    for Discrete [B], MultiDiscrete [B, n] and a Box of a few whole numbers [B, n], and 0 or 1 for
+    MultiBinary.
 
     A row whose episode is over stays as it is, with reward 0, until it is reset. A restored state
     goes on to the bit if the env is deterministic, see `SeededRows`. `rate` is the steps per second
@@ -161,6 +162,8 @@ class GymnasiumEnv(SeededRows):
         check_action_space(name, self.space)
         self.whole = has_whole_numbers(self.space)  # of the action: whole or real numbers
         self.real = isinstance(self.space, spaces.Box) and not self.whole
+        # The shape of an action as controllers give it, where it is a matrix.
+        self.own_shape = self.space.shape if self.real and len(self.space.shape) > 1 else None
         lowest = torch.as_tensor(lowest_choices(self.space)).reshape(-1)
         self.first_choices = lowest if lowest.any() else None  # the lowest numbers, if not 0
         self._declare_specs(name, makers, dtype)
@@ -283,8 +286,7 @@ class GymnasiumEnv(SeededRows):
                     "finite: the policy or its guide gave none"
                 )
             typed = actions.astype(self.space.dtype)
-            if not self.space.shape:
-                typed = typed[..., 0]
+            typed = typed.reshape(*actions.shape[:-1], *self.space.shape)
             return np.clip(typed, self.space.low, self.space.high)
         numbered = actions + lowest_choices(self.space)
         return numbered.astype(self.space.dtype) if self.whole else numbered

@@ -1,5 +1,6 @@
 """Rows of single Gymnasium envs, with controllers beside them."""
 
+import copy
 import inspect
 import pkgutil
 import warnings
@@ -16,18 +17,17 @@ from numpy.typing import NDArray
 
 from coil_rl.envs.env_batch import RowsInTurn
 from coil_rl.envs.gate import (
-    LIMIT,
-    OWN_LIMITS,
     EnvGate,
     ForeignError,
     acting,
     foreign,
+    limit_by_attributes,
     plain_array,
     predicts,
     shown,
 )
 from coil_rl.envs.gymnasium_makers import Env
-from coil_rl.envs.gymnasium_spaces import Entry, has_whole_numbers, leaves
+from coil_rl.envs.gymnasium_spaces import Entry, Fineness, has_whole_numbers, leaves
 from coil_rl.envs.workers import Entries
 
 MASKS = {"action_mask", "action_masks"}  # in info: which actions are possible
@@ -48,6 +48,7 @@ class Row:
 
     Attributes:
         entries: of the observation.
+        fineness: watch on the rewards of all rows.
         observation: the last one, as the env returned it.
         values: copies of its entries.
     """
@@ -64,6 +65,7 @@ class Row:
         self.make, self.makers, self.fresh = make, makers, fresh
         self.name, self.number, self.dtype = name, number, dtype
         self.entries: Sequence[Entry] = ()
+        self.fineness: Fineness | None = None  # of the rewards
         self.values: list[NDArray[Any]] = []
         self.advice: dict[str, NDArray[Any]] = {}
         self._open()
@@ -78,7 +80,7 @@ class Row:
             )
         with suppress(TypeError):  # an object without weak references
             _alive[id(env.unwrapped)] = env.unwrapped
-        limit = None if _has_limit(env) else LIMIT
+        limit = None if _has_limit(env) else limit_by_attributes(env.unwrapped)
         self.gate = EnvGate(env, self.name, self.number, self.dtype, limit)
         self.controllers = {
             name: controller_of(name, maker, env) for name, maker in self.makers.items()
@@ -118,6 +120,8 @@ class Row:
         self.observation, self.reward, self.terminated, self.truncated, self.info = self.gate.step(
             action
         )
+        if self.fineness is not None and self.fineness.unseen:
+            self.fineness.see(np.asarray(self.reward))
         self.values = self.gate.read(self.observation, self.entries)
         if not self.terminated:
             self._advise()
@@ -153,8 +157,10 @@ class Row:
 
     def _advise(self) -> None:
         for name, (act, _) in self.controllers.items():
+            # A copy, as the env may go on with the arrays that it returned.
+            observation = copy.deepcopy(self.observation)
             with foreign(f"the controller {name} beside {self.gate.place}", "it"):
-                advice = act(self.observation)
+                advice = act(observation)
             self.advice[name] = self._fitted(name, advice)
 
     def _fitted(self, name: str, advice: Any) -> NDArray[Any]:
@@ -185,6 +191,7 @@ class Rows(RowsInTurn):
         first = self.rows[0]
         self.like = first.gate.env if like is None else like
         self.entries = entries_of(first.name, self.like, first.dtype)
+        self.fineness = Fineness(f"the env {first.name}", "the reward", first.dtype)
         self._fit(first)
         self.extend(make_row, len(numbers), numbers[0])
 
@@ -202,7 +209,7 @@ class Rows(RowsInTurn):
             self.rows.append(row)
 
     def _fit(self, row: "Row") -> None:
-        row.entries = self.entries
+        row.entries, row.fineness = self.entries, self.fineness
         if row.gate.env is not self.like:
             _check_same_spaces(row.name, row.number, row.gate.env, self.like)
 
@@ -329,7 +336,7 @@ def controller_of(
 
 
 def _has_limit(env: Env) -> bool:
-    """Return whether an env names the largest number of steps of an episode."""
+    """Return whether something around an env ends an episode after a number of steps."""
     spec = getattr(env, "spec", None)
     if getattr(spec, "max_episode_steps", None):
         return True
@@ -338,7 +345,7 @@ def _has_limit(env: Env) -> bool:
         if isinstance(layer, gymnasium.wrappers.TimeLimit):
             return True
         layer = layer.env
-    return any(isinstance(getattr(layer, name, None), int) for name in OWN_LIMITS)
+    return False
 
 
 def entries_of(name: str, env: Env, floats: np.dtype[Any]) -> list[Entry]:

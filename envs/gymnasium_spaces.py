@@ -4,6 +4,7 @@ A guide or policy of this project reads tensors of numbers. So a choice becomes 
 and nested Dict and Tuple spaces become nested keys.
 """
 
+import math
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeGuard
@@ -29,6 +30,44 @@ WATCHED = 256  # first observations, in which the range of each number is found
 # A number whose range has fewer steps of its dtype than COARSE is rounded too much to act on; fewer
 # than STILL are the rounding of the env itself.
 COARSE, STILL = 100.0, 1e-6
+
+
+class Fineness:
+    """Watch on the first values of some numbers: whether they are too fine for their dtype.
+
+    Args:
+        place: where they come from, for the warning.
+        title: of the numbers, for the warning.
+        dtype: to which they are rounded.
+
+    Attributes:
+        unseen: how many values are still to be seen.
+    """
+
+    def __init__(self, place: str, title: str, dtype: np.dtype[Any]) -> None:
+        self.place, self.title, self.dtype = place, title, dtype
+        self.unseen = WATCHED if dtype.kind == "f" else 0
+
+    def see(self, value: NDArray[Any]) -> None:
+        """Note a value, and warn after the last one if a range has too few steps of the dtype."""
+        if self.unseen == WATCHED:
+            self.low = self.high = value.astype(np.float64)
+        self.low, self.high = np.minimum(self.low, value), np.maximum(self.high, value)
+        self.unseen -= 1
+        if self.unseen:
+            return
+        with np.errstate(all="ignore"):  # of numbers that are refused anyway
+            step = np.spacing(np.maximum(abs(self.low), abs(self.high)).astype(self.dtype))
+            count = ((self.high - self.low) / step).ravel()
+        for index in np.flatnonzero((count > STILL) & (count < COARSE))[:1]:
+            low, high = self.low.flat[index], self.high.flat[index]
+            which = f"number {index} of {self.title}" if self.low.ndim else self.title
+            warnings.warn(
+                f"{self.place}: {which} goes from {low} to {high}, but {self.dtype} has steps of "
+                f"{step.flat[index]:.2g} there, so little of it is seen: subtract its offset in a "
+                "wrapper",
+                stacklevel=2,
+            )
 
 
 class Entry:
@@ -71,7 +110,7 @@ class Entry:
                 "wrapper"
             )
         self.given = tuple(self.spec.shape)
-        self.id, self.unwatched = id, WATCHED
+        self.fineness = Fineness(f"the env {id}", self.title, self.dtype)
 
     def __call__(self, observation: Any) -> NDArray[Any]:
         """Return a copy of this entry of an observation, of the shape of `spec`.
@@ -100,8 +139,8 @@ class Entry:
         if value.dtype == self.dtype:
             converted = value.copy().reshape(self.given)
         else:
-            if self.unwatched and value.itemsize > self.dtype.itemsize:
-                self._watch(value)
+            if self.fineness.unseen and value.itemsize > self.dtype.itemsize:
+                self.fineness.see(value)
             with np.errstate(over="ignore"):
                 converted = value.astype(self.dtype).reshape(self.given)
         if converted.dtype.kind == "f" and not np.isfinite(converted).all():
@@ -130,26 +169,6 @@ class Entry:
             return None
         row, index = np.unravel_index(excess.argmax(), excess.shape)
         return int(index), float(numbers[row, index]), float(low[index]), float(high[index])
-
-    def _watch(self, value: NDArray[Any]) -> None:
-        """Warn after the first observations if their numbers are too fine for the dtype."""
-        if self.unwatched == WATCHED:
-            self.low = self.high = value.astype(np.float64)
-        self.low, self.high = np.minimum(self.low, value), np.maximum(self.high, value)
-        self.unwatched -= 1
-        if self.unwatched or self.dtype.kind != "f":
-            return
-        with np.errstate(all="ignore"):  # of numbers that are refused anyway
-            step = np.spacing(np.maximum(abs(self.low), abs(self.high)).astype(self.dtype))
-            count = ((self.high - self.low) / step).ravel()
-        for index in np.flatnonzero((count > STILL) & (count < COARSE))[:1]:
-            low, high = self.low.flat[index], self.high.flat[index]
-            warnings.warn(
-                f"the env {self.id}: number {index} of {self.title} goes from {low} to {high}, but "
-                f"{self.dtype} has steps of {step.flat[index]:.2g} there, so agent and guide see "
-                "little of it: subtract its offset in a wrapper",
-                stacklevel=2,
-            )
 
     def _is_single(self, value: NDArray[Any]) -> bool:
         """Return whether a value is one number, which may have a dimension of its own."""
@@ -242,7 +261,7 @@ def _whole_numbers(id: str, space: spaces.Box) -> TensorSpec:
 
 
 def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> TensorSpec:
-    """Return the spec of an action of one env.
+    """Return the spec of an action of one env; a matrix of real numbers is a vector.
 
     Args:
         id: of the env, for the `ValueError` about a space that is not supported.
@@ -252,7 +271,7 @@ def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> Tensor
     if has_whole_numbers(space):
         return _whole_numbers(id, space)
     if isinstance(space, spaces.Box):
-        shape = space.shape or (1,)
+        shape = (math.prod(space.shape),)
         if not (np.isfinite(space.low).any() or np.isfinite(space.high).any()):
             return Unbounded(shape, dtype=dtype)
         low, high = (

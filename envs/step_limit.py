@@ -1,19 +1,20 @@
-"""A largest number of steps for episodes of TorchRL envs that name none.
+"""A largest number of steps for episodes of TorchRL envs that nothing else ends.
 
 Without one, an env that never ends is evaluated for ever before the first update.
 """
 
 import warnings
+from numbers import Real
 from typing import Any
 
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
-from coil_rl.envs.gate import LIMIT, OWN_LIMITS
+from coil_rl.envs.gate import LIMIT, OWN_LIMITS, limit_by_attributes
 from coil_rl.envs.seeded_env import SeededEnv
 
-# Names of the largest number of steps, or of seconds, of an episode.
-NAMES = (*OWN_LIMITS, "episode_length", "time_limit")
+NAMES = (*OWN_LIMITS, "episode_length")  # of the largest number of steps of an episode
+SECONDS = "time_limit"  # name of the longest time of an episode
 
 
 class StepLimit(StepCounter):
@@ -52,42 +53,45 @@ def warn_of_limit(name: str, limit: int, remedy: str) -> None:
         remedy: how to set another limit.
     """
     warnings.warn(
-        f"the env {name} names no largest number of steps, and an episode did not end within "
-        f"{limit:,}: episodes are truncated there ({remedy})",
+        f"an episode of the env {name} did not end within {limit:,} steps, and no StepCounter "
+        f"ends it: episodes are truncated there ({remedy})",
         stacklevel=3,
     )
 
 
 def limits_of(env: EnvBase) -> list[StepLimit]:
-    """Return the transform that limits the episodes of a foreign env that names no limit.
+    """Return the transform that limits the episodes of a foreign env, if nothing else ends them.
 
     Args:
         env: of any batch size. The envs of coil-rl have limits of their own.
     """
-    if isinstance(_base(env), SeededEnv) or names_limit(env):
-        return []
-    return [StepLimit(type(_base(env)).__name__)]
+    limit = None if isinstance(_base(env), SeededEnv) else limit_of(env)
+    return [] if limit is None else [StepLimit(type(_base(env)).__name__, limit)]
 
 
-def names_limit(env: EnvBase) -> bool:
-    """Return whether an env names the largest number of steps of an episode.
+def limit_of(env: EnvBase) -> int | None:
+    """Return the steps after which an episode of an env is truncated; None if it ends by itself.
+
+    A StepCounter, a limit of Gymnasium and a `time_limit` in seconds are believed. Other attributes
+    make the limit longer, see `limit_by_attributes`.
 
     Args:
         env: it may have transforms, or be a wrapper of an env of another library.
     """
     if any(isinstance(part, StepCounter) and part.max_steps for part in env.modules()):
-        return True
+        return None
+    limit = LIMIT
     layer: Any = _base(env)
     for _ in range(100):  # layers of wrappers
-        numbers = [getattr(layer, name, None) for name in NAMES]
         spec = getattr(getattr(layer, "spec", None), "max_episode_steps", None)
-        if any(_is_number(number) for number in (*numbers, spec)):
-            return True
+        if _is_number(spec) or _is_number(getattr(layer, SECONDS, None)):
+            return None
+        limit = max(limit, limit_by_attributes(layer, NAMES))
         inside = getattr(layer, "_env", getattr(layer, "env", None))
         if inside is None:
-            return False
+            break
         layer = inside
-    return False
+    return limit
 
 
 def _base(env: EnvBase) -> EnvBase:
@@ -98,4 +102,4 @@ def _base(env: EnvBase) -> EnvBase:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    return isinstance(value, Real) and not isinstance(value, bool)

@@ -7,6 +7,7 @@ these kinds of actions.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import TypeVar
 
@@ -51,13 +52,20 @@ class ActionSpace:
             that are no choices, is a `ValueError`.
         batch_dims: number of batch dimensions of the env.
         first: lowest number of each choice, as controllers count them, [n]; None: 0.
+        own_shape: shape of an action as controllers give it; None: that of `spec`.
 
     Attributes:
         units: of its vectors, which are those of `spec`; None for choices.
     """
 
-    def __init__(self, spec: TensorSpec, batch_dims: int, first: Tensor | None = None) -> None:
-        self.spec = spec
+    def __init__(
+        self,
+        spec: TensorSpec,
+        batch_dims: int,
+        first: Tensor | None = None,
+        own_shape: Sequence[int] | None = None,
+    ) -> None:
+        self.spec, self.own_shape = spec, own_shape
         self.event = spec.shape[batch_dims:]
         self.continuous = spec.dtype.is_floating_point
         self.dtype = spec.dtype if self.continuous else torch.float32
@@ -138,6 +146,7 @@ class ActionSpace:
                 `ValueError`.
             batch: of the action.
         """
+        action = self._as_vector(action, batch)
         indices = self._indices(action, batch)
         vectors = action if indices is None else self._encoded(indices)
         return self.clamp(vectors.to(self.dtype))
@@ -151,6 +160,7 @@ class ActionSpace:
             action: of the guide.
             batch: of the action.
         """
+        action = self._as_vector(action, batch)
         indices = self._indices(action, batch)
         if not action.isfinite().all():
             raise ValueError("holds a number that is not finite")
@@ -189,6 +199,12 @@ class ActionSpace:
                 return number, row, str(error)
         return 0, rows[0], "does not fit the env"
 
+    def _as_vector(self, action: Tensor, batch: torch.Size) -> Tensor:
+        """Return a guide's action as a vector [*batch, A] if it has the shape of controllers."""
+        if self.own_shape is None or action.shape != (*batch, *self.own_shape):
+            return action
+        return action.reshape(*batch, self.size)
+
     def _indices(self, action: Tensor, batch: torch.Size) -> Tensor | None:
         """Return the choices of a guide as indices [*batch, *agents, n].
 
@@ -201,7 +217,8 @@ class ActionSpace:
         if (n and action.shape == (*lead, n)) or (n == 1 and action.shape == lead):
             indices = action.reshape(*lead, n)
             return indices if self.first is None else indices - self.first.to(indices)
-        raise ValueError(f"has the shape {list(action.shape)}, but must have {[*lead, self.size]}")
+        expected = [*lead, self.size] if self.own_shape is None else [*batch, *self.own_shape]
+        raise ValueError(f"has the shape {list(action.shape)}, but must have {expected}")
 
     def actions(self, vectors: Tensor) -> Tensor:
         """Convert vectors [*batch, *agents, A] to env actions; a discrete action is the argmax."""
@@ -272,6 +289,11 @@ class ActionTransform(Transform):
 def first_choices(env: EnvBase) -> Tensor | None:
     """Return the lowest number of each choice of an env, [n], if it has one and that is not 0."""
     return getattr(env, "first_choices", None)
+
+
+def own_shape(env: EnvBase) -> Sequence[int] | None:
+    """Return the shape of an action as controllers give it; None: that of the env's spec."""
+    return getattr(env, "own_shape", None)
 
 
 def random_action(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:

@@ -23,6 +23,7 @@ from coil_rl.transforms.action_space import (
     ActionTransform,
     first_choices,
     nested_key,
+    own_shape,
 )
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
 from coil_rl.transforms.normalised_action import ActionUnits
@@ -300,7 +301,10 @@ class GuideActions(ActionTransform):
         """Action space of the env without any transforms."""
         env = self.parent.base_env
         return ActionSpace(
-            env.full_action_spec[self.action_key], env.batch_dims, first_choices(env)
+            env.full_action_spec[self.action_key],
+            env.batch_dims,
+            first_choices(env),
+            own_shape(env),
         )
 
     @cached_property
@@ -309,7 +313,8 @@ class GuideActions(ActionTransform):
         if self.given_units is not None:
             return self.given_space
         space = self.action_space
-        return ActionSpace(space.spec, self.parent.batch_dims, self.given_space.first)
+        given = self.given_space
+        return ActionSpace(space.spec, self.parent.batch_dims, given.first, given.own_shape)
 
     @cached_property
     def rows(self) -> Tensor:

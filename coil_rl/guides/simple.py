@@ -163,6 +163,9 @@ class FollowAdvice(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         advice = tensordict[self.in_keys[0]]
-        guide = self.guide.expand(advice.shape[:-2])[..., None, None].expand_as(advice[..., :1, :])
+        lead = advice.shape[:-2]
+        # One for each row, whatever number of agents the row has.
+        guide = self.guide[(..., *(None,) * (len(lead) - self.guide.ndim))].expand(lead)
+        guide = guide[..., None, None].expand_as(advice[..., :1, :])
         chosen = advice.gather(-2, guide).squeeze(-2)
         return tensordict.set(self.out_keys[0], self.action_space.actions(chosen))

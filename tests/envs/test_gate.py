@@ -336,7 +336,7 @@ def ended(env, steps):
 
 def test_env_without_a_limit_gets_one_that_is_said():
     env = GymnasiumEnv(lambda: Plant(end=None), 2)
-    with pytest.warns(UserWarning, match=r"names no largest number of steps, .* within 1,000"):
+    with pytest.warns(UserWarning, match=r"did not end within 1,000 steps, and no TimeLimit"):
         assert ended(env, LIMIT + 5) == (LIMIT, True)
 
 
@@ -349,6 +349,16 @@ def test_limit_of_an_env_is_its_own():
         max_steps = 1010
 
     assert ended(GymnasiumEnv(lambda: Named(end=1010)), 1020) == (1010, True)
+
+
+@pytest.mark.parametrize(("steps", "expected"), [(10, LIMIT), (np.int64(1010), 1010)])
+def test_attribute_only_makes_the_limit_longer(steps, expected):
+    class Mistaken(Plant):
+        horizon = steps  # of a predictive controller
+
+    env = GymnasiumEnv(lambda: Mistaken(end=None))
+    with pytest.warns(UserWarning, match=rf"did not end within {expected:,} steps"):
+        assert ended(env, 1020) == (expected, True)
 
 
 def test_env_that_ignores_its_seed_is_noticed():

@@ -1,3 +1,4 @@
+import math
 import warnings
 from functools import partial
 
@@ -228,7 +229,7 @@ def test_spaces_become_entries():
     [
         (spaces.Box(-2.0, 3.0, (2,), np.float64), Bounded, (2,)),
         (spaces.Box(-1, 1, (), np.float32), Bounded, (1,)),
-        (spaces.Box(-np.inf, np.inf, (2, 2), np.float32), Unbounded, (2, 2)),
+        (spaces.Box(-np.inf, np.inf, (2, 2), np.float32), Unbounded, (4,)),
         (spaces.Discrete(3, start=5), Categorical, ()),
         (spaces.MultiDiscrete([2, 4]), MultiCategorical, (2,)),
         (spaces.MultiBinary(3), torch.int8, (3,)),
@@ -285,6 +286,65 @@ def test_numbers_too_fine_for_the_dtype_are_said(offset, step, coarse):
     found = [str(each.message) for each in said if "float32 has steps of" in str(each.message)]
     assert bool(found) == coarse
     assert not coarse or "number 0 of the observation goes from 5412345.67" in found[0]
+
+
+@pytest.mark.parametrize(("offset", "coarse"), [(1e8, True), (-1e6, True), (100.0, False)])
+def test_rewards_too_fine_for_the_dtype_are_said(offset, coarse):
+    class Offset(Place):
+        def step(self, action):
+            observation, *others = super().step(action)
+            return observation, offset + math.sin(self.place), *others[1:]
+
+    env = GymnasiumEnv(partial(Offset, 0.0, 0.1), num_envs=2, max_steps=1000)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        env.rollout(300, break_when_any_done=False)
+    found = [str(each.message) for each in said if "float32 has steps of" in str(each.message)]
+    assert bool(found) == coarse
+    assert not coarse or ": the reward goes from " in found[0]
+
+
+def test_controller_beside_an_env_gets_a_copy_of_its_observation():
+    class Own(Place):
+        def step(self, action):
+            _, *others = super().step(action)
+            self.state[:] = self.place
+            return self.state, *others
+
+        def reset(self, **options):
+            observation, info = super().reset(**options)
+            self.state = observation
+            return self.state, info
+
+    def careless(env, observation):
+        observation[:] = 7.0
+        return 0
+
+    env = GymnasiumEnv(partial(Own, 0.0, 0.5), controllers={"careless": careless})
+    seen = env.rollout(3)["next", "observation"]
+    assert seen.flatten().tolist() == [0.5, 1.0, 1.5]
+    assert env.rows[0].observation.tolist() == [1.5]
+
+
+def test_matrix_is_a_vector_of_which_controllers_give_the_matrix():
+    class Matrix(Place):
+        action_space = spaces.Box(-1, 1, (2, 3), np.float64)
+
+        def step(self, action):
+            self.received = action
+            return super().step(action)
+
+    def ones(env, observation):
+        return np.arange(6.0).reshape(2, 3) / 10
+
+    env = GymnasiumEnv(partial(Matrix, 0.0, 0.5), num_envs=2, controllers={"ones": ones})
+    data = env.reset()
+    assert env.action_spec.shape == (2, 6)
+    assert env.own_shape == (2, 3)
+    action = data["controller", "ones"]
+    assert action.shape == (2, 6)
+    env.step(data.set("action", action))
+    assert np.allclose(env.rows[1].gate.env.unwrapped.received, ones(None, None))
 
 
 @pytest.mark.parametrize(("name", "said"), [("success", False), ("sucess", True)])

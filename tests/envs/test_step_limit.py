@@ -9,7 +9,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper, StepCounter, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, EnvBatch, shipped_tracks
-from coil_rl.envs.step_limit import limits_of, names_limit
+from coil_rl.envs.step_limit import limit_of, limits_of
 from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.run.parts import EnvMaker
 
@@ -39,7 +39,7 @@ class Endless(EnvBase):
 
 
 class Named(Endless):
-    max_steps = 30
+    max_steps = 1010
 
 
 def stay(env):
@@ -50,7 +50,7 @@ def stay(env):
 def test_endless_env_is_truncated_and_says_so_once(make):
     env = EnvMaker(lambda rows, cases, count: make())(2)
     assert "limit_count" not in make().observation_spec
-    with pytest.warns(UserWarning, match="names no largest number of steps") as said:
+    with pytest.warns(UserWarning, match="did not end within 1,000 steps") as said:
         result = evaluate_policy(env, stay(env))
     assert [(row["steps"], row["reward"]) for row in result.episodes] == [(1000, 1000.0)] * 2
     assert "Endless" in str(said[0].message)
@@ -73,7 +73,6 @@ def test_rows_count_their_own_steps():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: Named(2),
         lambda: TransformedEnv(Endless(2), StepCounter(5)),
         lambda: GymWrapper(gymnasium.make("Pendulum-v1")),
         lambda: TransformedEnv(GymWrapper(gymnasium.make("Pendulum-v1"))),
@@ -81,8 +80,16 @@ def test_rows_count_their_own_steps():
 )
 def test_limit_that_an_env_names_is_left_to_it(make):
     env = make()
-    assert names_limit(env)
+    assert limit_of(env) is None
     assert not limits_of(env)
+
+
+def test_attribute_only_makes_the_limit_longer():
+    class Planner(Endless):
+        horizon = 10
+
+    assert [part.max_steps for part in limits_of(Named(2))] == [1010]
+    assert [part.max_steps for part in limits_of(Planner(2))] == [1000]
 
 
 def test_envs_of_the_project_are_left_as_they_are():

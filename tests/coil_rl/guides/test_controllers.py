@@ -2,17 +2,22 @@
 
 import importlib
 import textwrap
+from functools import partial
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
 from worlds import continued
 
+from coil_rl import GymnasiumEnv
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
-from coil_rl.guides import ControllerGuide, EntryGuide, PerRow, RecordedGuide
+from coil_rl.envs.gate import ForeignError
+from coil_rl.guides import ControllerGuide, EntryGuide, FollowAdvice, PerRow, RecordedGuide
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
@@ -240,6 +245,40 @@ def test_controller_that_cannot_be_used_is_refused_in_one_sentence(of, options, 
 def test_entries_that_a_controller_does_not_take_are_refused(of, message):
     with pytest.raises(ValueError, match=message):
         ControllerGuide(of, ["a", "b"])
+
+
+class Matrix(gymnasium.Env):
+    """Its action is a matrix, and its reward the sum of the first row."""
+
+    action_space = spaces.Box(-1, 1, (2, 3), np.float64)
+    observation_space = spaces.Box(-1, 1, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2), {}
+
+    def step(self, action):
+        return np.zeros(2), action[0].sum(), False, False, {}
+
+
+class GivesMatrix:
+    def __init__(self, shape=(2, 3)):
+        self.shape = shape
+
+    def act(self, observation):
+        return np.arange(6.0).reshape(self.shape) / 10
+
+
+def test_matrix_of_a_controller_is_the_matrix_that_the_env_gets():
+    env = TransformedEnv(GymnasiumEnv(Matrix, 2), GuideActions({"theirs": PerRow(GivesMatrix)}))
+    data = env.reset()
+    assert data["guide_action"].shape == (2, 1, 6)
+    for guide in (0, [0, 0]):
+        stepped = env.step(FollowAdvice(env, guide)(data.clone()))
+        assert stepped["next", "reward"].flatten().tolist() == pytest.approx([0.3, 0.3])
+    other = PerRow(partial(GivesMatrix, (3, 2)))
+    env = TransformedEnv(GymnasiumEnv(Matrix, 2), GuideActions({"theirs": other}))
+    with pytest.raises(ForeignError, match=r"has the shape \[3, 2\], but must have \[2, 3\]"):
+        env.reset()
 
 
 def test_entry_of_the_env_is_advice():
