@@ -170,6 +170,8 @@ def action_array(value: Any) -> NDArray[Any]:
             f"the action is the tuple {shown(value)}; return the action alone, without a state"
         )
     array = np.atleast_1d(plain_array(value, "the action"))
+    if array.dtype == np.bool_:
+        array = array.astype(np.int64)
     if not np.isfinite(array).all():
         raise ForeignError(f"the action is {shown(array)}, which is not finite")
     return array

@@ -277,6 +277,12 @@ def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> Tensor
         low, high = (
             torch.as_tensor(bound, dtype=dtype).reshape(shape) for bound in (space.low, space.high)
         )
+        for index in (low >= high).nonzero().flatten().tolist()[:1]:
+            raise ValueError(
+                f"number {index} of the action of {id} has the bounds {space.low.flat[index]} and "
+                f"{space.high.flat[index]}, which are equal in {dtype}: subtract the offset in a "
+                "wrapper"
+            )
         return Bounded(low, high, shape, dtype=dtype)
     if isinstance(space, spaces.Discrete):
         return Categorical(int(space.n), dtype=torch.int64)

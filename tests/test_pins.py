@@ -27,7 +27,8 @@ SMALL = [
 RUNS = {
     "ppo": ["method=ppo"],
     "coil": ["method=coil"],
-    "dagger": ["method=dagger", "learner.regressor.estimator.n_estimators=20"],
+    # Trees would choose other splits on another machine.
+    "dagger": ["method=dagger", "learner=linear"],
     "dynamic_coil_sequential": [
         "method=dynamic_coil_sequential",
         "guide=[spline,undertuned]",
@@ -39,8 +40,9 @@ RUNS = {
     ],
     "sac": ["method=coil", "learner=sac", "learner.starts=256", "learner.ratio=2"],
 }
-# relative; on one machine the numbers are the same to the bit, on another they round differently
-TOLERANCE = 1e-4
+# Relative. On one machine the numbers are the same to the bit; another one rounds differently,
+# which two trainings one after the other amplify to 2e-4.
+TOLERANCE = 1e-3
 
 
 def run(name: str, folder: Path) -> Path:

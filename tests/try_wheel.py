@@ -123,8 +123,10 @@ def main() -> int:
         folder = Path(name)
         wheel, unpacked = built(folder)
         print(f"in the sdist: {collected(unpacked, folder / 'of_sdist')}", flush=True)
-        tools = ["pytest", "hypothesis", "-c", str(ROOT / "constraints.txt")]
-        packages = [str(wheel)] if given.site else [f"{wheel}[{EXTRAS}]", *tools]
+        # A test builds a package, for which the setuptools of a new environment are too old.
+        tools = ["setuptools", "-c", str(ROOT / "constraints.txt")]
+        others_too = [f"{wheel}[{EXTRAS}]", "pytest", "hypothesis"]
+        packages = [*([str(wheel)] if given.site else others_too), *tools]
         python = environment(folder / "of_wheel", packages, given.site)
         bare = folder / "bare"
         shutil.copytree(ROOT / "tests", bare / "tests")

@@ -7,6 +7,7 @@ these kinds of actions.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TypeVar
@@ -35,6 +36,13 @@ Key = TypeVar("Key", NestedKey, NestedKey | None)
 def nested_key(key: Key) -> Key:
     """Return the key of an entry as TensorDict takes it; YAML has lists for tuples."""
     return key if key is None or isinstance(key, str) else unravel_key(tuple(key))
+
+
+def written_key(key: NestedKey) -> str:
+    """Return the key of an entry as YAML takes it, such as `[observation,"0"]`."""
+    if isinstance(key, str):
+        return key
+    return f"[{','.join(json.dumps(part) if part.isdigit() else part for part in key)}]"
 
 
 class ChoicesError(ValueError):

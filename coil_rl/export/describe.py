@@ -26,10 +26,11 @@ from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.normaliser import Normaliser
 from coil_rl.run.controller import Controller
 from coil_rl.run.delivery import GuideActs
-from coil_rl.run.reasons import handed_over
+from coil_rl.run.reasons import FIRST, delivered, handed_over
 from coil_rl.run.run import Run
 
 PACKAGES = ("coil-rl", "torch", "onnx", "onnxscript", "onnxruntime")
+LEARNED = "a learned policy"
 AS_GIVEN = "as the env gives it"
 EACH_EPISODE = (
     "In the first step of each episode every state input is its `first` value; afterwards it is "
@@ -123,6 +124,11 @@ def guide_itself(controller: Controller, step: PolicyStep) -> str | None:
 def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
     sentence = handed_over(run.folder) if run.file_of(which) == "best" else None
     method = run.settings.get("method") or {}
+    acts = LEARNED
+    if guide is not None:
+        acts = f"guide {guide} itself, not a learned policy"
+    elif run.file_of(which) == "best" and delivered(run.folder) == FIRST:
+        acts = "the first policy, which is its guide and has learned nothing"
     return {
         "label": run.label,
         "method": method.get("name", run.label),
@@ -130,7 +136,7 @@ def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
         "frames": run.budget.frames,
         "which": which,
         "chosen": sentence or f"the {run.file_of(which)} policy of the training",
-        "acts": "a learned policy" if guide is None else f"guide {guide} itself, no learned policy",
+        "acts": acts,
         "actions": "deterministic",
     }
 

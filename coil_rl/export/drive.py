@@ -30,10 +30,14 @@ class Policy:
         """Return the action for the inputs of the contract, by name."""
         feeds = dict(self.state)
         for entry in self.contract["inputs"]:
-            value = np.asarray(inputs.get(entry["name"], ()), entry["dtype"])
-            if [*value.shape] != entry["shape"] or not np.isfinite(value).all():
+            given = np.asarray(inputs.get(entry["name"], ()))
+            if [*given.shape] != entry["shape"] or not np.isfinite(given).all():
                 raise ValueError(f"{entry['name']} must be {entry['shape']} finite numbers")
-            feeds[entry["name"]] = value[None]
+            places = given - np.array(entry.get("lowest", given))
+            if not ((places >= 0) & (places % 1 == 0) & (places < entry.get("choices", 1))).all():
+                counts = f"{entry['choices']} from {entry['lowest']} on"
+                raise ValueError(f"{entry['name']} must be numbers of choices, {counts}")
+            feeds[entry["name"]] = given[None].astype(entry["dtype"])
         names = ["action", *(each["output"] for each in self.contract["state"])]
         action, *state = self.session.run(names, {name: feeds[name] for name in self.read})
         self.state = dict(zip(self.state, state, strict=True))

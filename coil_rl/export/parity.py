@@ -3,8 +3,9 @@
 Differences are in normalised actions, so that 1 is half of the range of a number; another choice
 counts as 1. They may be at most `LIMIT`, with a guide inside `WITH_GUIDE`. A guide may amplify the
 rounding of what it reads: the spline through two midpoints that nearly coincide does so by a
-thousand. There a difference may be larger by what a change of the inputs by `ROUNDING` of their
-value, which no sensor resolves, does to the controller's own action.
+thousand. There a difference may be larger by twice what a change of the inputs by `ROUNDING` of
+their value, which no sensor resolves, does to the controller's own action: torch and the file each
+round.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ def compare(
     allowed = torch.full_like(differences, limit)
     beyond = (differences > limit).nonzero().flatten().tolist()
     if beyond:
-        allowed[beyond] += _rounding(step, [rows[number] for number in beyond])
+        allowed[beyond] += 2 * _rounding(step, [rows[number] for number in beyond])
     worst = int((differences - allowed).argmax())
     if not bool((differences <= allowed).all()):
         raise NotExportableError(

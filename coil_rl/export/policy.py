@@ -205,7 +205,25 @@ def _row(value: Any, entry: Mapping[str, Any]) -> NDArray[Any]:
         raise ValueError(f"{entry['name']} holds {given.dtype}, but must hold numbers")
     if not np.isfinite(given).all():
         raise ValueError(f"{entry['name']} holds a number that is not finite")
+    if "choices" in entry:
+        _check_choices(given.reshape(shape), entry)
     return given.astype(entry["dtype"]).reshape(1, *shape)
+
+
+def _check_choices(given: NDArray[Any], entry: Mapping[str, Any]) -> None:
+    """Raise a `ValueError` for what are no numbers of choices, as the env counts them.
+
+    Args:
+        given: [..., n].
+        entry: of the contract.
+    """
+    places = given - np.array(entry["lowest"])
+    fits = (places >= 0) & (places % 1 == 0) & (places < np.array(entry["choices"]))
+    if not fits.all():
+        raise ValueError(
+            f"{entry['name']} is {given.tolist()}, which are no choices of {entry['choices']} from "
+            f"{entry['lowest']} on"
+        )
 
 
 def _fits(given: tuple[int, ...], shape: tuple[int, ...]) -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
 from coil_rl.export.contract import CONTRACT, DRIVER, ONNX, TORCH
-from coil_rl.export.describe import describe, guide_itself
+from coil_rl.export.describe import LEARNED, describe
 from coil_rl.export.files import as_onnx, as_torch, traced
 from coil_rl.export.parity import LIMIT, WITH_GUIDE, Parity, compare, expected
 from coil_rl.export.policy import ExportedPolicy
@@ -89,24 +89,26 @@ def export_policy(
     )
     _save(Path(folder), contents, contract)
     say(f"export: {parity}")
-    _say_if_guide(run, guide_itself(controller, step), outside)
+    if run.make_learner is not None:
+        _say_if_not_learned(contract["policy"]["acts"], outside)
     return ExportedPolicy(folder)
 
 
-def _say_if_guide(run: Run, guide: str | None, outside: str | None) -> None:
-    """Say that a run with a learned policy has handed over its guide instead.
+def _say_if_not_learned(acts: str, outside: str | None) -> None:
+    """Say that a run with a learned policy has handed over another one.
 
     Args:
-        run: of the policy.
-        guide: that acts; None: a policy does.
+        acts: what is exported, as in the contract.
         outside: why the guides are outside; None if they are not.
     """
-    if guide is None or run.make_learner is None:
+    if acts == LEARNED:
         return
-    passed = "" if outside is None else ", and its file only passes guide_action on"
+    passed = ""
+    if outside is not None and acts.startswith("guide "):
+        passed = ", and its file only passes guide_action on"
     say(
-        f"export: what the run handed over is guide {guide} itself, not a learned policy{passed}; "
-        'policy=last exports the last learned policy, which="last" in Python'
+        f"export: what the run handed over is {acts}{passed}; policy=last exports the last learned "
+        'policy, which="last" in Python'
     )
 
 

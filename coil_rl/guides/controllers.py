@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, is_tensor_collection, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
 from torchrl.data import Unbounded
@@ -31,7 +31,7 @@ from coil_rl.envs.gate import ForeignError, Predictor, action_array, foreign, pr
 from coil_rl.errors import did_you_mean
 from coil_rl.files import LARGEST_TABLE, read_text
 from coil_rl.guides.functions import FunctionGuide
-from coil_rl.transforms.action_space import ActionSpace, nested_key
+from coil_rl.transforms.action_space import ActionSpace, nested_key, written_key
 
 # Other minus signs, as text programs write them: hyphens, the sign itself, and dashes.
 MINUS = str.maketrans(dict.fromkeys("\u2010\u2011\u2212\u2013\u2014\ufe63\uff0d", "-"))
@@ -90,6 +90,9 @@ class PerRow(TensorDictModuleBase):
         flat = tensordict.reshape(-1)
         rows, starts = (flat[key].flatten().tolist() for key in ("row", "is_init"))
         self.asked = rows
+        for key in self.read:
+            if is_tensor_collection(flat[key]):
+                raise ForeignError(_parts_of(key, flat[key]))
         observations = zip(*(flat[key].cpu().numpy().copy() for key in self.read), strict=True)
         actions: list[NDArray[Any]] = []
         for row, start, observed in zip(rows, starts, observations, strict=True):
@@ -336,6 +339,21 @@ def _mapped(convert: Callable[[Any], Any], kind: type, value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(_mapped(convert, kind, part) for part in value)
     return convert(value) if isinstance(value, kind) else value
+
+
+def _parts_of(key: NestedKey, entry: TensorDictBase) -> str:
+    """Return the sentence about an entry that is several ones.
+
+    Args:
+        key: of the entry.
+        entry: the entries inside it.
+    """
+    inner = entry.keys(include_nested=True, leaves_only=True)
+    names = [written_key(unravel_key((key, part))) for part in inner]
+    return (
+        f"{written_key(key)} is not one entry but several; name those that the controller reads by "
+        f"in_keys=[{','.join(names)}]"
+    )
 
 
 def _in_space(entry: NDArray[Any], space: Any) -> Any:

@@ -17,8 +17,10 @@ from torchrl.modules import MLP, ConvNet
 
 from coil_rl.envs.limits import check_choice, check_range
 from coil_rl.learners.activations import ACTIVATIONS, ORTHOGONAL
+from coil_rl.transforms.action_space import written_key
 
 Shapes = Mapping[NestedKey, torch.Size]
+ADDED = ("episode_reward", "task_reward", "limit_count")  # entries that no env has by itself
 STATE = "policy_state"  # what an env carries for a network with a memory
 
 
@@ -34,10 +36,8 @@ def entry_specs(
     available = [*spec.keys(True, True), *extra]
     missing = [key for key in in_keys if key not in available]
     if missing:
-        names = [
-            ", ".join(key if isinstance(key, str) else "/".join(key) for key in keys)
-            for keys in (missing, available)
-        ]
+        own = [key for key in available if key not in ADDED]
+        names = [", ".join(map(written_key, keys)) for keys in (missing, own)]
         raise KeyError(
             f"the env has no entry {names[0]} to observe; it has {names[1]}: name "
             "some of them by observes=[ENTRY,...], from Python by in_keys"

@@ -11,10 +11,12 @@ from coil_rl.learners.anchor import StartTest
 from coil_rl.report.runs import DELIVERY
 from coil_rl.report.table import return_format
 
+REMEDY = "remove it, and the sentence is left out"  # for the file of the test at the end
+FIRST = "first"  # policy of a run that holds its guide
 POLICIES = {
     "last": "the last policy",
     "earlier": "an earlier policy",
-    "first": "the first policy",
+    FIRST: "the first policy",
     "tuned": "the tuned guide",
     "best_candidate": "the best candidate",
 }
@@ -49,8 +51,10 @@ def start_test(row: Mapping[str, float]) -> str | None:
     return f"Start test, mean returns in {cases:.0f} new cases: {listed}. {outcome}"
 
 
-def handed_over(folder: Path) -> str | None:
-    """Return the sentence that says what a run handed over and why; None without a test.
+def delivered(folder: Path) -> str | None:
+    """Return the name of what a run handed over, such as "last" or that of a guide.
+
+    It is None without a test.
 
     Args:
         folder: of the run.
@@ -61,10 +65,27 @@ def handed_over(folder: Path) -> str | None:
     file = folder / DELIVERY
     if not file.exists():
         return None
-    with file_of_a_run(file, "remove it, and the sentence is left out"):
+    with file_of_a_run(file, REMEDY):
+        return str(json.loads(read_file(file, LARGEST_NUMBERS))["policy"])
+
+
+def handed_over(folder: Path) -> str | None:
+    """Return the sentence that says what a run handed over and why; None without a test.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        UserError: if the file is damaged.
+    """
+    chosen = delivered(folder)
+    if chosen is None:
+        return None
+    file = folder / DELIVERY
+    with file_of_a_run(file, REMEDY):
         report = json.loads(read_file(file, LARGEST_NUMBERS))
         returns = {str(name): float(value) for name, value in report["returns"].items()}
-        chosen, cases, frames = str(report["policy"]), int(report["cases"]), report["frames"]
+        cases, frames = int(report["cases"]), report["frames"]
         ahead = [float(value) for value in report.get("ahead") or ()]
     names = dict(POLICIES)
     if frames is not None:
@@ -72,6 +93,8 @@ def handed_over(folder: Path) -> str | None:
     spec = return_format(returns.values())
     listed = ", ".join(f"{names.get(name, name)} {value:{spec}}" for name, value in returns.items())
     title = names.get(chosen, f"the {chosen} itself, and nothing that was learned")
+    if chosen == FIRST:
+        title += ", which is its guide and has learned nothing"
     sentence = (
         f"Handed over is {title}: mean returns in {cases} new cases of the training, whose steps "
         f"are among its frames: {listed}"

@@ -65,7 +65,9 @@ def test_guide_is_deterministic_and_advises_another_agent(run):
         *TINY, "method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
     )
     step = env_maker(config)().rollout(5, break_when_any_done=False)[:, -1]
-    assert torch.equal(step["guide_action"][:, 0], guide(step.clone())["action"])
+    # Not to the bit: some processors round other numbers of rows differently.
+    expected = guide(step.clone())["action"]
+    torch.testing.assert_close(step["guide_action"][:, 0], expected, atol=1e-6, rtol=0)
 
 
 def test_run_without_an_agent_is_refused(tmp_path):

@@ -21,7 +21,7 @@ from coil_rl.export import ExportedPolicy, drive, export_policy
 from coil_rl.run.parts import TEST
 
 SOURCE = Path(drive.__file__)
-LONGEST = 22  # statements besides imports
+LONGEST = 26  # statements besides imports
 
 
 def test_driver_is_short_and_needs_no_other_package():
@@ -53,6 +53,20 @@ def test_input_that_is_missing_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"guide_action must be \[1\] finite numbers"):
         policy.act({"observation": [1.0, 2.0]})
     assert policy.act({"observation": [2.0, 3.0], "guide_action": [10.0]}) == 16.0
+
+
+@pytest.mark.parametrize("wrong", [[0], [5], [2.5]])
+def test_advice_that_is_no_choice_is_refused(wrong, tmp_path):
+    def choices(contract):
+        contract["inputs"][-1] |= {"choices": [3], "lowest": [2]}
+
+    shutil.copy(SOURCE, write(tmp_path, choices) / SOURCE.name)
+    driver, policy = copied(tmp_path).Policy(), ExportedPolicy(tmp_path)
+    assert driver.act({"observation": [2.0, 3.0], "guide_action": [4.0]}) == 10.0
+    with pytest.raises(ValueError, match=r"numbers of choices, \[3\] from \[2\] on"):
+        driver.act({"observation": [2.0, 3.0], "guide_action": wrong})
+    with pytest.raises(ValueError, match=r"no choices of \[3\] from \[2\] on"):
+        policy.act([2.0, 3.0], wrong)
 
 
 def driven(env, act, most):

@@ -98,3 +98,6 @@ def test_advice_of_choices_is_given_in_the_numbers_of_the_env(tmp_path):
         observation = OBSERVATIONS.sample()
         own = controller.act(observation)
         np.testing.assert_array_equal(policy.act(observation, [[0, 0]]), own)
+    for wrong in ([[0, 2]], [[-1, 0]], [[0.5, 0]]):
+        with pytest.raises(ValueError, match=r"no choices of \[3, 2\] from \[0, 0\] on"):
+            policy.act(observation, wrong)

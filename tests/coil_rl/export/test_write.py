@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -94,10 +95,23 @@ def test_guide_that_was_handed_over_is_said_to_be_no_policy(guide, tmp_path, cap
     assert "what the run handed over is guide controller itself, not a learned policy" in said
     assert ("its file only passes guide_action on" in said) == (guide == "PI")
     assert "policy=last exports the last learned policy" in said
-    assert policy.contract["policy"]["acts"] == "guide controller itself, no learned policy"
+    assert policy.contract["policy"]["acts"] == "guide controller itself, not a learned policy"
     last = coil_rl.export_policy(run, tmp_path / "last", which="last", observations=OBSERVATIONS)
     assert last.contract["policy"]["acts"] == "a learned policy"
     assert "itself" not in capsys.readouterr().out
+
+
+def test_first_policy_that_was_handed_over_is_said_to_have_learned_nothing(tmp_path, capsys):
+    folder = learned(tmp_path / "run", "coil_anchored", guide="thermostat.control:proportional")
+    report = json.loads((folder / "delivery.json").read_text())
+    (folder / "delivery.json").write_text(json.dumps(report | {"policy": "first"}))
+    shutil.copy(folder / "policy_last.pt", folder / "policy_best.pt")
+    run = coil_rl.open_run(folder)
+    policy = coil_rl.export_policy(run, tmp_path / "exported", observations=OBSERVATIONS)
+    said = "the first policy, which is its guide and has learned nothing"
+    assert policy.contract["policy"]["acts"] == said
+    assert f"Handed over is {said}" in policy.contract["policy"]["chosen"]
+    assert f"what the run handed over is {said}; policy=last" in capsys.readouterr().out
 
 
 @pytest.mark.slow
