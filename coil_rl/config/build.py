@@ -16,6 +16,7 @@ from coil_rl.config.logger import make_logger
 from coil_rl.config.measured import complete_measures
 from coil_rl.config.nodes import build, build_all, find_target
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune, with_tuned
+from coil_rl.config.pretrained import run_folder
 from coil_rl.config.saved import identity, settings
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
@@ -75,7 +76,7 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         logger=partial(make_logger, config.logger) if config.logger else None,
         callbacks=guide_returns,
         prepare=partial(distil, config, folder) if trains else lambda: 0,
-        init=Path(config.init).expanduser() if config.init else None,
+        init=run_folder(config.init) if config.init else None,
         delivery=config.delivery,
         which=config.evaluation.policy,
         fallback=config.evaluation.fallback,

@@ -26,6 +26,7 @@ from coil_rl.config.logger import check_logger
 from coil_rl.config.nodes import build as build_node
 from coil_rl.config.nodes import build_all, check_node
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
+from coil_rl.config.pretrained import run_folder
 from coil_rl.config.replay import check_recordings_to_leave_out, check_replay
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.values import check_values
@@ -310,7 +311,7 @@ def _check_init(config: DictConfig, learner: Learner) -> None:
     """Raise a `UserError` if the run begins with the policy of another one that does not fit."""
     if not config.init or (Path(config.run_dir) / INIT).exists():  # it has begun already
         return
-    path = weights_file(Path(config.init).expanduser())
+    path = weights_file(run_folder(config.init))
     state = checkpoint.load(path)
     try:
         learner.policy.load_state_dict(state)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, ListConfig
 
+from coil_rl.config.pretrained import PREFIX
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.programs import app
 
@@ -34,7 +35,7 @@ def report(config: DictConfig) -> None:
     from coil_rl.files import write_text
     from coil_rl.report import page, write_csv
     from coil_rl.report.comparison import compare
-    from coil_rl.report.configurations import distinguish
+    from coil_rl.report.configurations import distinguish, of_several_envs
     from coil_rl.report.figures import draw_report
     from coil_rl.report.html import Section, html_page
     from coil_rl.report.runs import failed_jobs, read_runs
@@ -59,6 +60,7 @@ def report(config: DictConfig) -> None:
     notes = [
         page.notes(against, compared),
         *page.handed_over(finished),
+        *of_several_envs(finished),
         *differences,
         page.progress(len(finished), len(runs), failed_jobs(folders)),
     ]
@@ -112,6 +114,12 @@ def _folders(config: DictConfig) -> list[Path]:
         raise UserError(
             f"folder={config.folder} must be a folder, or a list of them: folder=[ONE,OTHER]"
         )
+    for folder in given:
+        if folder.startswith(PREFIX):
+            raise UserError(
+                f"folder={folder}: a report is about folders with runs; evaluate a shipped policy "
+                f"by coil-evaluate run={folder}"
+            )
     return [Path(folder).expanduser() for folder in given]
 
 

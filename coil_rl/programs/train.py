@@ -7,6 +7,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from coil_rl.config.pretrained import PREFIX
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
@@ -107,7 +108,13 @@ def resume_from_command_line(resumed: str, others: Sequence[str]) -> None:
     given = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.from_dotlist(list(others)))
     trust_packages(given.trust)
     lengthens = any(argument.startswith("budget.frames=") for argument in others)
-    folder = folders.folder(resumed.removeprefix("resume="))
+    name = resumed.removeprefix("resume=")
+    if name.startswith(PREFIX):
+        raise UserError(
+            f"{resumed}: a shipped policy has no training that could go on; begin a run with it by "
+            f"init={name}"
+        )
+    folder = folders.folder(name)
     resume(folder, given.budget.frames if lengthens else None)
 
 

@@ -45,6 +45,7 @@ def distinguish(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
         keys = differing([runs[index] for index in of_label])
         if not keys:
             continue
+        keys = _telling_first(keys, [relevant(runs[index]) for index in of_label])
         names = ", ".join(keys[:MOST_KEYS]) + (" and others" if len(keys) > MOST_KEYS else "")
         sentences.append(
             f"The runs of {label} differ in {names}, so they are not means of one another."
@@ -59,6 +60,41 @@ def distinguish(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
                 shown = f"{number}: {shown}, ..."
             distinguished[index] = _relabelled(run, f"{label} ({shown})")
     return distinguished, sentences
+
+
+def of_several_envs(runs: Sequence[Run]) -> list[str]:
+    """Return the sentence about runs in different envs, whose rewards are no comparison.
+
+    Args:
+        runs: finished runs.
+    """
+    nodes = [run.settings.get("env") or {} for run in runs]
+    names = list(dict.fromkeys(str(node.get("id") or node.get("_target_")) for node in nodes))
+    if len(names) < 2:
+        return []
+    return [
+        f"The runs are in {len(names)} envs ({', '.join(map(_text, names))}): compare those of one "
+        "env only."
+    ]
+
+
+def _telling_first(keys: Sequence[str], configurations: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return keys with those first whose values tell the most configurations apart.
+
+    Args:
+        keys: in which the configurations differ.
+        configurations: values by key.
+    """
+    texts = {key: [str(values.get(key)) for values in configurations] for key in keys}
+    first: list[str] = []
+    while len(first) < min(MOST_KEYS, len(keys)):
+        groups = {
+            key: len(set(zip(*(texts[each] for each in (*first, key)), strict=True)))
+            for key in keys
+            if key not in first
+        }
+        first.append(max(groups, key=lambda key: groups[key]))  # the first one of the best
+    return [*first, *(key for key in keys if key not in first)]
 
 
 def differing(runs: Sequence[Run]) -> list[str]:

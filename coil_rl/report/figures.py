@@ -12,13 +12,13 @@ from coil_rl.report import style
 from coil_rl.report.comparison import Comparison
 from coil_rl.report.curves import draw_curve_grid, draw_learning_curves
 from coil_rl.report.guide_use import draw_guide_use, guide_use
-from coil_rl.report.html import Figure, svg, webp
+from coil_rl.report.html import Figure, moving, svg
 from coil_rl.report.intervals import draw_intervals, driver_intervals
 from coil_rl.report.runs import RESTORE, Run
 
 MAX_CURVES = 8  # in one plot
-FILM = "episode.webp"
-LARGEST_FILM = 1_000_000  # bytes
+FILMS = ("episode.webp", "lines.gif")
+LARGEST_FILM = 2_000_000  # bytes
 MAX_FILMS = 8  # on a page
 
 Draw = Callable[[style.Target], None]
@@ -113,15 +113,16 @@ def films(runs: Sequence[Run]) -> list[Figure]:
         runs: finished runs.
 
     Raises:
-        UserError: for a file that is no WebP picture, or too large.
+        UserError: for a file that is no WebP or GIF picture, or too large.
     """
     found: dict[str, Figure] = {}
     for run in runs:
-        path = run.folder / FILM
-        if run.label in found or len(found) == MAX_FILMS or not path.exists():
+        paths = [run.folder / name for name in FILMS if (run.folder / name).exists()]
+        if run.label in found or len(found) == MAX_FILMS or not paths:
             continue
-        with file_of_a_run(path, RESTORE):
-            image = webp(read_file(path, LARGEST_FILM))
-        caption = f"The first case of the evaluation, seed {run.seed}."
+        with file_of_a_run(paths[0], RESTORE):
+            image = moving(read_file(paths[0], LARGEST_FILM))
+        what = "The first case" if paths[0].name == FILMS[0] else "The cases"
+        caption = f"{what} of the evaluation, seed {run.seed}."
         found[run.label] = Figure(f"Film of {run.label}", image, caption)
     return list(found.values())

@@ -58,7 +58,7 @@ class Figure:
 
     Args:
         title: above it.
-        image: an SVG for the page itself, from `svg`, or a `data:` address, from `webp`.
+        image: an SVG for the page itself, from `svg`, or a `data:` address, from `moving`.
         caption: below it.
     """
 
@@ -109,15 +109,19 @@ def svg(draw: Callable[[io.BytesIO], None]) -> Markup:
     return Markup(text)
 
 
-def webp(content: bytes) -> str:
-    """Return a WebP picture as a `data:` address.
+def moving(content: bytes) -> str:
+    """Return a moving picture as a `data:` address.
 
     Args:
         content: of the file.
 
     Raises:
-        ValueError: for anything but a WebP picture.
+        ValueError: for anything but a WebP or GIF picture.
     """
-    if content[:4] != b"RIFF" or content[8:12] != b"WEBP":
-        raise ValueError("no WebP picture")
-    return f"data:image/webp;base64,{base64.b64encode(content).decode()}"
+    if content[:4] == b"RIFF" and content[8:12] == b"WEBP":
+        kind = "webp"
+    elif content[:6] == b"GIF89a":
+        kind = "gif"
+    else:
+        raise ValueError("no WebP or GIF picture")
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

@@ -7,7 +7,7 @@ import io
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import chain, cycle
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,17 +33,10 @@ RIGHT_CONE = "#1f6fd6"
 
 # After Okabe and Ito and after Tol, without the colours of the cones, the strongest first.
 AGENTS = ("#d55e00", "#009e73", "#aa3377", "#56b4e9", "#332288")
-# Of the methods that are compared most often, so that their colour is the same in all pictures.
-OWN = {
-    "coil": AGENTS[0],
-    "coil_anchored": AGENTS[1],
-    "residual": AGENTS[2],
-    "ppo": AGENTS[3],
-    "kickstart": AGENTS[4],
-}
 GUIDES = ("#4d4d4d", "#8a8a8a")
 DASHED = (0.0, (3.2, 1.6))
 SECOND_ROUND = (0.0, (6.0, 1.2))  # of a colour that is used again
+LATER_ROUNDS = (SECOND_ROUND, (0.0, (1.2, 1.2)), (0.0, (6.0, 1.2, 1.2, 1.2)))
 
 Target = str | os.PathLike[str] | io.BytesIO  # a buffer receives an SVG
 
@@ -79,6 +72,20 @@ class Stroke(NamedTuple):
     linestyle: Any = "-"
 
 
+# Of the methods that are compared most often, so that they look the same in all pictures.
+OWN = {
+    "coil": Stroke(AGENTS[0]),
+    "coil_anchored": Stroke(AGENTS[1]),
+    "imitate_then_ppo": Stroke(AGENTS[2]),
+    "ppo": Stroke(AGENTS[3]),
+    "kickstart": Stroke(AGENTS[4]),
+    "jump_start": Stroke(AGENTS[0], SECOND_ROUND),
+    "residual_coil": Stroke(AGENTS[1], SECOND_ROUND),
+    "tune": Stroke(AGENTS[2], SECOND_ROUND),
+    "residual": Stroke(AGENTS[3], SECOND_ROUND),
+}
+
+
 def strokes(labels: Iterable[str]) -> dict[str, Stroke]:
     """Return a stroke for each policy.
 
@@ -99,20 +106,32 @@ def strokes(labels: Iterable[str]) -> dict[str, Stroke]:
 def strong_strokes(labels: Iterable[str]) -> dict[str, Stroke]:
     """Return a stroke in a strong colour for each label, dashed once the colours are used again.
 
-    The methods of `OWN` have their own colours; the others take those that are left, in the given
-    order.
+    The methods of `OWN` have their own, and so have the variants of a method, such as "ppo (1)", of
+    which further ones have other dashes. The others take what is left, in the given order.
 
     Args:
         labels: names of the policies or methods, all different.
     """
     labels = list(labels)
-    result = {label: Stroke(OWN[label]) for label in labels if label in OWN}
-    taken = {stroke.colour for stroke in result.values()}
-    left = [Stroke(colour) for colour in AGENTS if colour not in taken]
-    again = cycle(Stroke(colour, SECOND_ROUND) for colour in AGENTS)
-    others = (label for label in labels if label not in OWN)
-    result |= dict(zip(others, chain(left, again), strict=False))
+    result: dict[str, Stroke] = {}
+    for label in labels:
+        own = OWN.get(label.partition(" (")[0])
+        if own is not None:
+            variants = [own, *(Stroke(own.colour, dashes) for dashes in LATER_ROUNDS)]
+            free = [stroke for stroke in variants if stroke not in result.values()]
+            result[label] = free[0] if free else own
+    others = [label for label in labels if label not in result]
+    result |= dict(zip(others, _free_strokes(list(result.values())), strict=False))
     return {label: result[label] for label in labels}
+
+
+def _free_strokes(taken: Sequence[Stroke]) -> Iterator[Stroke]:
+    """Yield strokes without end: first in colours that no other one has, then in new dashes."""
+    colours = {stroke.colour for stroke in taken}
+    yield from (Stroke(colour) for colour in AGENTS if colour not in colours)
+    dashed = [Stroke(colour, dashes) for dashes in LATER_ROUNDS for colour in AGENTS]
+    yield from (stroke for stroke in dashed if stroke not in taken)
+    yield from cycle(dashed)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ import json
 import pytest
 from run_folders import driven, make_run
 
-from coil_rl.report.configurations import distinguish
+from coil_rl.report.configurations import distinguish, of_several_envs
 from coil_rl.report.runs import read_runs
 
 CASES = {"a": 1.0, "b": 2.0}
@@ -65,6 +65,22 @@ def test_runs_that_differ_are_divided_and_the_key_is_named(runs, one, two, names
 )
 def test_runs_that_differ_in_their_seed_only_are_pooled(runs, one, two):
     assert labels(runs(one, two)) == ["coil", "coil"]
+
+
+def test_keys_of_a_label_tell_the_runs_apart(runs):
+    env = dict.fromkeys("abcd", 1)
+    of_two = [env, env | {"network": "gru"}, dict.fromkeys("abcd", 2), {"guide": "x", "a": 3}]
+    found = labels(runs(*of_two))
+    assert len({label.partition(": ")[2] for label in found}) == 4
+    assert "network=gru" in found[1]
+
+
+def test_runs_in_several_envs_are_said(runs):
+    read = runs({"env": {"id": "A"}, "label": "a"}, {"env": {"_target_": "my.B"}, "label": "b"})
+    assert of_several_envs(read) == [
+        "The runs are in 2 envs (A, my.B): compare those of one env only."
+    ]
+    assert of_several_envs(read[:1]) == []
 
 
 def test_many_differences_are_numbered(runs):

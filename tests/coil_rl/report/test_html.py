@@ -10,7 +10,7 @@ from coil_rl.errors import UserError
 from coil_rl.report import draw_learning_curves, page, style
 from coil_rl.report.comparison import compare
 from coil_rl.report.figures import draw_report, films
-from coil_rl.report.html import SCRIPT, Section, html_page, svg, webp
+from coil_rl.report.html import SCRIPT, Section, html_page, moving, svg
 from coil_rl.report.runs import read_runs
 from coil_rl.report.table import Table
 
@@ -114,7 +114,8 @@ def test_equal_pictures_are_equal_texts():
 
 
 def test_file_that_is_no_picture_is_refused(tmp_path):
-    assert webp(WEBP).startswith("data:image/webp;base64,")
+    assert moving(WEBP).startswith("data:image/webp;base64,")
+    assert moving(b"GIF89a" + EVIL.encode()).startswith("data:image/gif;base64,")
     folder = make_run(
         tmp_path / "run", "coil", 0, driven("guide", {"a": 1.0}) + driven("coil", {"a": 2.0})
     )
@@ -130,3 +131,14 @@ def test_method_has_one_colour_in_all_pictures():
         assert together[name] == stroke
         assert style.strokes(["guide", name])[name] == stroke
     assert len({stroke.colour for stroke in together.values()}) == 4
+
+
+def test_variants_of_a_method_have_its_colour_and_other_dashes():
+    labels = ["ppo (1: a=1)", "ppo (2: a=2)", "coil_anchored", "coil", "mine", "jump_start"]
+    strokes = style.strong_strokes(labels)
+    assert len(set(map(str, strokes.values()))) == len(labels)
+    assert {strokes[label].colour for label in labels[:2]} == {style.OWN["ppo"].colour}
+    for name in ("coil_anchored", "coil", "jump_start"):
+        assert strokes[name] == style.OWN[name]
+    many = style.strong_strokes([f"run {number}" for number in range(40)])
+    assert len(set(map(str, list(many.values())[:20]))) == 20
