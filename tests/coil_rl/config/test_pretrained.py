@@ -6,12 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from programs import called
+from tiny_runs import trained
 
 import coil_rl
 from coil_rl.config import pretrained
 from coil_rl.config.pretrained import CARD, CHECKSUMS, LARGEST
+from coil_rl.run.training import INIT
 
 PLACE = Path(pretrained.__file__).parents[1] / "policies"
 NAMES = coil_rl.pretrained_names()
@@ -87,3 +90,22 @@ def test_shipped_policy_is_a_guide():
     guide = coil_rl.LearnedGuide("pretrained:pendulum/coil")
     env = coil_rl.GymnasiumEnv("Pendulum-v1", num_envs=2)
     assert guide(env.reset())["action"].shape == (2, 1)
+
+
+def test_shipped_policy_is_the_first_one_of_a_run(tmp_path):
+    folder = trained(tmp_path / "run", "ppo", "init=pretrained:cone_track/ppo")
+    first = torch.load(folder / "policies" / "000000000000.pt", weights_only=True)
+    shipped = torch.load(folder / INIT, weights_only=True)
+    assert all(torch.equal(value, shipped[name]) for name, value in first.items())
+
+
+@pytest.mark.parametrize(
+    ("name", "argument", "message"),
+    [
+        ("train", "resume=", "has no training that could go on; begin a run with it by init=pre"),
+        ("report", "folder=", "evaluate a shipped policy by coil-evaluate run=pretrained:cone_t"),
+    ],
+)
+def test_program_says_what_a_shipped_policy_is_not_for(name, argument, message, tmp_path):
+    said = called(name, f"{argument}pretrained:cone_track/ppo", cwd=tmp_path, code=2)
+    assert message in said.stderr
