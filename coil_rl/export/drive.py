@@ -35,8 +35,10 @@ class Policy:
                 raise ValueError(f"{entry['name']} must be {entry['shape']} finite numbers")
             places = given - np.array(entry.get("lowest", given))
             if not ((places >= 0) & (places % 1 == 0) & (places < entry.get("choices", 1))).all():
-                counts = f"{entry['choices']} from {entry['lowest']} on"
-                raise ValueError(f"{entry['name']} must be numbers of choices, {counts}")
+                raise ValueError(
+                    f"{entry['name']} must be numbers of choices, {entry['choices']} from "
+                    f"{entry['lowest']} on"
+                )
             feeds[entry["name"]] = given[None].astype(entry["dtype"])
         names = ["action", *(each["output"] for each in self.contract["state"])]
         action, *state = self.session.run(names, {name: feeds[name] for name in self.read})
