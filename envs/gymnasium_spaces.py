@@ -110,7 +110,7 @@ class Entry:
                 "wrapper"
             )
         self.given = tuple(self.spec.shape)
-        self.fineness = Fineness(f"the env {id}", self.title, self.dtype)
+        self.id, self.fineness = id, Fineness(f"the env {id}", self.title, self.dtype)
 
     def __call__(self, observation: Any) -> NDArray[Any]:
         """Return a copy of this entry of an observation, of the shape of `spec`.
