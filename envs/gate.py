@@ -38,7 +38,7 @@ def limit_by_attributes(env: Any, names: Sequence[str] = OWN_LIMITS) -> int:
     """
     values = (getattr(env, name, None) for name in names)
     numbers = [value for value in values if isinstance(value, Real) and math.isfinite(value)]
-    return max([LIMIT, *map(math.ceil, numbers)])
+    return max([LIMIT, *(math.ceil(float(number)) for number in numbers)])
 
 
 class ForeignError(ValueError):
