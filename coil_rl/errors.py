@@ -19,6 +19,10 @@ class UserError(Exception):
     """
 
 
+class RunningError(UserError):
+    """Another process is working on the same run."""
+
+
 def is_outside(error: BaseException) -> bool:
     """Return whether an error has its cause in the user's input, or in code of other people."""
     return isinstance(error, UserError) or bool(getattr(error, "outside", False))

@@ -45,7 +45,7 @@ from coil_rl import programs
 from coil_rl.config.sentences import is_no_bug, sentence
 from coil_rl.config.trust import trust_packages
 from coil_rl.config.written import keep_written, key_of
-from coil_rl.errors import UserError
+from coil_rl.errors import RunningError, UserError
 from coil_rl.files import FAILED_JOBS
 from coil_rl.output import SafeStream, say
 from coil_rl.programs.folders import spelled
@@ -349,12 +349,19 @@ class Jobs:
     def fail(self, error: Exception) -> float:
         """Note that a job failed, and return NaN, its result.
 
+        A job whose run another process is working on has not failed: it is left to that process,
+        so that several programs can share a sweep.
+
         Args:
             error: a mistake of the user, or a bug, whose traceback is printed.
         """
         hydra_config = HydraConfig.get()
         overrides = " ".join(hydra_config.overrides.task)
         reason = sentence(error)
+        if isinstance(error, RunningError):
+            job = f"job {hydra_config.job.num} ({overrides})"
+            say(f"{self.name}: {job} is left to the process that works on it", error=True)
+            return math.nan
         if not is_no_bug(error):
             traceback.print_exception(error)
             reason = f"{type(error).__name__}: {reason}"

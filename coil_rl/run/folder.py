@@ -13,7 +13,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from coil_rl.errors import UserError
+from coil_rl.errors import RunningError, UserError
 from coil_rl.files import LARGEST_NUMBERS, read_file, remove_unfinished, write_text
 from coil_rl.output import say
 from coil_rl.plain_yaml import yaml_of
@@ -39,7 +39,7 @@ PACKAGES = (
 def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Make a run folder and lock it until the block or this process ends.
 
-    If another process holds the lock, raise a `UserError`, or with `wait` wait for it.
+    If another process holds the lock, raise a `RunningError`, or with `wait` wait for it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = folder / ".lock"
@@ -50,7 +50,7 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
             remove_unfinished(folder)
             yield
     except Timeout:
-        raise UserError(
+        raise RunningError(
             f"another process is running in {folder}; wait until it ends, or end it"
         ) from None
 

@@ -1,6 +1,7 @@
 """Signals, closed streams and failing jobs: what was learned is kept, and the others go on."""
 
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -10,7 +11,7 @@ import pytest
 from programs import TINY, called, command, environment, program
 
 from coil_rl.run import checkpoint, stopping
-from coil_rl.run.folder import is_evaluated
+from coil_rl.run.folder import is_evaluated, locked
 
 SMALL = [*TINY, "evaluation.gif=false", "method=ppo", "learner.epochs=1"]
 LONG = [*SMALL, "budget.frames=200_000", "checkpoint_every=10_000"]
@@ -115,6 +116,19 @@ def test_sweep_whose_jobs_are_all_refused_leaves_no_folder(tmp_path):
     error = called("train", *sweep, cwd=tmp_path, code=2).stderr
     assert "2 jobs of this sweep failed" in error
     assert not (tmp_path / "sweep").exists()
+
+
+def test_job_that_another_process_works_on_is_left_to_it(tmp_path):
+    sweep = ["-m", *SMALL, "learner.gamma=0.8,0.9", "hydra.sweep.dir=sweep"]
+    with locked(tmp_path / "sweep" / "0"):
+        error = called(
+            "train", *sweep, "hydra.sweep.subdir=\\${hydra.job.num}", cwd=tmp_path
+        ).stderr
+    assert "job 0 (learner.gamma=0.8" in error
+    assert "is left to the process that works on it" in error
+    assert not (tmp_path / "sweep" / "failed_jobs.txt").exists()
+    assert not is_evaluated(tmp_path / "sweep" / "0")
+    assert is_evaluated(tmp_path / "sweep" / "1")
 
 
 @pytest.mark.slow
