@@ -85,7 +85,6 @@ def describe(
             "observations": parity.observations,
             "largest_difference": parity.largest,
             "limit": parity.limit,
-            "observations_beyond_the_limit": parity.beyond,
             "unit": "normalised actions: 1 is half of the range of a number; another choice is 1",
             "cpu_milliseconds_per_call": round(parity.milliseconds, 3),
             "cpu_milliseconds_per_call_of_torch": round(parity.torch_milliseconds, 3),

@@ -89,6 +89,17 @@ def test_smoothing_spline_of_few_points_minimises_the_penalised_squares(
     assert values.numpy() == pytest.approx(truth, abs=1e-9)
 
 
+@pytest.mark.parametrize("gap", [0.02, 0.05, 0.2])
+def test_close_points_cost_no_digits_in_float32(gap: float) -> None:
+    along = torch.tensor([0.0, 1.0, 1.0 + gap, 2.5, 2.5 + gap, 4.0])
+    points = torch.stack([along, 0.3 * torch.sin(3.0 * along)]).unsqueeze(-1)
+    found = smoothing_spline(points, torch.tensor([6.0]), 0.3)
+    knots = found.knots.squeeze(-1).double().numpy()
+    for values, positions in zip(found.values.squeeze(-1), points.squeeze(-1), strict=True):
+        expected = make_smoothing_spline(knots, positions.double().numpy(), lam=0.3)(knots)
+        assert np.abs(values.numpy() - expected).max() < 1e-6
+
+
 @steady
 @given(seeds, st.integers(2, SLOTS))
 def test_parabola_agrees_with_numpy(seed: int, n: int) -> None:
