@@ -184,7 +184,7 @@ def test_a_slow_plant_is_spread_by_itself() -> None:
 
 def test_warnings_of_a_process_reach_the_program() -> None:
     env = plants(2, rows=2, ends=None)
-    with pytest.warns(UserWarning, match="an episode did not end within 1,000"):
+    with pytest.warns(UserWarning, match="did not end within 1,000 steps"):
         drive(env, 1_000)
 
 
