@@ -136,7 +136,7 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         and not config.method.search
         and advises_only(config)
         and not demonstrations(config),
-        advice=list(config.evaluation.advice) if config.method.transforms else [],
+        advice=list(config.evaluation.advice) if advises(config) else [],
         repeats=config.evaluation.repeats,
         compiled=config.compile,
         notes=notes,
@@ -200,10 +200,19 @@ def recorded(pictures: list[Picture]) -> dict[str, NestedKey]:
     return entries
 
 
+def advises(config: DictConfig) -> bool:
+    """Return whether a method adds the advice of guides to the env."""
+    return GuideActions in _added(config)
+
+
 def advises_only(config: DictConfig) -> bool:
     """Return whether all that a method adds to the env of its guides is their advice."""
-    added = {get_object(node["_target_"]) for node in config.method.transforms.values()}
-    return added == {GuideActions} and not config.degrade and not config.action
+    return _added(config) == {GuideActions} and not config.degrade and not config.action
+
+
+def _added(config: DictConfig) -> set[Any]:
+    """Return the classes of the transforms of a method."""
+    return {get_object(node["_target_"]) for node in config.method.transforms.values()}
 
 
 def guide_results(
@@ -366,10 +375,10 @@ def disturbances(config: DictConfig, cases: str) -> dict[str, Any]:
 def build_transforms(config: DictConfig, advice: str = "") -> list[Transform]:
     """Return the transforms of an env.
 
-    They are those of the method, `degrade` if the method has any, `advice`, `action` and network.
+    They are those of the method, `degrade` if they have advice, `advice`, `action` and network.
     """
     transforms = build_all(config.method.transforms, "method.transforms")
-    if transforms:
+    if any(isinstance(part, GuideActions) for part in transforms):
         transforms += build_all(config.degrade, "degrade")
     if advice:
         node = config.evaluation.advice[advice]

@@ -8,6 +8,7 @@ from coil_rl.config.build import (
     build_bare_env,
     build_guides,
     build_learner,
+    build_transforms,
     cases_node,
     disturbances,
     env_maker,
@@ -115,6 +116,16 @@ def test_guide_drives_with_degraded_advice():
     env, policy = env_maker(config).guided(4, TRAIN)
     step = env.step(policy(env.reset()))
     torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.4 * 0.5 + 0.2))
+
+
+def test_advice_of_a_method_without_any_is_not_degraded():
+    view = "{_target_: coil_rl.transforms.ObservationNoise, sigma: 0.1, seed: 0}"
+    config = composed(
+        "method=ppo", f"+method.transforms.view={view}", "degrade=[random]", "run_dir=unused"
+    )
+    transforms = build_transforms(config)
+    assert [type(part).__name__ for part in transforms] == ["ObservationNoise"]
+    env_maker(config)().rollout(2)
 
 
 def test_advice_is_degraded_after_the_transforms_of_the_method():
