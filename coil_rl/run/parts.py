@@ -161,7 +161,7 @@ class EnvMaker:
 def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> EnvBase:
     """Return an env with the sum of its rewards, `episode_reward`, and with transforms.
 
-    Episodes of a foreign env that names no largest number of steps are truncated after 1,000.
+    Episodes of a foreign env that nothing else ends are truncated, see `limit_of`.
 
     Transforms that do not fit are a `UserError` that begins with `name`.
     """
