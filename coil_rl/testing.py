@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs, st
 
 from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.transforms import GuideActions, set_progress
-from coil_rl.transforms.action_space import ActionSpace, first_choices, nested_key, own_shape
+from coil_rl.transforms.action_space import first_choices, nested_key, own_shape, space_of
 from coil_rl.transforms.guide_actions import unfit_action
 
 
@@ -282,9 +282,7 @@ class _AskedGuide:
         plant = getattr(env, "base_env", env)
         self.env.base_env.first_choices = first_choices(plant)
         self.env.base_env.own_shape = own_shape(plant)
-        self.space = ActionSpace(
-            self.env.full_action_spec[action_key], 1, first_choices(plant), own_shape(plant)
-        )
+        self.space = space_of(self.env.base_env, action_key)
 
     def check_action(self, guide: nn.Module, _: object, written: TensorDictBase) -> None:
         """Raise a `ValueError` for an invalid action; a forward hook of the guide."""

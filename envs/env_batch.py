@@ -20,10 +20,10 @@ from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
-from coil_rl.envs.gate import foreign
+from coil_rl.envs.gate import SET_LIMIT, foreign, warn_of_limit
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.envs.seeded_env import SeededEnv
-from coil_rl.envs.step_limit import limit_of, warn_of_limit
+from coil_rl.envs.step_limit import COUNTER, limit_of
 
 SEEDS = 2**31  # seeds of drawn episodes are below
 REMEMBERED = 20_000  # steps; a longer episode is not repeated when a state is restored
@@ -270,7 +270,7 @@ class _EnvRow:
         """End the episode, unless it is over."""
         if after["done"].any():
             return
-        warn_of_limit(self.name, self.steps, "env.max_steps=NUMBER sets another limit")
+        warn_of_limit(self.name, self.steps, COUNTER, SET_LIMIT)
         for name in ("done", "truncated"):
             flag = after.get(name, None)
             if flag is not None:

@@ -22,12 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 LIMIT = 1_000  # steps; of an episode of an env that has no wrapper which ends it
+SET_LIMIT = "env.max_steps=NUMBER sets another limit"
 # Attributes in which envs keep the largest number of steps of an episode themselves.
 OWN_LIMITS = ("max_steps", "max_episode_steps", "_max_episode_steps", "horizon")
 
 
 def limit_by_attributes(env: Any, names: Sequence[str] = OWN_LIMITS) -> int:
-    """Return the steps after which an episode is truncated if the env has not ended it.
+    """Return the number of steps after which an episode is truncated, unless the env ends it.
 
     An attribute may be another thing than it seems, such as the horizon of a predictive controller.
     So it only makes the limit longer.
@@ -39,6 +40,22 @@ def limit_by_attributes(env: Any, names: Sequence[str] = OWN_LIMITS) -> int:
     values = (getattr(env, name, None) for name in names)
     numbers = [value for value in values if isinstance(value, Real) and math.isfinite(value)]
     return max([LIMIT, *(math.ceil(float(number)) for number in numbers)])
+
+
+def warn_of_limit(name: str, limit: int, wrapper: str, remedy: str) -> None:
+    """Warn that the episodes of an env are truncated.
+
+    Args:
+        name: of the env.
+        limit: the number of steps.
+        wrapper: what could have ended the episode.
+        remedy: how to set another limit.
+    """
+    warnings.warn(
+        f"an episode of the env {name} did not end within {limit:,} steps, and no {wrapper} ends "
+        f"it: episodes are truncated there ({remedy})",
+        stacklevel=3,
+    )
 
 
 class ForeignError(ValueError):
@@ -300,12 +317,7 @@ class EnvGate:
         """Return whether an episode has reached the limit, and say so."""
         if self.limit is None or self.steps < self.limit:
             return False
-        warnings.warn(
-            f"an episode of the env {self.name} did not end within {self.limit:,} steps, and no "
-            "TimeLimit ends it: episodes are truncated there (env.max_steps=NUMBER sets another "
-            "limit)",
-            stacklevel=2,
-        )
+        warn_of_limit(self.name, self.limit, "TimeLimit", SET_LIMIT)
         return True
 
     def render(self) -> NDArray[np.uint8]:

@@ -33,7 +33,7 @@ COARSE, STILL = 100.0, 1e-6
 
 
 class Fineness:
-    """Watch on the first values of some numbers: whether they are too fine for their dtype.
+    """Warns if the first values of some numbers need more digits than their dtype has.
 
     Args:
         place: where they come from, for the warning.
@@ -49,7 +49,7 @@ class Fineness:
         self.unseen = WATCHED if dtype.kind == "f" else 0
 
     def see(self, value: NDArray[Any]) -> None:
-        """Note a value, and warn after the last one if a range has too few steps of the dtype."""
+        """Take a value; after the last one, warn if its range has too few steps of the dtype."""
         if self.unseen == WATCHED:
             self.low = self.high = value.astype(np.float64)
         self.low, self.high = np.minimum(self.low, value), np.maximum(self.high, value)

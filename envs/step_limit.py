@@ -1,19 +1,19 @@
-"""A largest number of steps for episodes of TorchRL envs that nothing else ends.
+"""Truncation of the episodes of TorchRL envs that nothing else ends.
 
 Without one, an env that never ends is evaluated for ever before the first update.
 """
 
-import warnings
 from numbers import Real
 from typing import Any
 
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
-from coil_rl.envs.gate import LIMIT, OWN_LIMITS, limit_by_attributes
+from coil_rl.envs.gate import LIMIT, OWN_LIMITS, limit_by_attributes, warn_of_limit
 from coil_rl.envs.seeded_env import SeededEnv
 
 NAMES = (*OWN_LIMITS, "episode_length")  # of the largest number of steps of an episode
+COUNTER = StepCounter.__name__
 SECONDS = "time_limit"  # name of the longest time of an episode
 
 
@@ -38,25 +38,10 @@ class StepLimit(StepCounter):
                 warn_of_limit(
                     self.name,
                     self.max_steps,
-                    "put TorchRL's StepCounter(NUMBER) around it, or give it the attribute "
-                    "max_steps, for another limit",
+                    COUNTER,
+                    f"put TorchRL's {COUNTER}(NUMBER) around it for another limit",
                 )
         return after
-
-
-def warn_of_limit(name: str, limit: int, remedy: str) -> None:
-    """Say that the episodes of an env are truncated.
-
-    Args:
-        name: of the env.
-        limit: the number of steps.
-        remedy: how to set another limit.
-    """
-    warnings.warn(
-        f"an episode of the env {name} did not end within {limit:,} steps, and no StepCounter "
-        f"ends it: episodes are truncated there ({remedy})",
-        stacklevel=3,
-    )
 
 
 def limits_of(env: EnvBase) -> list[StepLimit]:
@@ -70,7 +55,7 @@ def limits_of(env: EnvBase) -> list[StepLimit]:
 
 
 def limit_of(env: EnvBase) -> int | None:
-    """Return the steps after which an episode of an env is truncated; None if it ends by itself.
+    """Return the number of steps after which an episode is truncated; None: something else ends it.
 
     A StepCounter, a limit of Gymnasium and a `time_limit` in seconds are believed. Other attributes
     make the limit longer, see `limit_by_attributes`.

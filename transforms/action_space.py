@@ -304,6 +304,17 @@ def own_shape(env: EnvBase) -> Sequence[int] | None:
     return getattr(env, "own_shape", None)
 
 
+def space_of(env: EnvBase, action_key: NestedKey) -> ActionSpace:
+    """Return the action space of an env without transforms, as its controllers see it.
+
+    Args:
+        env: without transforms.
+        action_key: entry of the action.
+    """
+    spec = env.full_action_spec[action_key]
+    return ActionSpace(spec, env.batch_dims, first_choices(env), own_shape(env))
+
+
 def random_action(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:
     """Write a random action of an env, which is uniform where the action is bounded.
 

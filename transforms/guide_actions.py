@@ -21,9 +21,8 @@ from torchrl.envs import EnvBase, Transform
 from coil_rl.transforms.action_space import (
     ActionSpace,
     ActionTransform,
-    first_choices,
     nested_key,
-    own_shape,
+    space_of,
 )
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
 from coil_rl.transforms.normalised_action import ActionUnits
@@ -299,13 +298,7 @@ class GuideActions(ActionTransform):
     @cached_property
     def given_space(self) -> ActionSpace:
         """Action space of the env without any transforms."""
-        env = self.parent.base_env
-        return ActionSpace(
-            env.full_action_spec[self.action_key],
-            env.batch_dims,
-            first_choices(env),
-            own_shape(env),
-        )
+        return space_of(self.parent.base_env, self.action_key)
 
     @cached_property
     def guide_space(self) -> ActionSpace:

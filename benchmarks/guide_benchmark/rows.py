@@ -224,8 +224,7 @@ def check_row(row: Mapping[str, str]) -> None:
     if row["task"] not in known:
         raise ValueError(f"{place}: no such task; add it to {REFERENCES.name}")
     try:
-        numbers = {name: float(row[name]) for name in NUMBERS}
-        seeds = int(row["seeds"])
+        numbers, seeds = _numbers(row), int(row["seeds"])
     except ValueError as error:
         raise ValueError(f"{place}: a number is expected ({error})") from error
     unknown = [name for name in KNOWN if not math.isfinite(numbers[name])]
@@ -259,8 +258,12 @@ def read_rows(file: Path) -> list[dict[str, str]]:
 
 def numbers_of(row: Mapping[str, str]) -> dict[str, Any]:
     """Return a checked row of a table with numbers in place of their text."""
-    numbers = {name: float(row[name]) for name in NUMBERS}
-    return {**row, **numbers, "seeds": int(row["seeds"])}
+    return {**row, **_numbers(row), "seeds": int(row["seeds"])}
+
+
+def _numbers(row: Mapping[str, str]) -> dict[str, float]:
+    """Return the numbers of a row by column."""
+    return {name: float(row[name]) for name in NUMBERS}
 
 
 def _check_numbers(

@@ -121,12 +121,13 @@ def guide_itself(controller: Controller, step: PolicyStep) -> str | None:
 
 
 def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
-    sentence = handed_over(run.folder) if run.file_of(which) == "best" else None
+    file = run.file_of(which)
+    tested = file == "best"  # so a test may have chosen it
     method = run.settings.get("method") or {}
     acts = LEARNED
     if guide is not None:
         acts = f"guide {guide} itself, not a learned policy"
-    elif run.file_of(which) == "best" and delivered(run.folder) == FIRST:
+    elif tested and delivered(run.folder) == FIRST:
         acts = "the first policy, which is its guide and has learned nothing"
     return {
         "label": run.label,
@@ -134,7 +135,7 @@ def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
         "seed": run.seed,
         "frames": run.budget.frames,
         "which": which,
-        "chosen": sentence or f"the {run.file_of(which)} policy of the training",
+        "chosen": (tested and handed_over(run.folder)) or f"the {file} policy of the training",
         "acts": acts,
         "actions": "deterministic",
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -182,14 +182,9 @@ def _one_hot(value: Any, entry: Mapping[str, Any]) -> Any:
     sizes, given = np.array(source["choices"]), np.asarray(value)
     if given.size == sizes.sum() and given.size != sizes.size:
         return given
-    chosen = np.ravel(given) - np.array(source["start"])
-    if chosen.shape != sizes.shape or (chosen < 0).any() or (chosen >= sizes).any():
-        raise ValueError(
-            f"{entry['name']} is {np.ravel(given).tolist()}, which are no choices of "
-            f"{sizes.tolist()} from {source['start']} on"
-        )
+    chosen = _chosen(entry["name"], np.ravel(given), source["choices"], source["start"])
     vector = np.zeros(sizes.sum())
-    vector[chosen.astype(np.int64) + np.cumsum([0, *sizes[:-1]])] = 1
+    vector[chosen + np.cumsum([0, *sizes[:-1]])] = 1
     return vector
 
 
@@ -206,24 +201,31 @@ def _row(value: Any, entry: Mapping[str, Any]) -> NDArray[Any]:
     if not np.isfinite(given).all():
         raise ValueError(f"{entry['name']} holds a number that is not finite")
     if "choices" in entry:
-        _check_choices(given.reshape(shape), entry)
+        _chosen(entry["name"], given.reshape(shape), entry["choices"], entry["lowest"])
     return given.astype(entry["dtype"]).reshape(1, *shape)
 
 
-def _check_choices(given: NDArray[Any], entry: Mapping[str, Any]) -> None:
-    """Raise a `ValueError` for what are no numbers of choices, as the env counts them.
+def _chosen(
+    name: str, given: NDArray[Any], choices: Sequence[int], lowest: Sequence[int]
+) -> NDArray[np.int64]:
+    """Return numbers of choices, counted from 0.
 
     Args:
-        given: [..., n].
-        entry: of the contract.
+        name: of the input, for the message.
+        given: numbers as the env counts them, [..., n].
+        choices: how many there are of each, [n].
+        lowest: number of the first one of each, [n].
+
+    Raises:
+        ValueError: for anything but numbers of choices.
     """
-    places = given - np.array(entry["lowest"])
-    fits = (places >= 0) & (places % 1 == 0) & (places < np.array(entry["choices"]))
-    if not fits.all():
+    places = given - np.array(lowest) if given.shape[-1:] == (len(choices),) else np.array(-1)
+    if not ((places >= 0) & (places % 1 == 0) & (places < np.array(choices))).all():
         raise ValueError(
-            f"{entry['name']} is {given.tolist()}, which are no choices of {entry['choices']} from "
-            f"{entry['lowest']} on"
+            f"{name} is {given.tolist()}, which are no choices of {list(choices)} from "
+            f"{list(lowest)} on"
         )
+    return places.astype(np.int64)
 
 
 def _fits(given: tuple[int, ...], shape: tuple[int, ...]) -> bool:

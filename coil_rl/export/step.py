@@ -30,7 +30,7 @@ from coil_rl.export.gru import WrittenGru
 from coil_rl.learners.critics import Critics
 from coil_rl.run.controller import Controller
 from coil_rl.transforms import GuideActions
-from coil_rl.transforms.action_space import ActionSpace, first_choices
+from coil_rl.transforms.action_space import ActionSpace, space_of
 from coil_rl.transforms.advice_dropout import AdviceDropout
 from coil_rl.transforms.combined_actions import AdaptiveMixedAction, CombinedAction
 from coil_rl.transforms.degraded_advice import DegradedAdvice
@@ -261,9 +261,7 @@ class PolicyStep(nn.Module):
         if advice is not None and not inside:
             self.inputs.append(advice.outside)
         self.action_key = env.action_key
-        self.space = ActionSpace(
-            plant.full_action_spec[plant.action_key], plant.batch_dims, first_choices(plant)
-        )
+        self.space = space_of(plant, plant.action_key)
         self.eval().requires_grad_(False)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:

@@ -95,7 +95,7 @@ def export_policy(
 
 
 def _say_if_not_learned(acts: str, outside: str | None) -> None:
-    """Say that a run with a learned policy has handed over another one.
+    """Say that what is exported is a guide, or a policy that has learned nothing.
 
     Args:
         acts: what is exported, as in the contract.

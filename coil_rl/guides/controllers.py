@@ -90,10 +90,13 @@ class PerRow(TensorDictModuleBase):
         flat = tensordict.reshape(-1)
         rows, starts = (flat[key].flatten().tolist() for key in ("row", "is_init"))
         self.asked = rows
+        columns = []
         for key in self.read:
-            if is_tensor_collection(flat[key]):
-                raise ForeignError(_parts_of(key, flat[key]))
-        observations = zip(*(flat[key].cpu().numpy().copy() for key in self.read), strict=True)
+            entry = flat[key]
+            if is_tensor_collection(entry):
+                raise ForeignError(_parts_of(key, entry))
+            columns.append(entry.cpu().numpy().copy())
+        observations = zip(*columns, strict=True)
         actions: list[NDArray[Any]] = []
         for row, start, observed in zip(rows, starts, observations, strict=True):
             actions.append(self._action(row, start, observed))
@@ -342,7 +345,7 @@ def _mapped(convert: Callable[[Any], Any], kind: type, value: Any) -> Any:
 
 
 def _parts_of(key: NestedKey, entry: TensorDictBase) -> str:
-    """Return the sentence about an entry that is several ones.
+    """Return the error message for a key that stands for several entries.
 
     Args:
         key: of the entry.

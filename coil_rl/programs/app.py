@@ -356,16 +356,15 @@ class Jobs:
             error: a mistake of the user, or a bug, whose traceback is printed.
         """
         hydra_config = HydraConfig.get()
-        overrides = " ".join(hydra_config.overrides.task)
-        reason = sentence(error)
+        job = f"job {hydra_config.job.num} ({' '.join(hydra_config.overrides.task)})"
         if isinstance(error, RunningError):
-            job = f"job {hydra_config.job.num} ({overrides})"
             say(f"{self.name}: {job} is left to the process that works on it", error=True)
             return math.nan
+        reason = sentence(error)
         if not is_no_bug(error):
             traceback.print_exception(error)
             reason = f"{type(error).__name__}: {reason}"
-        line = f"job {hydra_config.job.num} ({overrides}): {reason}"
+        line = f"{job}: {reason}"
         say(f"{self.name}: {line}; the other jobs go on", error=True)
         with contextlib.suppress(OSError):  # it is empty
             Path(hydra_config.runtime.output_dir).rmdir()

@@ -45,7 +45,8 @@ def distinguish(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
         keys = differing([runs[index] for index in of_label])
         if not keys:
             continue
-        keys = _telling_first(keys, [relevant(runs[index]) for index in of_label])
+        configurations = {index: relevant(runs[index]) for index in of_label}
+        keys = _telling_first(keys, list(configurations.values()))
         names = ", ".join(keys[:MOST_KEYS]) + (" and others" if len(keys) > MOST_KEYS else "")
         sentences.append(
             f"The runs of {label} differ in {names}, so they are not means of one another."
@@ -53,7 +54,7 @@ def distinguish(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
         numbers: dict[str, int] = {}
         for index in of_label:
             run = runs[index]
-            values = [f"{key}={_text(relevant(run).get(key))}" for key in keys]
+            values = [f"{key}={_text(configurations[index].get(key))}" for key in keys]
             shown = ", ".join(values[:MOST_KEYS])
             if len(keys) > MOST_KEYS:  # the shown values may be alike
                 number = numbers.setdefault(", ".join(values), len(numbers) + 1)
@@ -63,7 +64,7 @@ def distinguish(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
 
 
 def of_several_envs(runs: Sequence[Run]) -> list[str]:
-    """Return the sentence about runs in different envs, whose rewards are no comparison.
+    """Return a warning if runs are in different envs, whose rewards cannot be compared.
 
     Args:
         runs: finished runs.
@@ -79,7 +80,7 @@ def of_several_envs(runs: Sequence[Run]) -> list[str]:
 
 
 def _telling_first(keys: Sequence[str], configurations: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return keys with those first whose values tell the most configurations apart.
+    """Return keys, first those whose values distinguish the most configurations.
 
     Args:
         keys: in which the configurations differ.

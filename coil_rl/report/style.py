@@ -126,7 +126,7 @@ def strong_strokes(labels: Iterable[str]) -> dict[str, Stroke]:
 
 
 def _free_strokes(taken: Sequence[Stroke]) -> Iterator[Stroke]:
-    """Yield strokes without end: first in colours that no other one has, then in new dashes."""
+    """Yield strokes: first in unused colours, then in unused dashes, then used ones again."""
     colours = {stroke.colour for stroke in taken}
     yield from (Stroke(colour) for colour in AGENTS if colour not in colours)
     dashed = [Stroke(colour, dashes) for dashes in LATER_ROUNDS for colour in AGENTS]

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import LARGEST_NUMBERS, read_file
@@ -11,7 +12,6 @@ from coil_rl.learners.anchor import StartTest
 from coil_rl.report.runs import DELIVERY
 from coil_rl.report.table import return_format
 
-REMEDY = "remove it, and the sentence is left out"  # for the file of the test at the end
 FIRST = "first"  # policy of a run that holds its guide
 POLICIES = {
     "last": "the last policy",
@@ -62,11 +62,31 @@ def delivered(folder: Path) -> str | None:
     Raises:
         UserError: if the file is damaged.
     """
+    report = _delivery(folder)
+    return None if report is None else report["policy"]
+
+
+def _delivery(folder: Path) -> dict[str, Any] | None:
+    """Return what a run says about its test at the end; None without a test.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        UserError: if the file is damaged.
+    """
     file = folder / DELIVERY
     if not file.exists():
         return None
-    with file_of_a_run(file, REMEDY):
-        return str(json.loads(read_file(file, LARGEST_NUMBERS))["policy"])
+    with file_of_a_run(file, "remove it, and the sentence is left out"):
+        report = json.loads(read_file(file, LARGEST_NUMBERS))
+        return {
+            "policy": str(report["policy"]),
+            "returns": {str(name): float(value) for name, value in report["returns"].items()},
+            "cases": int(report["cases"]),
+            "frames": None if report["frames"] is None else int(report["frames"]),
+            "ahead": [float(value) for value in report.get("ahead") or ()],
+        }
 
 
 def handed_over(folder: Path) -> str | None:
@@ -78,26 +98,21 @@ def handed_over(folder: Path) -> str | None:
     Raises:
         UserError: if the file is damaged.
     """
-    chosen = delivered(folder)
-    if chosen is None:
+    report = _delivery(folder)
+    if report is None:
         return None
-    file = folder / DELIVERY
-    with file_of_a_run(file, REMEDY):
-        report = json.loads(read_file(file, LARGEST_NUMBERS))
-        returns = {str(name): float(value) for name, value in report["returns"].items()}
-        cases, frames = int(report["cases"]), report["frames"]
-        ahead = [float(value) for value in report.get("ahead") or ()]
+    chosen, returns, ahead = report["policy"], report["returns"], report["ahead"]
     names = dict(POLICIES)
-    if frames is not None:
-        names["earlier"] = f"the policy after {int(frames):,} frames"
+    if report["frames"] is not None:
+        names["earlier"] = f"the policy after {report['frames']:,} frames"
     spec = return_format(returns.values())
     listed = ", ".join(f"{names.get(name, name)} {value:{spec}}" for name, value in returns.items())
     title = names.get(chosen, f"the {chosen} itself, and nothing that was learned")
     if chosen == FIRST:
         title += ", which is its guide and has learned nothing"
     sentence = (
-        f"Handed over is {title}: mean returns in {cases} new cases of the training, whose steps "
-        f"are among its frames: {listed}"
+        f"Handed over is {title}: mean returns in {report['cases']} new cases of the training, "
+        f"whose steps are among its frames: {listed}"
     )
     if ahead:
         mean, low, high = (f"{value:+{spec}}" for value in ahead)

@@ -269,6 +269,14 @@ class Place(gymnasium.Env):
         return np.array([self.place]), 0.0, False, False, {}
 
 
+def said_of_coarse_numbers(env):
+    """Return the warnings of numbers that are too fine for float32, in 300 steps."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        env.rollout(300, break_when_any_done=False)
+    return [str(each.message) for each in said if "float32 has steps of" in str(each.message)]
+
+
 @pytest.mark.parametrize(
     ("offset", "step", "coarse"),
     [
@@ -279,11 +287,7 @@ class Place(gymnasium.Env):
     ],
 )
 def test_numbers_too_fine_for_the_dtype_are_said(offset, step, coarse):
-    env = GymnasiumEnv(partial(Place, offset, step), max_steps=1000)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        env.rollout(300, break_when_any_done=False)
-    found = [str(each.message) for each in said if "float32 has steps of" in str(each.message)]
+    found = said_of_coarse_numbers(GymnasiumEnv(partial(Place, offset, step), max_steps=1000))
     assert bool(found) == coarse
     assert not coarse or "number 0 of the observation goes from 5412345.67" in found[0]
 
@@ -296,10 +300,7 @@ def test_rewards_too_fine_for_the_dtype_are_said(offset, coarse):
             return observation, offset + math.sin(self.place), *others[1:]
 
     env = GymnasiumEnv(partial(Offset, 0.0, 0.1), num_envs=2, max_steps=1000)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        env.rollout(300, break_when_any_done=False)
-    found = [str(each.message) for each in said if "float32 has steps of" in str(each.message)]
+    found = said_of_coarse_numbers(env)
     assert bool(found) == coarse
     assert not coarse or ": the reward goes from " in found[0]
 
