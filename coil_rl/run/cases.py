@@ -37,6 +37,7 @@ class TrainingCases:
     Attributes:
         steps: that all comparisons have taken so far.
         taken: of these the steps of each policy in the last comparison.
+        episodes: number of all episodes so far.
         longest: number of steps of the longest episode so far, of this process.
         calls: number of actions that guides were asked for.
     """
@@ -45,6 +46,7 @@ class TrainingCases:
     frames: int
     seed: int = 0
     steps: int = field(default=0, init=False)
+    episodes: int = field(default=0, init=False)
     calls: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
@@ -158,18 +160,25 @@ class TrainingCases:
             for after, running in episodes(env, policy, sampled=sampled, tick=bar.update):
                 totals.add(after, running)
         self.steps += int(totals.steps.sum())
+        self.episodes += totals.steps.numel()
         self.longest = max(self.longest, int(totals.steps.max()))
         self.calls += guide_calls(env) - before
         return totals
 
     def state_dict(self) -> dict[str, Any]:
         """Return what later comparisons depend on."""
-        return {"generator": self.generator.get_state(), "steps": self.steps, "calls": self.calls}
+        return {
+            "generator": self.generator.get_state(),
+            "steps": self.steps,
+            "episodes": self.episodes,
+            "calls": self.calls,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.generator.set_state(state["generator"])
         self.steps, self.calls = state["steps"], state["calls"]
+        self.episodes = state["episodes"]
 
 
 def seeded_env(env: EnvBase | None) -> SeededEnv | None:

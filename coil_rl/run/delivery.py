@@ -4,7 +4,8 @@ The last policy of a training need not be its best one, and may be worse than it
 `delivery=tested` a part of the frames is kept for a test at the end: the last policy, the kept one
 that had the highest return in training, and each guide act in the same new cases, and the one with
 the highest mean return is handed over. A policy that holds a guide is compared with its own first
-policy instead. None of these cases is in the evaluation curve or in the table.
+policy instead. None of these cases is in the evaluation curve or in the table. Where no guide is
+held and the start test has left no frames for it, the test is left out.
 """
 
 import copy
@@ -31,6 +32,7 @@ from coil_rl.run import checkpoint
 from coil_rl.run.cases import LEAST_CASES, TrainingCases
 from coil_rl.run.curve import EvaluationCurve
 from coil_rl.run.judge import guide_titles
+from coil_rl.run.reasons import UNTESTED
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.combined_actions import GradualResidual, ResidualAction
 
@@ -102,20 +104,50 @@ class Delivery:
         """
         if not self.cases.longest:
             return self._affordable()
-        policies = 1 + len(self._guides_of_env())
-        return max(self._affordable(), FIRST_CASES * policies * self.cases.longest)
+        if not self._fits():
+            return 0
+        return max(self._affordable(), FIRST_CASES * self._compared() * self.cases.longest)
+
+    def _fits(self) -> bool:
+        """Return whether the frames allow for the first cases, or a guide is held.
+
+        Episodes are taken to be as long as in the start test. A run that holds a guide is always
+        tested, as it promises to be no worse than this guide.
+        """
+        if not self.cases.episodes or self._holds():
+            return True
+        length = self.cases.steps / self.cases.episodes
+        return FIRST_CASES * self._compared() * length <= self._left()
+
+    def _compared(self) -> int:
+        """Return the number of policies that the first cases compare at least."""
+        return 1 + len(self._guides_of_env())
+
+    def _holds(self) -> bool:
+        """Return whether the policy holds a guide."""
+        hold = hold_of(self.learner.policy)
+        return hold is not None and bool(hold.held)
+
+    def _share(self) -> int:
+        """Return the frames of the share of one test."""
+        return math.ceil(SHARE * self.cases.frames)
+
+    def _left(self) -> int:
+        """Return what the start test has left of both shares."""
+        return max(2 * self._share() - self.cases.steps, 0)
 
     def _affordable(self) -> int:
         """Return the frames that the test may take.
 
         What the start test took beyond the same share is missing here.
         """
-        share = math.ceil(SHARE * self.cases.frames)
-        return max(min(share, 2 * share - self.cases.steps), 0)
+        return min(self._share(), self._left())
 
     def after_update(self, update: int) -> dict[str, float]:
         """Test, hand over, and return the mean returns by name."""
         last = {name: value.clone() for name, value in self.learner.policy.state_dict().items()}
+        if not self._fits():
+            return self._hand_over_untested(last)
         candidates: dict[str, Any] = {"last": last} | self._guides()
         earlier = self._earlier(update)
         if earlier is not None:
@@ -134,6 +166,12 @@ class Delivery:
             float(cases),
         )
         return dict(zip(self.names, numbers, strict=True))
+
+    def _hand_over_untested(self, last: dict[str, Any]) -> dict[str, float]:
+        """Hand over the last policy, and return the numbers of a test that was left out."""
+        checkpoint.save(last, self.folder / "policy_best.pt")
+        self._report(UNTESTED, {}, {"last": torch.empty(0)}, None)
+        return dict.fromkeys(self.names, math.nan) | {"delivery/cases": 0.0}
 
     def _earlier(self, update: int) -> Path | None:
         """Return the file of the kept policy with the highest return in training, if it is known.
@@ -156,8 +194,7 @@ class Delivery:
 
         The advice of a run without guides in its env does not exist, so there is nothing then.
         """
-        hold = hold_of(self.learner.policy)
-        if hold is not None and bool(hold.held) and self.curve is not None:
+        if self._holds() and self.curve is not None:
             return {"first": checkpoint.load(self.curve.file(0))}
         titles = self._guides_of_env()
         return {title: {GUIDE: torch.tensor(index)} for index, title in enumerate(titles)}
@@ -217,7 +254,7 @@ class Delivery:
             earlier: file of the best kept policy; None: there is none.
         """
         ahead = None
-        if chosen != "last":
+        if chosen in returns and chosen != "last":
             ahead = mean_interval((returns[chosen] - returns["last"]).tolist())
         report = {
             "policy": chosen,

@@ -13,8 +13,10 @@ from coil_rl.report.runs import DELIVERY
 from coil_rl.report.table import return_format
 
 FIRST = "first"  # policy of a run that holds its guide
+UNTESTED = "last_untested"  # the last policy, where no frames were left for a test
 POLICIES = {
     "last": "the last policy",
+    UNTESTED: "the last policy",
     "earlier": "an earlier policy",
     FIRST: "the first policy",
     "tuned": "the tuned guide",
@@ -102,6 +104,11 @@ def handed_over(folder: Path) -> str | None:
     if report is None:
         return None
     chosen, returns, ahead = report["policy"], report["returns"], report["ahead"]
+    if chosen == UNTESTED:
+        return (
+            "Handed over is the last policy, without a test at the end: the start test has left no "
+            "frames for it, and no guide is held."
+        )
     names = dict(POLICIES)
     if report["frames"] is not None:
         names["earlier"] = f"the policy after {report['frames']:,} frames"
