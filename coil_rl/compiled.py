@@ -18,7 +18,7 @@ from unittest.mock import patch
 
 import torch
 from torch import Tensor, nn
-from torch.fx import GraphModule
+from torch.fx import GraphModule, Node
 
 from coil_rl.envs.kept_tables import cache_folder
 from coil_rl.errors import UserError
@@ -30,6 +30,8 @@ from coil_rl.output import say
 OPTIONS = {"fallback_random": True, "cpp.use_decompose_tanh": True}
 # Operations whose result has a shape that depends on values.
 DYNAMIC = torch.Tag.dynamic_output_shape
+MASKS = (torch.bool, torch.uint8)  # types of indices
+MASK = "mask"  # entry of a node's meta: whether an index by its value is a mask
 
 
 class Compiled:
@@ -117,7 +119,10 @@ def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor
     # Shapes of the nodes take two thirds of the time of recording, and the compiler finds them
     # again.
     def set_meta_without_shapes(proxy: Any, value: Any) -> Any:
-        return proxy if isinstance(value, Tensor) else set_meta(proxy, value)
+        if not isinstance(value, Tensor):
+            return set_meta(proxy, value)
+        proxy.node.meta[MASK] = value.dtype in MASKS
+        return proxy
 
     without_shapes = patch.object(proxy_tensor, "set_meta", set_meta_without_shapes)
     with compiling(), without_shapes, torch.random.fork_rng(), warnings.catch_warnings():
@@ -130,11 +135,11 @@ def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor
     with torch.no_grad():
         for argument, value in zip(arguments, before, strict=True):
             argument.copy_(value)
+    graph.graph.eliminate_dead_code()
+    _check_graph(graph, arguments)
     for node in graph.graph.nodes:
         node.meta.clear()
-    graph.graph.eliminate_dead_code()
     graph.recompile()
-    _check_graph(graph, arguments)
     return graph
 
 
@@ -149,10 +154,24 @@ def _check_graph(graph: GraphModule, arguments: Sequence[Tensor]) -> None:
                 "with another one"
             )
     for node in graph.graph.nodes:
-        if DYNAMIC in getattr(node.target, "tags", ()):
+        if DYNAMIC in getattr(node.target, "tags", ()) and not _by_numbers(graph, node):
             raise UserError(
                 f"this cannot be compiled, because {node.target} gives shapes that depend on values"
             )
+
+
+def _by_numbers(graph: GraphModule, node: Node) -> bool:
+    """Return whether an operation picks entries by their numbers, which fixes the shape."""
+    if node.target is not torch.ops.aten.index.Tensor:
+        return False
+    indices: Any = node.args[1]
+    return not any(_is_mask(graph, index) for index in indices if index is not None)
+
+
+def _is_mask(graph: GraphModule, index: Node) -> bool:
+    if index.op == "get_attr":
+        return getattr(graph, str(index.target)).dtype in MASKS
+    return bool(index.meta.get(MASK, True))
 
 
 @contextmanager

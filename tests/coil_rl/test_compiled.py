@@ -70,6 +70,17 @@ def test_shapes_that_depend_on_values_are_refused():
         Compiled(lambda x: [x[x.nonzero()[:, 0]]])(torch.ones(3))
     with pytest.raises(UserError, match=r"cannot be compiled, because aten\.index"):
         Compiled(lambda x: [x[x > 0].sum()])(torch.ones(3))
+    mask = torch.tensor([True, False, True])
+    with pytest.raises(UserError, match=r"cannot be compiled, because aten\.index"):
+        Compiled(lambda x: [x[mask]])(torch.ones(3))
+
+
+def test_entries_by_their_numbers_are_compiled():
+    drawn, fixed = (lambda: torch.randperm(3)[:2].sort()[0]), torch.tensor([2, 0])
+    graph = compiled.record(lambda x: [x[drawn()], x[:, fixed]], (torch.ones(3, 3),))
+    rows, columns = graph(torch.arange(9.0).view(3, 3))
+    assert rows.shape == (2, 3)
+    assert columns.tolist() == [[2, 0], [5, 3], [8, 6]]
 
 
 def test_constant_that_shares_memory_with_an_argument_is_refused():

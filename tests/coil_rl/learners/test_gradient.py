@@ -43,6 +43,13 @@ CASES = [
     ),
     pytest.param(SAC, (), {"starts": 64, "batch_size": 32}, id="sac", marks=pytest.mark.slow),
     pytest.param(
+        SAC,
+        (),
+        {"starts": 64, "batch_size": 32, "critics": 3, "target_critics": 2},
+        id="redq",
+        marks=pytest.mark.slow,
+    ),
+    pytest.param(
         DQN,
         (partial(DiscreteActions, 5),),
         {"starts": 64, "batch_size": 32},
