@@ -3,13 +3,15 @@
     python -m benchmarks.guide_benchmark outputs/experiments/guide_benchmark
 
 Each folder in it has the runs of one task. With `--add FILE` the rows join a table that exists; a
-row of the same task, method, arm and configuration is replaced. The page that holds all tasks is
-then of the whole table.
+row of the same task, method, arm and configuration is replaced. The pages are then of the whole
+table, but for the learning curves, which need the runs: `--curves NAME` keeps a picture that the
+page of a task has, and adds another one.
 """
 
 import argparse
 import csv
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from benchmarks.guide_benchmark.pages import write_all, write_task
 from benchmarks.guide_benchmark.rows import benchmark_rows, check_row, numbers_of, read_rows
 from coil_rl.errors import UserError
 from coil_rl.report import read_runs, write_csv
-from coil_rl.report.runs import failed_jobs
+from coil_rl.report.runs import Run, failed_jobs
 
 SAME = ("task", "method", "arm", "fingerprint")  # of two rows that replace each other
 
@@ -42,29 +44,37 @@ def added(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return [row for row in known if tuple(row[name] for name in SAME) not in new] + list(rows)
 
 
-def measured(folder: Path, pages: Path) -> list[dict[str, Any]]:
-    """Return the rows of all tasks, and write the page of each.
+def runs_of(folder: Path, pages: Path) -> dict[str, list[Run]]:
+    """Return the runs of each task.
 
     Args:
         folder: with a folder for each task.
-        pages: where to write.
+        pages: where pages are written, which is no task.
 
     Raises:
-        ValueError: if a task has no reference, or none a finished run of plain PPO.
         UserError: if a folder has no runs, or a damaged one.
     """
     tasks = [path for path in sorted(folder.iterdir()) if path.is_dir() and path != pages]
-    runs = {path: read_runs([path]) for path in tasks if not path.name.startswith(".")}
-    rows = {path: benchmark_rows(path.name, runs[path]) for path in runs}
+    return {path.name: read_runs([path]) for path in tasks if not path.name.startswith(".")}
+
+
+def measured(folder: Path, runs: Mapping[str, Sequence[Run]]) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of each task that has any.
+
+    Args:
+        folder: of the runs, for messages.
+        runs: of each task.
+
+    Raises:
+        ValueError: if a task has no reference, or none a finished run of plain PPO.
+    """
+    rows = {task: benchmark_rows(task, runs[task]) for task in runs}
     if not any(rows.values()):
         raise ValueError(f"{folder} has no task with plain PPO; train it: +arm=alone method=ppo")
-    for path, found in rows.items():
-        if found:
-            pages.mkdir(parents=True, exist_ok=True)
-            write_task(pages, path.name, found, runs[path], failed_jobs([path]))
-        else:
-            print(f"{path.name} is left out: it has no plain PPO; train +arm=alone method=ppo")
-    return list(chain.from_iterable(rows.values()))
+    for task, found in rows.items():
+        if not found:
+            print(f"{task} is left out: it has no plain PPO; train +arm=alone method=ppo")
+    return {task: found for task, found in rows.items() if found}
 
 
 def main() -> None:
@@ -73,17 +83,29 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="of the experiments, with a folder for each task")
     parser.add_argument("--pages", type=Path, help="where to write; FOLDER/pages by default")
     parser.add_argument("--add", type=Path, help="table of rows that the new ones join")
+    parser.add_argument(
+        "--curves", default="", help="name of a further picture of learning curves, such as sac"
+    )
     given = parser.parse_args()
     if not given.folder.is_dir():
         parser.error(f"{given.folder} does not exist; give the folder of the experiments")
+    if not re.fullmatch("[a-z0-9_]*", given.curves):
+        parser.error(f"--curves={given.curves} must be of small letters, digits and _")
     pages = given.pages or given.folder / "pages"
     try:
-        rows = measured(given.folder, pages)
-        table = added(given.add, rows) if given.add else rows
+        runs = runs_of(given.folder, pages)
+        rows = measured(given.folder, runs)
+        found = list(chain.from_iterable(rows.values()))
+        table = added(given.add, found) if given.add else found
     except (ValueError, UserError, csv.Error) as error:
         parser.error(str(error))
+    pages.mkdir(parents=True, exist_ok=True)
     for file in {pages / "rows.csv", given.add or pages / "rows.csv"}:
         write_csv(table, file)
+    for task in rows:
+        refused = failed_jobs([given.folder / task])
+        ladder = sorted((row for row in table if row["task"] == task), key=lambda row: -row["end"])
+        write_task(pages, task, ladder, runs[task], refused, given.curves)
     print(write_all(pages, table))
 
 

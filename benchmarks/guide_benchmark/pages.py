@@ -66,7 +66,12 @@ SMOKE = "**Smoke: too few seeds or frames for a conclusion**; it only shows that
 
 
 def write_task(
-    folder: Path, task: str, rows: Sequence[Row], runs: Sequence[Run], jobs: int
+    folder: Path,
+    task: str,
+    rows: Sequence[Row],
+    runs: Sequence[Run],
+    jobs: int,
+    curves_of: str = "",
 ) -> None:
     """Write the page of a task with its curves and its ladder.
 
@@ -74,8 +79,9 @@ def write_task(
         folder: of the pages.
         task: its name.
         rows: of the table, the best first.
-        runs: all its runs.
-        jobs: number of further runs that were refused or failed.
+        runs: those of which curves are drawn.
+        jobs: number of further runs beside them that were refused or failed.
+        curves_of: name of a further picture of curves; empty: the first picture.
     """
     arms = arms_of(runs)
     curves = {
@@ -85,9 +91,10 @@ def write_task(
     }
     curves = {method: seeds for method, seeds in curves.items() if seeds}
     guide = float(np.mean([max(run.guide_returns.values()) for run in _guided(arms)] or [np.nan]))
+    picture = f"{task}.{curves_of}.webp" if curves_of else f"{task}.webp"
     draw_learning_curves(
         curves,
-        folder / f"{task}.webp",
+        folder / picture,
         guides={GUIDE: guide},
         title=f"{task}: with its intact guide",
     )
@@ -99,12 +106,19 @@ def write_task(
         f"Score 0 is the random guide ({rows[0]['random']:.1f}), score 1 is "
         f"{rows[0]['reference']:.1f}: {reference.source}. Percentages are of the distance from the "
         "random guide to the better of PPO and the intact guide.",
-        f"![learning curves]({task}.webp)",
+        *(f"![learning curves]({name})" for name in _pictures(folder, task)),
         "## Ladder",
         markdown_table(rows, LADDER),
-        f"Runs started: {len(runs) + jobs}, finished: {finished}, refused or failed: {jobs}.",
+        f"Runs in the table: {sum(row['seeds'] for row in rows)}. Of the last sweep "
+        f"{len(runs) + jobs} were started, {finished} finished, {jobs} were refused or failed.",
     ]
     write_text(folder / f"{task}.md", "\n\n".join(lines) + "\n")
+
+
+def _pictures(folder: Path, task: str) -> list[str]:
+    """Return the names of the pictures of a task, the first one first."""
+    found = [*folder.glob(f"{task}.webp"), *sorted(folder.glob(f"{task}.*.webp"))]
+    return [path.name for path in found]
 
 
 def _guided(arms: Mapping[tuple[str, str], Any]) -> list[Run]:

@@ -190,7 +190,7 @@ def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, monke
     page = (tmp_path / "README.md").read_text()
     assert page in capsys.readouterr().out
     assert "Smoke" in page
-    assert "Runs started: 3, finished: 3" in (tmp_path / "pendulum.md").read_text()
+    assert "3 were started, 3 finished" in (tmp_path / "pendulum.md").read_text()
     assert (tmp_path / "all.png").exists()
     assert (tmp_path / "pendulum.webp").exists()
 
@@ -199,14 +199,22 @@ def test_page_of_all_tasks_is_of_the_whole_table_that_rows_join(folder, tmp_path
     file = tmp_path / "table.csv"
     shutil.copyfile(ROWS, file)
     pages = tmp_path / "pages"
+    pages.mkdir()
+    shutil.copyfile(ROWS.parent / "pendulum.webp", pages / "pendulum.webp")
     words = ["guide_benchmark", str(folder), "--pages", str(pages), "--add", str(file)]
-    monkeypatch.setattr(sys, "argv", words)
+    monkeypatch.setattr(sys, "argv", [*words, "--curves", "more"])
     program.main()
     assert len(read_rows(file)) == len(read_rows(ROWS)) + 3
     assert (pages / "rows.csv").read_bytes() == file.read_bytes()
     page = (pages / "README.md").read_text()
     assert "acrobot, cart_pole" in page  # without a page here
     assert "[pendulum](pendulum.md)" in page
+    task = (pages / "pendulum.md").read_text()
+    assert "(pendulum.webp)" in task
+    assert "(pendulum.more.webp)" in task
+    known = [row for row in read_rows(file) if row["task"] == "pendulum"]
+    assert task.count("\n| ") == len(known) + 1  # the ladder has the rows of all sweeps
+    assert (pages / "pendulum.webp").read_bytes() == (ROWS.parent / "pendulum.webp").read_bytes()
 
 
 @pytest.mark.parametrize(
