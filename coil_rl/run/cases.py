@@ -20,6 +20,7 @@ from coil_rl.transforms.guide_transform import SeededGenerator
 
 SEEDS = 2**31  # seeds of cases are below
 LEAST_CASES = 2  # of a comparison: a placebo may give a row the advice of another row
+MOST_CASES = 32  # of the test at the end
 
 
 @dataclass(eq=False)
@@ -179,6 +180,19 @@ class TrainingCases:
         self.generator.set_state(state["generator"])
         self.steps, self.calls = state["steps"], state["calls"]
         self.episodes = state["episodes"]
+
+
+def further_cases(done: int, taken: int, frames: int) -> int:
+    """Return how many further cases a test has, if their episodes are as long as those so far.
+
+    They are not more than those so far, because their episodes may be longer.
+
+    Args:
+        done: number of cases so far.
+        taken: steps of their episodes.
+        frames: that the test may take.
+    """
+    return min(int(frames * done / taken), MOST_CASES, 2 * done) - done
 
 
 def seeded_env(env: EnvBase | None) -> SeededEnv | None:

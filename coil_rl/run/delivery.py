@@ -29,7 +29,7 @@ from coil_rl.learners.learner import Learner
 from coil_rl.report.runs import DELIVERY
 from coil_rl.report.statistics import mean_interval
 from coil_rl.run import checkpoint
-from coil_rl.run.cases import LEAST_CASES, TrainingCases
+from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
 from coil_rl.run.curve import EvaluationCurve
 from coil_rl.run.judge import guide_titles
 from coil_rl.run.reasons import UNTESTED
@@ -38,7 +38,7 @@ from coil_rl.transforms.combined_actions import GradualResidual, ResidualAction
 
 GUIDE = "guide"  # entry of a file of weights that stands for a guide: its number
 SHARE = 0.05  # of the frames of a run that the test may take; its first cases may take more
-FIRST_CASES, MOST_CASES = 2, 32
+FIRST_CASES = 2
 RETURN_IN_TRAINING = "train/return"
 
 
@@ -227,9 +227,7 @@ class Delivery:
                     policies["earlier"] = earlier
                     taken = self.cases.steps - begun
                 earlier = None
-            done = len(returns["last"])
-            affordable = int(reserve * done / taken)  # as long as those so far
-            count = min(affordable, MOST_CASES) - done
+            count = further_cases(len(returns["last"]), taken, reserve)
         return returns
 
     def _act(self, policies: Mapping[str, Any], returns: dict[str, Tensor]) -> None:

@@ -20,10 +20,10 @@ from torch import Tensor
 from coil_rl.envs.limits import check_range
 from coil_rl.guides.candidates import Candidates
 from coil_rl.guides.simple import FollowAdvice
-from coil_rl.run.cases import LEAST_CASES, TrainingCases
+from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
 
 OWN, MEAN, BEST = "own", "mean", "best"  # the candidates of the test at the end
-FIRST_CASES, MOST_CASES = 4, 32  # of that test
+FIRST_CASES = 4  # of that test
 Values = dict[str, float]  # of the numbers, by name
 MakeGuide = Callable[[Mapping[str, float]], TensorDictModuleBase]
 
@@ -192,8 +192,8 @@ class Tuner:
             new = self.returns(list(values.values()), count)
             for known, returns in zip(found.values(), new, strict=True):
                 known.append(returns)
-            done, taken = sum(map(len, found[OWN])), self.cases.steps - begun
-            count = min(int(reserve * done / taken), MOST_CASES) - done
+            taken = self.cases.steps - begun
+            count = further_cases(sum(map(len, found[OWN])), taken, reserve)
         return {name: torch.cat(returns) for name, returns in found.items()}
 
     def state_dict(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from programs import LAP
 
 from coil_rl.config.build import assemble, build_learner, env_maker
 from coil_rl.learners.anchor import hold_of
-from coil_rl.run.cases import TrainingCases, guide_calls
+from coil_rl.run.cases import TrainingCases, further_cases, guide_calls
 from coil_rl.run.delivery import GuideActs
 from coil_rl.run.parts import TESTS, TRAIN
 
@@ -183,3 +183,11 @@ def test_a_block_of_cases_makes_one_env():
         cases.renew(count)
         cases.compared([learner.policy, learner.policy])
     assert made == [2, 4, 6]
+
+
+def test_test_at_the_end_grows_with_what_its_episodes_take():
+    assert further_cases(2, taken=100, frames=1000) == 2  # not at once: they may be longer
+    assert further_cases(4, taken=900, frames=1000) == 0
+    assert further_cases(4, taken=2000, frames=1000) < 0
+    assert further_cases(16, taken=16, frames=1000) == 16
+    assert further_cases(32, taken=32, frames=1000) == 0
