@@ -46,7 +46,7 @@ class Parity:
         return (
             f"the file differs from torch by at most {self.largest:.1e} on {self.observations:,} "
             f"observations (limit {self.limit:.0e}); {self.milliseconds:.2f} ms of CPU a "
-            f"call (torch {self.torch_milliseconds:.2f})"
+            f"call, torch takes {self.torch_milliseconds:.2f} ms"
         )
 
 

@@ -5,6 +5,7 @@ state, so whoever loads the policy has them, guides see the observations as they
 evaluation never changes them.
 """
 
+import math
 import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -27,6 +28,7 @@ LIMIT = 10.0  # of a normalised number: an outlier must not become a huge input
 SMALL, LARGE, FAR = 0.1, 10.0, 3.0
 ROUNDING = 1e-7  # of the size of an element: smaller deviations are that of float32
 TINIEST = 1e-60  # variance of an element that was always 0, in any unit
+LARGEST = torch.finfo(torch.float64).max  # variance; in place of infinity, which times 0 is NaN
 MOST_SHOWN = 4  # elements in a message
 CHOICES = (OneHot, Categorical)  # specs of choices, of several at once too
 
@@ -34,7 +36,8 @@ CHOICES = (OneHot, Categorical)  # specs of choices, of several at once too
 class Normaliser(TensorDictModuleBase):
     """Entries of an env, normalised by mean and standard deviation of all that `learn` has seen.
 
-    The results are written as `("normalised", KEY)`. Before the first `learn` they equal the
+    The results are written as `("normalised", KEY)`. Before the first `learn` they are 0, so that
+    no result depends on the unit or the centre of an entry; with `automatic` they equal the
     entries. Advice, which shares the unit of the action, and entries of other than floating point
     numbers are a `ValueError`.
 
@@ -60,7 +63,10 @@ class Normaliser(TensorDictModuleBase):
             if not spec.dtype.is_floating_point:
                 raise ValueError(f"normalise: {key} has numbers of type {spec.dtype}; leave it out")
             shape = spec.shape[len(env.batch_size) :]
-            self.moments.append(Moments(shape, spec.device, automatic=automatic))
+            moments = Moments(shape, spec.device, automatic=automatic)
+            if not automatic:
+                moments.variance.fill_(math.inf)
+            self.moments.append(moments)
 
     def reads(self, keys: Sequence[NestedKey]) -> list[NestedKey]:
         """Return the keys that a network reads in place of `keys`."""
@@ -172,9 +178,8 @@ class Moments(nn.Module):
         mean, variance = rows.mean(0), rows.var(0, correction=0)
         self.count += len(rows)
         share, change = len(rows) / self.count, mean - self.mean
-        spread = (
-            self.variance * (1 - share) + variance * share + change.square() * share * (1 - share)
-        )
+        before = self.variance.clamp(max=LARGEST)
+        spread = before * (1 - share) + variance * share + change.square() * share * (1 - share)
         self.mean += change * share
         self.variance.copy_(spread)
 

@@ -115,6 +115,24 @@ def test_evaluation_does_not_change_the_statistics_and_several_policies_act_at_o
     )
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_learner_learns_the_same_in_every_unit_and_around_every_centre(kind):
+    found = []
+    for unit, centre in ((1.0, 0.0), (1e-4, 0.0), (1e3, -2e5)):
+        torch.manual_seed(0)
+        low, high = (unit * torch.tensor([-1.0, end]) + centre for end in (-1.0, 1.0))
+        action = Categorical(3, ()) if kind is DQN else None
+        env = AnyEnv(8, action, {"observation": Bounded(low, high, (2,))})
+        learner = learner_of(kind, env, normalise=True)
+        rollout = Rollout(env, learner.policy, 8, learner.keys)
+        for _ in range(3):
+            learner.update(rollout.collect())
+        weights = [each.detach().flatten() for each in learner.policy.parameters()]
+        found.append(torch.cat(weights))
+    for each in found[1:]:
+        torch.testing.assert_close(each, found[0], rtol=1e-2, atol=1e-3)
+
+
 def test_only_measurements_are_normalised_and_never_advice():
     env = worlds.cones(cars=4)
     learner = PPO(env, ["observation", "guide_action"], normalise=True)
