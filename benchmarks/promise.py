@@ -10,6 +10,9 @@ A method is compared with the better of its guide, as it acts alone in the cases
 of PPO, seed by seed. It is a loss if the 95 % interval of the mean difference is below 0 and the
 mean below -1 % of the scale, a gain if both are above, and else even. The scale of a task is the
 distance from the return of its random guide to the better of PPO and its intact guide.
+
+With `--others 10` the seeds from 10 on, which were run once afterwards, have a column of their own
+beside those below 10; the other columns are of all.
 """
 
 import argparse
@@ -18,6 +21,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -42,6 +46,8 @@ COLUMNS = {
     "low": ("low", "+.1f"),
     "high": ("high", "+.1f"),
     "verdict": ("verdict", ""),
+    "claimed": ("seeds that claim", ""),
+    "others": ("others", ""),
     "lowest": ("lowest kept - guide (%)", "+.1f"),
     "tests": ("tests (% of frames)", ".1f"),
     "held": ("weight: seeds", ""),
@@ -108,6 +114,35 @@ def rows_of_task(name: str, runs: Sequence[Run]) -> list[dict[str, object]]:
         for (method, arm), each in arms.items()
         if arm != ALONE
     ]
+
+
+def add_parts(rows: Sequence[dict[str, object]], runs: Sequence[Run], others: int) -> None:
+    """Add to the rows of a task what the seeds below a number say, and what the others say.
+
+    Args:
+        rows: of the task.
+        runs: its runs.
+        others: the smallest seed of the others.
+    """
+    arms = arms_of(runs)
+    scale = scale_of(arms, arms[PPO, ALONE])
+    for row in rows:
+        arm = arms[str(row["method"]), str(row["arm"])]
+        row["claimed"] = _part(arm, arms[PPO, ALONE], scale, range(others))
+        row["others"] = _part(arm, arms[PPO, ALONE], scale, range(others, max(arm.runs) + 1))
+
+
+def _part(arm: Arm, alone: Arm, scale: float, seeds: range) -> str:
+    """Return the difference of some seeds of an arm, its interval and the verdict as a text."""
+    part, ppo = (
+        Arm({seed: run for seed, run in each.runs.items() if seed in seeds})
+        for each in (arm, alone)
+    )
+    if not set(part.runs) & set(ppo.runs):
+        return ""
+    row: dict[str, Any] = _row(part, ppo, scale)
+    interval = f"({row['low']:+.1f} to {row['high']:+.1f})"
+    return f"{row['difference']:+.1f} {interval} {row['verdict']}"
 
 
 def scale_of(arms: dict[Key, Arm], alone: Arm) -> float:
@@ -204,16 +239,23 @@ def main() -> None:
     """Print the table and write it into the folder."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="of coil-train +experiment=promise")
-    folder = parser.parse_args().folder
+    parser.add_argument("--others", type=int, help="smallest of the seeds that confirm the claim")
+    given = parser.parse_args()
+    folder = given.folder
     rows: list[dict[str, object]] = []
     for task in sorted(path for path in folder.iterdir() if path.is_dir()):
-        rows += rows_of_task(task.name, read_runs([task]))
+        runs = read_runs([task])
+        found = rows_of_task(task.name, runs)
+        if found and given.others is not None:
+            add_parts(found, runs, given.others)
+        rows += found
     counts = Counter(row["verdict"] for row in rows)
     losses = [f"{row['task']} {row['arm']}" for row in rows if row["verdict"] == "loss"]
     sentence = f"{counts['gain']} gains, {counts['even']} even, {counts['loss']} losses"
     if losses:
         sentence += f": {', '.join(losses)}"
-    page = f"{markdown_table(rows, COLUMNS)}\n\n{sentence}."
+    columns = {name: COLUMNS[name] for name in COLUMNS if rows and name in rows[0]}
+    page = f"{markdown_table(rows, columns)}\n\n{sentence}."
     write_text(folder / "promise.md", page)
     write_csv(rows, folder / "promise.csv")
     print(page)

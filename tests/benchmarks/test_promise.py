@@ -83,3 +83,18 @@ def test_program_writes_the_table(folder, monkeypatch, capsys):
     assert page in capsys.readouterr().out
     assert "gains," in page
     assert (folder / "promise.csv").exists()
+    assert "others" not in page
+
+
+def test_seeds_that_confirm_have_a_column_of_their_own(folder):
+    runs = read_runs([folder / "pendulum"])
+    rows = promise.rows_of_task("pendulum", runs)
+    promise.add_parts(rows, runs, 1)
+    scale = rows[0]["guide"] - rows[1]["guide"]
+    for column, seed in (("claimed", 0), ("others", 1)):
+        intact = promise.arms_of(runs)["coil_anchored", "intact"]
+        expected = 100 * (intact.reward(seed) - intact.guide) / scale
+        assert rows[0][column].startswith(f"{expected:+.1f} (")
+    promise.add_parts(rows, runs, 2)
+    assert rows[0]["others"] == ""
+    assert f"{rows[0]['difference']:+.1f}" in rows[0]["claimed"]
