@@ -117,7 +117,7 @@ def rows_of_task(name: str, runs: Sequence[Run]) -> list[dict[str, object]]:
 
 
 def add_parts(rows: Sequence[dict[str, object]], runs: Sequence[Run], others: int) -> None:
-    """Add to the rows of a task what the seeds below a number say, and what the others say.
+    """Add to the rows of a task the difference with the first seeds, and with the others.
 
     Args:
         rows: of the task.

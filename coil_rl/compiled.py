@@ -30,7 +30,7 @@ from coil_rl.output import say
 OPTIONS = {"fallback_random": True, "cpp.use_decompose_tanh": True}
 # Operations whose result has a shape that depends on values.
 DYNAMIC = torch.Tag.dynamic_output_shape
-MASKS = (torch.bool, torch.uint8)  # types of indices
+MASKS = (torch.bool, torch.uint8)  # types of an index that is a mask
 MASK = "mask"  # entry of a node's meta: whether an index by its value is a mask
 
 

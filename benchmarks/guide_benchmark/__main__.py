@@ -59,7 +59,7 @@ def runs_of(folder: Path, pages: Path) -> dict[str, list[Run]]:
 
 
 def measured(folder: Path, runs: Mapping[str, Sequence[Run]]) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of each task that has any.
+    """Return the rows of the table by task, without tasks that have none.
 
     Args:
         folder: of the runs, for messages.

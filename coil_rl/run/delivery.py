@@ -109,7 +109,7 @@ class Delivery:
         return max(self._affordable(), FIRST_CASES * self._compared() * self.cases.longest)
 
     def _fits(self) -> bool:
-        """Return whether the frames allow for the first cases, or a guide is held.
+        """Return whether there is a test: its first cases fit into the frames, or a guide is held.
 
         Episodes are taken to be as long as in the start test. A run that holds a guide is always
         tested, as it promises to be no worse than this guide.
@@ -120,7 +120,7 @@ class Delivery:
         return FIRST_CASES * self._compared() * length <= self._left()
 
     def _compared(self) -> int:
-        """Return the number of policies that the first cases compare at least."""
+        """Return the smallest number of policies that act in the first cases."""
         return 1 + len(self._guides_of_env())
 
     def _holds(self) -> bool:
@@ -129,11 +129,11 @@ class Delivery:
         return hold is not None and bool(hold.held)
 
     def _share(self) -> int:
-        """Return the frames of the share of one test."""
+        """Return the number of frames that one of the two tests may take."""
         return math.ceil(SHARE * self.cases.frames)
 
     def _left(self) -> int:
-        """Return what the start test has left of both shares."""
+        """Return the number of frames that the start test has left for the test at the end."""
         return max(2 * self._share() - self.cases.steps, 0)
 
     def _affordable(self) -> int:
@@ -168,7 +168,7 @@ class Delivery:
         return dict(zip(self.names, numbers, strict=True))
 
     def _hand_over_untested(self, last: dict[str, Any]) -> dict[str, float]:
-        """Hand over the last policy, and return the numbers of a test that was left out."""
+        """Hand over the last policy without a test, and return NaN for its mean returns."""
         checkpoint.save(last, self.folder / "policy_best.pt")
         self._report(UNTESTED, {}, {"last": torch.empty(0)}, None)
         return dict.fromkeys(self.names, math.nan) | {"delivery/cases": 0.0}
@@ -252,7 +252,7 @@ class Delivery:
             earlier: file of the best kept policy; None: there is none.
         """
         ahead = None
-        if chosen in returns and chosen != "last":
+        if chosen not in ("last", UNTESTED):
             ahead = mean_interval((returns[chosen] - returns["last"]).tolist())
         report = {
             "policy": chosen,

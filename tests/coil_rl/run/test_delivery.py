@@ -106,11 +106,11 @@ def test_test_at_the_end_gets_what_the_start_test_leaves_of_a_tenth(taken, kept,
 
 
 def test_run_with_tests_takes_no_more_frames_than_one_without(tmp_path):
-    small = ["method=coil_anchored", "budget.frames=1000", "budget.num_envs=2"]
+    small = ["method=coil_anchored", "budget.frames=700", "budget.num_envs=2"]
     rows = rows_of(trained(tmp_path / "run", *small) / "metrics.csv")
-    # Two cases of 40 steps of two policies, and again at the end.
-    assert float(rows[-1]["frames/tests"]) > 0.1 * 1000
-    assert float(rows[-1]["frames"]) <= 1000
+    # Two cases of 40 steps with two policies, more than both tests may take together.
+    assert float(rows[-1]["frames/tests"]) > 0.2 * 700
+    assert float(rows[-1]["frames"]) <= 700
 
 
 def test_test_at_the_end_is_left_out_where_the_start_test_took_the_frames_of_both(tmp_path):
