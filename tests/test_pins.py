@@ -63,7 +63,13 @@ def same(one: str, other: str) -> bool:
         return False
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name.startswith("dynamic") else name
+        for name in RUNS
+    ],
+)
 def test_short_run_gives_the_pinned_numbers(name: str, tmp_path: Path) -> None:
     folder = run(name, tmp_path)
     for file in FILES:

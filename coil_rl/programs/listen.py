@@ -59,12 +59,18 @@ def listen(config: DictConfig) -> None:
 def _agent(run: Run) -> TensorDictModuleBase:
     """Return the agent of a run, which must use advice."""
     from coil_rl.listening.measures import split_policy
+    from coil_rl.run.delivery import GuideActs
 
     agent: TensorDictModuleBase | None = run.policy()
     if agent is None:
         raise UserError(
             f"run={run.folder} has no agent, only a guide; "
             "give a run of an agent that observes advice"
+        )
+    if isinstance(agent, GuideActs):
+        raise UserError(
+            f"run={run.folder} handed over its guide, which uses no advice; "
+            "write evaluation.policy=last for the last policy that learned"
         )
     try:
         split_policy(agent)

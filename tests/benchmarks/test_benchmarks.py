@@ -63,6 +63,7 @@ def test_quick_run_measures_everything(tmp_path, capsys):
     assert "already holds a benchmark" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_other_learners_are_measured_without_yardsticks(tmp_path):
     overrides = [
         "track=generated",

@@ -5,6 +5,7 @@ from programs import called
 
 from benchmarks import delay
 
+pytestmark = pytest.mark.slow
 SMALL = ["env.time_limit=2", "budget.frames=256", "budget.num_envs=8", "budget.steps=16"]
 SMALL += ["budget.minibatches=2", "evaluation.curve.points=1", "evaluation.curve.num_envs=2"]
 SMALL += ["track.test.count=2", "logger=none"]

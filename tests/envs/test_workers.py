@@ -251,6 +251,7 @@ def test_envs_are_closed_in_their_processes(workers, tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_no_process_outlives_its_program(tmp_path) -> None:
     errors = tmp_path / "errors"
     kinds = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]

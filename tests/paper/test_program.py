@@ -137,6 +137,7 @@ def test_runs_of_one_label_with_other_configurations_are_not_pooled(tmp_path):
         check_pools(result, {"one": runs, "two": []})
 
 
+@pytest.mark.slow
 def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs):
     sweep, started = two_runs
     choices = ["experiments=[paper]", "labels=[coil,ppo]"]

@@ -101,6 +101,7 @@ def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path):
         assert torch.equal(resumed[key], value), key
 
 
+@pytest.mark.slow
 def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
     (tmp_path / "run").mkdir()
     overrides = [

@@ -67,6 +67,7 @@ def test_recorded_steering_is_learned_and_the_imitation_drives(folder):
     assert torch.bincount(tracks).tolist() == [33, 33, 12]
 
 
+@pytest.mark.slow
 def test_data_set_is_the_first_round_of_dagger(folder):
     trained(folder, "recording=[a.mcap,b.mcap]", "hydra.run.dir=two")
     arguments = ["method=dagger", "env=simulated_robot", "guide=spline", "learner=linear"]

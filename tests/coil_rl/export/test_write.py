@@ -83,7 +83,7 @@ def test_python_guide_is_an_input_in_the_unit_of_the_env(tmp_path, capsys):
     same_actions(run, policy, rooms(), heard)
 
 
-@pytest.mark.parametrize("guide", ["PI", "proportional"])
+@pytest.mark.parametrize("guide", [pytest.param("PI", marks=pytest.mark.slow), "proportional"])
 def test_guide_that_was_handed_over_is_said_to_be_no_policy(guide, tmp_path, capsys):
     folder = learned(
         tmp_path / "run", "coil", "delivery=tested", guide=f"thermostat.control:{guide}"

@@ -32,7 +32,7 @@ def cache(tmp_path_factory, monkeypatch):
 
 
 CASES = [
-    pytest.param(PPO, (), {"minibatches": 4}, id="ppo"),
+    pytest.param(PPO, (), {"minibatches": 4}, id="ppo", marks=pytest.mark.slow),
     pytest.param(A2C, (), {"minibatches": 4}, id="a2c", marks=pytest.mark.slow),
     pytest.param(
         PPO,
@@ -100,6 +100,7 @@ def test_auto_compiles_a_run_of_many_steps_and_remembers_it(monkeypatch):
         assert ppo.state_dict()["gradient"]["compile"] is expected
 
 
+@pytest.mark.slow
 def test_auto_goes_on_without_a_compiler_and_true_does_not(monkeypatch, tmp_path):
     monkeypatch.setenv("CXX", "missing")
     monkeypatch.setenv("PATH", str(tmp_path))

@@ -104,6 +104,7 @@ def test_other_arguments_in_the_same_folder_are_refused(compared):
     assert "a comparison with words=" in called("compare", *words, code=2).stderr
 
 
+@pytest.mark.slow
 def test_comparison_that_was_stopped_ends_with_the_same_table(compared, tmp_path, monkeypatch):
     folder, _ = compared
     job = jobs._run_job

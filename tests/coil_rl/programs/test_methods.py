@@ -15,14 +15,8 @@ from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume
 from coil_rl.run import checkpoint
 
-# Their parts are also tested with another method.
-SLOW = ["coil_multi", "coil_rfc", "kickstart", "mixing", "residual", "residual_coil", "rfc", "wsrl"]
-SLOW += [
-    "dynamic_coil_agent_only",
-    "dynamic_coil_guide_only",
-    "dynamic_coil_joint",
-    "dynamic_coil_stochastic",
-]
+# One of each kind: learning from batches, tests, a replay buffer, imitation, a search, no training.
+FAST = ["coil", "coil_anchored", "rlpd", "dagger", "tune", "guide"]
 SKLEARN = ["oil", "dagger"]  # archives of skops contain the time
 
 
@@ -33,7 +27,7 @@ def proxies(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "method",
-    [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in METHODS],
+    [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in METHODS],
 )
 def test_method_ends_with_the_same_files_after_a_resume(method, proxies, tmp_path, capsys):
     run = trained(tmp_path / "run", method, proxies, "track.test.count=1")

@@ -88,6 +88,7 @@ def test_every_experiment_is_either_for_any_env_or_refused():
     assert sorted({*OWN, *REFUSED}) == shipped("experiment")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", sorted(OWN))
 def test_jobs_of_an_experiment_can_be_started_in_an_own_env(experiment, tmp_path):
     checked = set()

@@ -75,6 +75,7 @@ def test_finished_run_prints_its_evaluation_again(run):
     assert {file: file.stat().st_mtime_ns for file in before} == before
 
 
+@pytest.mark.slow
 def test_run_stopped_during_its_evaluation_resumes_to_the_same_numbers(run, tmp_path):
     folder, _ = run
     train = command("train", *TINY, STILL, "logger=tensorboard", "hydra.run.dir=run")

@@ -87,6 +87,12 @@ def test_controller_of_a_handed_over_guide_does_what_the_guide_does(guide_wins):
     assert not isinstance(run.controller("last").policy, GuideActs)
 
 
+def test_handed_over_guide_is_not_listened_to(guide_wins, tmp_path):
+    refused = called("listen", f"run={guide_wins}", cwd=tmp_path, code=2).stderr
+    assert "handed over its guide, which uses no advice; write evaluation.policy=last" in refused
+    assert not list(tmp_path.iterdir())
+
+
 def test_every_step_is_a_frame_and_the_log_has_the_parts(guide_wins):
     rows = rows_of(guide_wins / "metrics.csv")
     last = {name: float(value) for name, value in rows[-1].items() if name.startswith("frames")}
@@ -128,6 +134,7 @@ def test_test_at_the_end_is_left_out_where_the_start_test_took_the_frames_of_bot
     assert "last_untested 1" in called("report", f"folder={run.parent}").stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [8000, 11_000])  # for three and for four cases
 def test_placebo_of_other_rows_always_has_other_rows(frames, tmp_path):
     settings = [f"budget.frames={frames}", "degrade=[shuffled]", "training.learning_rate=0"]
@@ -168,6 +175,7 @@ def test_run_without_a_guide_in_its_env_compares_its_own_policies(tmp_path):
     assert math.isnan(float(rows_of(folder / "metrics.csv")[-1]["delivery/guide"]))
 
 
+@pytest.mark.slow
 def test_killed_run_ends_with_the_same_files(tmp_path):
     overrides = ["method=coil_anchored", "checkpoint_every=2", "budget.frames=2400"]
     whole = trained(tmp_path / "whole", *overrides)

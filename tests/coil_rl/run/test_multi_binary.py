@@ -59,10 +59,10 @@ def trained(env, folder, method, *overrides):
     ("method", "learner"),
     [
         ("ppo", "ppo"),
-        ("ppo", "a2c"),
-        ("ppo", "trpo"),
         ("coil", "ppo"),
-        ("rfc", "ppo"),
+        pytest.param("ppo", "a2c", marks=pytest.mark.slow),
+        pytest.param("ppo", "trpo", marks=pytest.mark.slow),
+        pytest.param("rfc", "ppo", marks=pytest.mark.slow),
     ],
 )
 def test_policy_learns_the_same_with_flags_as_with_numbers(method, learner, tmp_path):

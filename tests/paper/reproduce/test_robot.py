@@ -162,6 +162,7 @@ def test_own_runs_drive_with_any_label_and_again_with_other_weights(tmp_path):
     assert (robots_of(run, tmp_path).commands[0][0] != first.commands[0][0]).any()
 
 
+@pytest.mark.slow
 def test_recorded_command_is_the_transformed_action(tmp_path):
     options = ["learner.action_gain=1.0", "track=generated", "track.train.count=1"]
     recording = robots_of(
