@@ -49,7 +49,7 @@ class GymnasiumEnv(SeededRows):
 
     Reads `action`. Writes `reward`, `done`, `terminated`, `truncated` [B, 1] and the observation:
     `observation`, or one entry a key of a Dict space (nested as there; a Tuple has the keys "0",
-    "1", ...). A Box is a tensor of `dtype`, but uint8 stays uint8; Discrete and MultiDiscrete are
+    "1", ...). A Box is a tensor of `dtype`, but pixels stay uint8; Discrete and MultiDiscrete are
     one-hot vectors of `dtype`, MultiBinary is one of 0 and 1; texts are left out. Actions are
     bounded or unbounded for a Box (and clamped to its bounds; a matrix is a vector), indices from 0
     for Discrete [B], MultiDiscrete [B, n] and a Box of a few whole numbers [B, n], and 0 or 1 for

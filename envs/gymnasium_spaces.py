@@ -77,7 +77,7 @@ class Entry:
         id: of the env, for the `ValueError` about a space that is not supported.
         path: keys of Dict spaces and indices of Tuple spaces.
         space: of the entry.
-        floats: dtype of entries that are not uint8.
+        floats: dtype of entries that are no pixels.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Entry:
             self.spec: TensorSpec = MultiOneHot(self.choices, dtype=dtype)
             # Places of the first choices in the vector.
             self.first = np.cumsum([0, *self.choices[:-1]])
-        elif isinstance(space, spaces.Box) and space.dtype == np.uint8:
+        elif _is_picture(space):
             self.dtype = np.dtype(np.uint8)
             self.spec = Unbounded(space.shape or (1,), dtype=torch.uint8)
         elif isinstance(space, spaces.Box):
@@ -139,7 +139,7 @@ class Entry:
         if value.dtype == self.dtype:
             converted = value.copy().reshape(self.given)
         else:
-            if self.fineness.unseen and value.itemsize > self.dtype.itemsize:
+            if self.fineness.unseen and not np.can_cast(value.dtype, self.dtype, "safe"):
                 self.fineness.see(value)
             with np.errstate(over="ignore"):
                 converted = value.astype(self.dtype).reshape(self.given)
@@ -224,6 +224,13 @@ def leaves(
             yield from leaves(part, (*path, index))
     elif space.dtype is None or space.dtype.kind != "U":
         yield path, space
+
+
+def _is_picture(space: spaces.Space[Any]) -> bool:
+    """Return whether a space is of pixels, which networks divide by 255."""
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
+        return False
+    return len(space.shape) == 3 or bool((space.high == 255).all())
 
 
 def _choices(space: spaces.Space[Any]) -> list[int]:

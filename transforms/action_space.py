@@ -179,6 +179,8 @@ class ActionSpace:
             if ((numbers >= 0) & (numbers < limit)).all():
                 if not (numbers == numbers.long()).all():
                     raise ValueError("is no whole number, but must be the number of a choice")
+                if indices is None and self.size > len(self.choices):
+                    self._check_one_hot(action)
                 return
             if self.first is not None:
                 low, high = self.first, self.first + torch.tensor(self.choices) - 1
@@ -187,6 +189,12 @@ class ActionSpace:
                     "vector"
                 )
             raise ValueError(f"is neither an index below {max(self.choices)} nor a one-hot vector")
+
+    def _check_one_hot(self, vectors: Tensor) -> None:
+        """Raise a `ValueError` for vectors [..., A] of 0 and 1 that do not choose one option."""
+        chosen = torch.stack([part.sum(-1) for part in vectors.split(self.choices, -1)], -1)
+        if (chosen != 1).any():
+            raise ValueError("is no one-hot vector: it must have exactly one 1 for each choice")
 
     def unfit_row(self, action: Tensor, batch: torch.Size) -> tuple[int, Tensor, str]:
         """Return the first row whose action does not fit the env, and the reason.

@@ -44,7 +44,7 @@ class AdviceDropout(GuideTransform):
     ) -> TensorDictBase:
         shape = (*self.parent.batch_size, 1)
         # A number for every row, so that later draws do not depend on which rows are reset.
-        given = torch.rand(shape, generator=self.rng.generator) >= self.probability
+        given = self.rng.sample(torch.rand, shape) >= self.probability
         if not self.learns:
             given = torch.full(shape, self.in_evaluation)
         return self._write(tensordict_reset, given.to(self.parent.device))

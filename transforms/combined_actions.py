@@ -229,7 +229,7 @@ class AdaptiveMixedAction(CombinedAction):
         doubt = next_tensordict.pop("uncertainty", None)
         weight = self.weight_after(tensordict["agent_weight"], doubt)
         if self.learns:
-            draw = torch.rand(weight.shape, generator=self.rng.generator).to(weight)
+            draw = self.rng.sample(torch.rand, weight.shape).to(weight)
             drawn = self.low + (self.warm_up_high - self.low) * draw
             weight = torch.where((self.taken < self.warm_up).to(weight.device), drawn, weight)
         return super()._step(tensordict, next_tensordict).set("agent_weight", weight)
@@ -270,7 +270,7 @@ class _ActionSwitch(CombinedAction):
     def _draw(self) -> Tensor:
         """Draw a uniform number for every row, so that later draws do not depend on the data."""
         shape = (*self.parent.batch_size, 1)
-        return torch.rand(shape, generator=self.rng.generator).to(self.parent.device)
+        return self.rng.sample(torch.rand, shape).to(self.parent.device)
 
     def _of_agent(self, tensordict: TensorDictBase) -> Tensor:
         """Return the env's action where the agent acts."""

@@ -263,9 +263,9 @@ class RandomAdvice(_DrawnAdvice):
 class ShuffledAdvice(DegradedAdvice):
     """Placebo: the advice for another row of the batch; same distribution, no information.
 
-    At every step all rows are shifted by the same random number. In a partial reset, a new episode
-    gets the previous advice of another row. When the env builds its specs, a batch of one row is a
-    `ValueError`.
+    At every step all rows are shifted by the same random number; where several rows have one case,
+    those of each policy among themselves. In a partial reset, a new episode gets the previous
+    advice of another row. When the env builds its specs, a batch of one row is a `ValueError`.
 
     Args:
         seed: of the draws.
@@ -286,8 +286,11 @@ class ShuffledAdvice(DegradedAdvice):
         """Return the advice for other rows."""
         rows = advice.flatten(0, -3) if advice.ndim > 2 else advice.unsqueeze(0)
         self._check_rows(len(rows))
-        shift = int(torch.randint(1, len(rows), (), generator=self.rng.generator))
-        return rows.roll(shift, 0).view_as(advice)
+        among = self.rng.different or len(rows)
+        if among == 1:  # rows of a single case
+            among = len(rows)
+        shift = int(torch.randint(1, among, (), generator=self.rng.generator))
+        return rows.unflatten(0, (-1, among)).roll(shift, 1).view_as(advice)
 
     def _check_rows(self, rows: int) -> None:
         if rows < 2:

@@ -82,10 +82,11 @@ class Delay(Disturbance):
 
     def _drawn(self, tensordict: TensorDictBase) -> Tensor:
         """Return new lags [*batch, 1]; those of all rows are drawn, whichever of them begin."""
-        shape = (*tensordict.batch_size, 1)
-        lag = torch.randint(self.min_lag, self.max_lag + 1, shape, generator=self.rng.generator).to(
-            tensordict.device or "cpu"
-        )
+
+        def drawn(*shape: int, generator: torch.Generator) -> Tensor:
+            return torch.randint(self.min_lag, self.max_lag + 1, shape, generator=generator)
+
+        lag = self.rng.sample(drawn, (*tensordict.batch_size, 1)).to(tensordict.device or "cpu")
         return lag if self.active else torch.zeros_like(lag)
 
     def _late(self, values: Tensor, lag: Tensor) -> Tensor:

@@ -126,11 +126,31 @@ class SeededGenerator(nn.Module):
 
     Args:
         seed: of the generator.
+
+    Attributes:
+        different: number of rows that draw; row i gets what row `i % different` draws, so that
+            rows of one case, in which different policies act, get the same numbers. None: all rows
+            draw.
     """
 
     def __init__(self, seed: int) -> None:
         super().__init__()
         self.generator = torch.Generator().manual_seed(seed)
+        self.different: int | None = None
+
+    def sample(self, sample: Callable[..., Tensor], shape: Sequence[int], dim: int = 0) -> Tensor:
+        """Draw a tensor.
+
+        Args:
+            sample: draws a tensor of a shape with a generator, such as `torch.randn`.
+            shape: of the tensor.
+            dim: that of the rows.
+        """
+        if self.different is None:
+            return sample(*shape, generator=self.generator)
+        few = [*shape[:dim], self.different, *shape[dim + 1 :]]
+        rows = torch.arange(shape[dim]) % self.different
+        return sample(*few, generator=self.generator).index_select(dim, rows)
 
     def draw(
         self, sample: Callable[..., Tensor], shapes: Sequence[torch.Size], *, after_reset: bool
@@ -147,7 +167,7 @@ class SeededGenerator(nn.Module):
             after_reset: whether this is a partial reset.
         """
         state = self.generator.get_state() if after_reset else None
-        draws = [sample(2, *shape, generator=self.generator) for shape in shapes]
+        draws = [self.sample(sample, (2, *shape), dim=1) for shape in shapes]
         if state is not None:
             self.generator.set_state(state)
         return [pair[int(after_reset)] for pair in draws]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
@@ -17,27 +17,28 @@ from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 
-class _Uniform(SeededGenerator):
-    """Uniform random numbers [*batch, size] from `low` to `high`, or random actions of a space.
+def _batch_of(tensordict: TensorDictBase, key: NestedKey) -> torch.Size:
+    """Return the batch shape of the TensorDict that holds an entry."""
+    if isinstance(key, str) or len(key) == 1:
+        return tensordict.batch_size
+    return tensordict[key[:-1]].batch_size
 
-    What is observed gives the batch shape only.
-    """
+
+class _Uniform(SeededGenerator):
+    """Uniform random numbers [*batch, size] from `low` to `high`, or random actions of a space."""
 
     def __init__(self, low: float | None, high: float | None, size: int, seed: int) -> None:
         super().__init__(seed)
         self.low, self.high, self.size = low, high, size
         self.space: ActionSpace | None = None
 
-    def forward(self, observation: Tensor) -> Tensor:
-        batch = observation.shape[:-1]
+    def forward(self, batch: torch.Size, device: torch.device | None) -> Tensor:
         if self.space is not None and self.low is None and self.high is None:
             shape = (*batch, *self.space.agents, self.space.size)
-            draw = torch.rand(shape, generator=self.generator)
-            return self.space.random(draw.to(observation.device, self.space.dtype))
+            return self.space.random(self.sample(torch.rand, shape).to(device, self.space.dtype))
         low = -1.0 if self.low is None else self.low
         high = 1.0 if self.high is None else self.high
-        draw = torch.rand(*batch, self.size, generator=self.generator)
-        return (low + (high - low) * draw).to(observation)
+        return (low + (high - low) * self.sample(torch.rand, (*batch, self.size))).to(device)
 
 
 class ConstantGuide(TensorDictModuleBase):
@@ -45,7 +46,7 @@ class ConstantGuide(TensorDictModuleBase):
 
     Args:
         value: the action in the unit of the env, one number or one per dimension.
-        in_key: any entry [*batch, N], for the batch shape.
+        in_key: any entry, for the batch shape.
         out_key: entry for the action, [*batch, A].
     """
 
@@ -63,7 +64,7 @@ class ConstantGuide(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        batch = tensordict[self.in_keys[0]].shape[:-1]
+        batch = _batch_of(tensordict, self.in_keys[0])
         return tensordict.set(self.out_keys[0], self.value.expand(*batch, -1))
 
 
@@ -72,7 +73,7 @@ class ZeroGuide(TensorDictModuleBase):
 
     Args:
         size: A, number of dimensions of the action where no env says it, at least 1.
-        in_key: any entry [*batch, N], for the batch shape.
+        in_key: any entry, for the batch shape.
         out_key: entry for the action, [*batch, A]; 0 until `GuideActions` says which actions there
             are.
     """
@@ -97,11 +98,11 @@ class ZeroGuide(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        batch = tensordict[self.in_keys[0]].shape[:-1]
+        batch = _batch_of(tensordict, self.in_keys[0])
         return tensordict.set(self.out_keys[0], self.value.expand(*batch, *self.value.shape))
 
 
-class RandomGuide(TensorDictModule):
+class RandomGuide(TensorDictModuleBase):
     """Guide with random actions, uniform in the actions of the env: numbers or choices.
 
     Of a coordinate without a bound see `ActionSpace.random`. The state of its generator is in
@@ -113,7 +114,7 @@ class RandomGuide(TensorDictModule):
         size: A, number of dimensions of the action with `low` or `high` or outside of an env, at
             least 1.
         seed: of the generator.
-        in_key: any entry [*batch, N], for the batch shape.
+        in_key: any entry, for the batch shape.
         out_key: entry for the action, [*batch, A].
     """
 
@@ -127,7 +128,9 @@ class RandomGuide(TensorDictModule):
         out_key: NestedKey = "action",
     ) -> None:
         check_range(1, size=size)
-        super().__init__(_Uniform(low, high, size, seed), in_keys=[in_key], out_keys=[out_key])
+        self.in_keys, self.out_keys = [in_key], [out_key]
+        super().__init__()
+        self.module = _Uniform(low, high, size, seed)
 
     def in_space(self, space: ActionSpace) -> None:
         """Draw from a space from here on, unless `low` or `high` is given.
@@ -136,6 +139,11 @@ class RandomGuide(TensorDictModule):
             space: of the env.
         """
         self.module.space = space
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        batch = _batch_of(tensordict, self.in_keys[0])
+        return tensordict.set(self.out_keys[0], self.module(batch, tensordict.device))
 
 
 class FollowAdvice(TensorDictModuleBase):

@@ -128,6 +128,7 @@ def actor(
     shapes: Shapes | None = None,
     state_dependent_scale: bool = False,
     squash: bool = True,
+    clip: bool = True,
     inputs: Inputs | None = None,
     anchor: Anchor | None = None,
 ) -> ProbabilisticTensorDictSequential:
@@ -150,6 +151,7 @@ def actor(
         state_dependent_scale: whether the standard deviation is an output of the network; otherwise
             it is the same in every state.
         squash: whether bounded actions are squashed by tanh; otherwise samples are clipped.
+        clip: whether samples that are not squashed are clipped; otherwise the env does that.
         inputs: what networks read in place of some of `in_keys`; the first module of the policy.
         anchor: the settings of an anchored policy, which needs `AnchoredInputs`; None: it is none.
 
@@ -169,7 +171,7 @@ def actor(
         dtype = spec.dtype if spec.dtype.is_floating_point else None
         return ObservationNetwork(env, in_keys, network, outputs, gain, shapes, dtype)
 
-    part = _action_part(env, spec, network_of, scale, state_dependent_scale, squash)
+    part = _action_part(env, spec, network_of, scale, state_dependent_scale, squash, clip)
     head, sample = part.head, part.sample
     if anchor is not None and isinstance(inputs, AnchoredInputs):
         if spec.dtype.is_floating_point:
@@ -227,6 +229,7 @@ def _action_part(
     scale: float,
     state_dependent_scale: bool,
     squash: bool,
+    clip: bool,
 ) -> _ActionPart:
     """Return the part for the actions of an env; arguments as for `actor`."""
     event = action_shape(env)
@@ -241,7 +244,9 @@ def _action_part(
     low, high = spec.space.low[first], spec.space.high[first]
     if squash and bool((high - low).isfinite().all()):
         return _squashed(env, head, low, high)
-    return _clipped(env, head, low, high)
+    if clip:
+        return _clipped(env, head, low, high)
+    return _unbounded(env, head, event)
 
 
 def _one_choice(env: EnvBase, spec: TensorSpec, network_of: NetworkOf) -> _ActionPart:

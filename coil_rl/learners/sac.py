@@ -182,6 +182,7 @@ class SAC(OffPolicy):
             self.action_scale,
             self.action_gain,
             state_dependent_scale=True,
+            clip=False,  # where a bound is missing the critics learn of the sample itself
             inputs=self.inputs,
             anchor=self.anchor,
         )

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from tensordict import unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
@@ -81,11 +82,8 @@ class TrainingCases:
 
         They cannot where rows that begin alike draw different numbers later.
         """
-        env = self._build(SOME_ROWS) if self.env is None else self.env
-        seeded = seeded_env(env)
-        if seeded is None or seeded.draws_in_steps:
-            return False
-        return not any(isinstance(part, SeededGenerator) for part in env.modules())
+        seeded = seeded_env(self._build(SOME_ROWS) if self.env is None else self.env)
+        return seeded is not None and not seeded.draws_in_steps
 
     def _copy(self, copies: int) -> EnvBase:
         """Return an env that has each of the present cases in that many rows."""
@@ -147,7 +145,7 @@ class TrainingCases:
     @torch.no_grad()
     def _acted(self, env: EnvBase, policy: TensorDictModuleBase, *, sampled: bool) -> Totals:
         """Return the totals of a policy in the rows of the present cases, and count its steps."""
-        totals = Totals({"return": Measure("episode_reward", "last")})
+        totals = Totals({"return": Measure(unravel_key(env.reward_key), "sum")})
         before = guide_calls(env)
         with (
             torch.random.fork_rng(),
@@ -158,7 +156,8 @@ class TrainingCases:
                 if isinstance(part, SeededGenerator):  # of a transform: the env does not seed it
                     part.generator.manual_seed(self.env_seed + number)
             torch.manual_seed(self.env_seed)
-            for after, running in episodes(env, policy, sampled=sampled, tick=bar.update):
+            steps = episodes(env, policy, sampled=sampled, cases=self.count, tick=bar.update)
+            for after, running in steps:
                 totals.add(after, running)
         self.steps += int(totals.steps.sum())
         self.episodes += totals.steps.numel()

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -136,7 +137,9 @@ class EvaluationCurve:
             progress(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar,
         ):
             for cases, make_env in self.envs.items():
-                results = measures(make_env(len(updates)), policies, self.watch, bar.update)
+                env = make_env(len(updates))
+                count = env.batch_size.numel() // len(updates)
+                results = measures(env, policies, cases=count, watch=self.watch, tick=bar.update)
                 for name, values in results.items():
                     means = values.view(len(updates), -1).double().mean(1).tolist()
                     for row, mean in zip(rows, means, strict=True):
@@ -164,6 +167,8 @@ def _evenly(ends: Sequence[int], parts: int) -> list[int]:
 def measures(
     env: EnvBase,
     policy: TensorDictModuleBase,
+    *,
+    cases: int | None = None,
     watch: Watch | None = None,
     tick: Callable[[], Any] | None = None,
 ) -> dict[str, Tensor]:
@@ -172,17 +177,18 @@ def measures(
     Args:
         env: of batch size [B].
         policy: writes the action.
+        cases: number of different cases; row i has case `i % cases`. None: as many as rows.
         watch: further measures, as for `EvaluationCurve`.
         tick: called after every step.
 
     Returns:
         The `return`, the sum of the rewards of the task, and the measures of `watch`, [B] each.
     """
-    measured = {"return": Measure("episode_reward", "last")}
+    measured = {"return": Measure(unravel_key(env.reward_key), "sum")}
     for group, reduction in (("episode", "last"), ("step", "mean")):
         keys = (watch or {}).get(group, {})
         measured |= {name: Measure.of(key, reduction=reduction) for name, key in keys.items()}
     totals = Totals(measured)
-    for after, running in episodes(env, policy, tick=tick):
+    for after, running in episodes(env, policy, cases=cases, tick=tick):
         totals.add(after, running)
     return totals.results()

@@ -19,6 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.measures import Measure
 from coil_rl.run.lean_steps import LeanEnv
+from coil_rl.transforms.guide_transform import SeededGenerator
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,8 @@ def evaluate_policy(
     """
     measures = {"reward": Measure(unravel_key(env.reward_key), "sum"), **(measures or {})}
     totals, recorded = Totals(measures), {name: list[Tensor]() for name in record or {}}
-    for after, running in episodes(env, policy, sampled=sampled, tick=tick):
+    some = len(cases) or None
+    for after, running in episodes(env, policy, sampled=sampled, cases=some, tick=tick):
         totals.add(after, running)
         if watch is not None:
             watch(running.reshape(-1))
@@ -174,14 +176,21 @@ def episodes(
     policy: TensorDictModuleBase,
     *,
     sampled: bool = False,
+    cases: int | None = None,
     tick: Callable[[], Any] | None = None,
 ) -> Iterator[tuple[TensorDictBase, Tensor]]:
     """Yield the entries after each step of one episode on every row.
 
     With them comes whether the row was still in its episode, [*B, 1].
 
-    Arguments as for `evaluate_policy`.
+    Args:
+        env: as for `evaluate_policy`.
+        policy: as above.
+        sampled: as above.
+        cases: number of different cases; row i has case `i % cases`. None: as many as rows.
+        tick: as above.
     """
+    _draw_by_case(env, cases)
     carrier = env.eval().reset()
     lean = LeanEnv(env) if LeanEnv.covers(env) else None
     running = torch.ones_like(env.full_done_spec["done"].zero())
@@ -201,6 +210,14 @@ def episodes(
             return
         if tick is not None:
             tick()
+
+
+def _draw_by_case(env: EnvBase, cases: int | None) -> None:
+    """Let transforms and guides draw the same random numbers for all rows of a case."""
+    several = cases is not None and env.batch_dims == 1 and env.batch_size.numel() > cases
+    for part in env.modules():
+        if isinstance(part, SeededGenerator):
+            part.different = cases if several else None
 
 
 def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool) -> TensorDictBase:

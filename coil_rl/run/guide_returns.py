@@ -54,7 +54,8 @@ def guide_returns(
     """
     if EVALUATION not in make_env.sizes or not guides:
         return {}
-    env, policy = make_env.guided(make_env.sizes[EVALUATION], EVALUATION, guides)
+    cases = make_env.sizes[EVALUATION]
+    env, policy = make_env.guided(cases, EVALUATION, guides)
     with torch.random.fork_rng():
-        returns = measures(env, policy)["return"].view(len(guides), -1).mean(1)
+        returns = measures(env, policy, cases=cases)["return"].view(len(guides), -1).mean(1)
     return dict(zip(guide_titles(guides), returns.tolist(), strict=True))

@@ -158,6 +158,18 @@ class EnvMaker:
         return env, FollowAdvice(env, of_row)
 
 
+# Entries that transforms, policies and learners write. `last_action`, `row` and `is_init` are not
+# among them: where the env has its own, that is used.
+WRITTEN = {
+    *("action_log_prob", "action_value", "advantage", "agent_acts", "agent_weight"),
+    *("chosen_action", "chosen_action_value", "concatenated", "episode_reward"),
+    *("executed_action", "exploration_noise", "guide_action", "guide_distance", "guide_number"),
+    *("guide_state", "guide_steps", "limit_count", "loc", "logits", "normalised", "policy_state"),
+    *("remembered", "scale", "shown", "state_action_value", "state_value", "task_reward"),
+    *("unclipped_action", "value_target"),
+}
+
+
 def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> EnvBase:
     """Return an env with the sum of its rewards, `episode_reward`, and with transforms.
 
@@ -165,6 +177,11 @@ def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> Env
 
     Transforms that do not fit are a `UserError` that begins with `name`.
     """
+    if overwritten := WRITTEN & set(env.observation_spec.keys()):
+        raise UserError(
+            f"env: its observation has an entry {min(overwritten)}, a name under which a training "
+            "writes its own numbers; rename it in a wrapper"
+        )
     # Of the env itself and of the transforms.
     parts = [*env.modules(), *transforms]
     if any(isinstance(part, (VecNorm, VecNormV2)) for part in parts):

@@ -257,16 +257,16 @@ class Place(gymnasium.Env):
 
     action_space, observation_space = spaces.Discrete(2), spaces.Box(-np.inf, np.inf, (1,), float)
 
-    def __init__(self, offset, step=0.001):
-        self.offset, self.step_size = offset, step
+    def __init__(self, offset, step=0.001, dtype=float):
+        self.offset, self.step_size, self.dtype = offset, step, dtype
 
     def reset(self, *, seed=None, options=None):
         self.place = self.offset
-        return np.array([self.place]), {}
+        return np.array([self.place], self.dtype), {}
 
     def step(self, action):
         self.place += self.step_size
-        return np.array([self.place]), 0.0, False, False, {}
+        return np.array([self.place], self.dtype), 0.0, False, False, {}
 
 
 def said_of_coarse_numbers(env):
@@ -290,6 +290,35 @@ def test_numbers_too_fine_for_the_dtype_are_said(offset, step, coarse):
     found = said_of_coarse_numbers(GymnasiumEnv(partial(Place, offset, step), max_steps=1000))
     assert bool(found) == coarse
     assert not coarse or "number 0 of the observation goes from 5412345.67" in found[0]
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint32, np.int64, float])
+def test_whole_numbers_too_large_for_the_dtype_are_said(dtype):
+    make = partial(Place, 1_700_000_000, 1, dtype)
+    assert said_of_coarse_numbers(GymnasiumEnv(make, max_steps=1000))
+
+
+def test_pixels_stay_whole_numbers_and_other_small_numbers_do_not():
+    class Counts(gymnasium.Env):
+        action_space = spaces.Discrete(2)
+        observation_space = spaces.Dict(
+            {
+                "image": spaces.Box(0, 10, (4, 5, 3), np.uint8),
+                "pixels": spaces.Box(0, 255, (2,), np.uint8),
+                "cars": spaces.Box(0, 3, (2,), np.uint8),
+            }
+        )
+
+        def reset(self, *, seed=None, options=None):
+            return self.observation_space.sample() | {"cars": np.array([3, 1], np.uint8)}, {}
+
+        def step(self, action):
+            return self.reset()[0], 0.0, False, False, {}
+
+    first = GymnasiumEnv(Counts, max_steps=3).reset()
+    assert first["image"].dtype == first["pixels"].dtype == torch.uint8
+    assert first["cars"][0].tolist() == [3.0, 1.0]
+    assert first["cars"].dtype == torch.float32
 
 
 @pytest.mark.parametrize(("offset", "coarse"), [(1e8, True), (-1e6, True), (100.0, False)])

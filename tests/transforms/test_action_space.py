@@ -158,6 +158,16 @@ def test_numbers_have_the_bounds_and_the_dtype_of_the_action(dtype):
             torch.full((4, 3), 2.5),
             "is neither an index below 3 nor a one-hot vector",
         ),
+        (
+            Categorical(3, (4,)),
+            torch.zeros(4, 3),
+            "is no one-hot vector: it must have exactly one 1 for each choice",
+        ),
+        (
+            MultiCategorical([2, 2], (4, 2)),
+            torch.tensor([1.0, 0.0, 1.0, 1.0]).expand(4, 4),
+            "is no one-hot vector: it must have exactly one 1 for each choice",
+        ),
         (Unbounded((4,)), torch.zeros(4), "advice needs a vector of real numbers or choices"),
         (
             Bounded(0, 9, (4, 1), dtype=torch.int64),

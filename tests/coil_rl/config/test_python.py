@@ -4,6 +4,7 @@ import csv
 import json
 import math
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,6 +14,7 @@ from programs import called
 
 import coil_rl
 from coil_rl.config import given
+from coil_rl.errors import UserError
 from coil_rl.run import checkpoint
 
 ENV = "thermostat:Room-v0"
@@ -285,3 +287,14 @@ def test_numbers_of_a_class_are_tuned(tmp_path):
     )
     assert set(json.loads((run.folder / "tuned.json").read_text())) == {"gain"}
     assert run.controller().act(np.zeros(3, np.float32)).shape == (1,)
+
+
+@pytest.mark.parametrize("name", ["state_value", "loc", "episode_reward"])
+def test_entry_that_a_training_overwrites_is_refused(name, tmp_path):
+    def make():
+        env = gymnasium.make("Pendulum-v1")
+        space = gymnasium.spaces.Dict({name: env.observation_space})
+        return gymnasium.wrappers.TransformObservation(env, lambda seen: {name: seen}, space)
+
+    with pytest.raises(UserError, match=f"an entry {name}, a name under which a training writes"):
+        coil_rl.train(make, method="ppo", folder=tmp_path / "run", overrides=[f"observes=[{name}]"])

@@ -26,3 +26,11 @@ def test_random_is_uniform_and_depends_on_its_seed():
     assert -2 <= action.min() < -1.99
     assert 0.99 < action.max() < 1
     assert abs(action.mean() + 0.5) < 0.01
+
+
+def test_batch_shape_is_that_of_the_data_whatever_is_observed():
+    images = TensorDict({"observation": torch.zeros(5, 8, 8, 3, dtype=torch.uint8)}, [5])
+    for guide in (ConstantGuide([0.1, -0.2]), ZeroGuide(size=2), RandomGuide(size=2)):
+        action = guide(images.copy())["action"]
+        assert action.shape == (5, 2)
+        assert action.dtype == torch.float32

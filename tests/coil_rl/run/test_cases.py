@@ -156,22 +156,34 @@ def test_policies_side_by_side_have_the_returns_of_each_alone():
     assert not torch.equal(*cases.compared([learner.policy] * 2, [True, False]))
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["env=pendulum", "disturb=[observation_noise]"],
-        ["env=pendulum", "disturb=[action_delay]"],
-        ["env=pendulum", "degrade=[shuffled]"],
-        ["env=simulated_robot"],
-    ],
-    ids=["noise", "delay", "shuffled advice", "noisy scans"],
-)
-def test_policies_act_in_turn_where_rows_that_begin_alike_draw_other_numbers(words):
-    cases, learner = built(*words)
+def test_policies_act_in_turn_where_rows_that_begin_alike_draw_other_numbers():
+    cases, learner = built("env=simulated_robot")  # its scans are noisy
     assert not cases.can_copy()
     cases.renew(2)
     first, second = cases.compared([learner.policy, learner.policy])
     assert torch.equal(first, second)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["disturb=[observation_noise]"],
+        ["disturb=[action_delay]", "disturb.action_delay.max_lag=6"],
+        ["degrade=[noisy]"],
+        ["degrade=[shuffled]"],
+        ["guide=random"],
+    ],
+    ids=["noise", "delay", "noisy advice", "shuffled advice", "random guide"],
+)
+def test_policies_side_by_side_have_the_same_noise_and_delays(words):
+    cases, learner = built("env=pendulum", *words)
+    assert cases.can_copy()
+    cases.renew(3)
+    first, second = cases.compared([learner.policy, learner.policy])
+    assert torch.equal(first, second)
+    assert len(first.unique()) == 3
+    (alone,) = cases.compared([learner.policy])
+    torch.testing.assert_close(first, alone, rtol=1e-3, atol=0.1)
 
 
 def test_a_block_of_cases_makes_one_env():

@@ -1,11 +1,15 @@
+import gymnasium
+import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 from worlds import driving_measures, perturbed
 
+from coil_rl import GymnasiumEnv
 from coil_rl.envs import ConeTrackEnv
 from coil_rl.errors import UserError
-from coil_rl.guides import SplineGuide
+from coil_rl.guides import ConstantGuide, SplineGuide
 from coil_rl.learners import PPO
 from coil_rl.run.curve import EvaluationCurve, measures
 from coil_rl.run.evaluation import evaluate_policy
@@ -108,8 +112,27 @@ def test_missing_policy_is_named(tmp_path, rings):
 
 
 def test_guide_measured_from_its_cases_does_not_crash(rings):
-    values = measures(world(rings), SplineGuide(), WATCH)
+    values = measures(world(rings), SplineGuide(), watch=WATCH)
     assert {name: value.shape for name, value in values.items()} == dict.fromkeys(
         ("return", "crashed", "smoothness"), (CASES,)
     )
     assert not values["crashed"].any()
+
+
+def test_returns_are_summed_as_exactly_as_those_of_the_table():
+    class Costly(gymnasium.Env):
+        observation_space, action_space = spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            reward = -1000.0 - 0.05 * float((action[0] - 0.5) ** 2)
+            return np.zeros(1, np.float32), reward, False, False, {}
+
+    env = TransformedEnv(GymnasiumEnv(Costly, num_envs=2, max_steps=1000), RewardSum())
+    for action in (0.5, 0.0):
+        guide = ConstantGuide(action)
+        expected = evaluate_policy(env, guide).episodes[0]["reward"]
+        assert measures(env, guide)["return"].tolist() == [expected] * 2
+        assert expected == pytest.approx(-1e6 - 50 * (action - 0.5) ** 2, abs=0.1)

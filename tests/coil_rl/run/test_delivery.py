@@ -53,7 +53,19 @@ def report(folder):
 def guide_wins(tmp_path_factory):
     """A run of COIL that learns nothing, so that its guide is better than any of its policies."""
     folder = tmp_path_factory.mktemp("delivery") / "run"
-    return trained(folder, "method=coil", "training.learning_rate=0")
+    disturbed = ["disturb=[action_delay,observation_noise]", "disturb.action_delay.max_lag=6"]
+    return trained(folder, "method=coil", "training.learning_rate=0", *disturbed)
+
+
+def test_policies_that_act_alike_have_equal_returns_whatever_disturbs_the_env(guide_wins):
+    guide, agent = [
+        row
+        for row in rows_of(guide_wins / "evaluation.csv")
+        if row["case"] == "1" and row["actions"] == "deterministic"
+    ]
+    assert agent["reward"] == guide["reward"]  # it is the guide that was handed over
+    curve = [row["evaluation/return"] for row in rows_of(guide_wins / "metrics.csv")]
+    assert len(set(curve) - {"nan"}) == 1 < len(curve)  # no policy learned anything
 
 
 def test_guide_is_handed_over_where_nothing_better_was_learned(guide_wins):

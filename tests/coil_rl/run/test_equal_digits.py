@@ -175,7 +175,14 @@ def test_every_method_learns_the_same_in_every_unit_of_the_reward(method, tmp_pa
     assert found[0] == found[1]
 
 
-@pytest.mark.parametrize("method", marked(["coil", "residual", "residual_coil", "coil_anchored"]))
+@pytest.mark.parametrize(
+    "method",
+    [
+        *("coil", "residual", "q_filter"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("coil_anchored", "rlpd", "cheq")),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("ibrl", "residual_coil")),
+    ],
+)
 def test_half_bounded_actions_have_equal_digits_wherever_the_bound_is(method, tmp_path):
     boxes = HALF
     if method != "residual":
