@@ -8,8 +8,9 @@ A task has a folder with the runs of its arms, whose labels are METHOD_ARM. `ppo
 PPO; in the others a method has an intact, detuned, reversed or random guide. The unit is the seed.
 A method is compared with the better of its guide, as it acts alone in the cases of the table, and
 of PPO, seed by seed. It is a loss if the 95 % interval of the mean difference is below 0 and the
-mean below -1 % of the scale, a gain if both are above, and else even. The scale of a task is the
-distance from the return of its random guide to the better of PPO and its intact guide.
+mean below -1 % of the scale, a gain if both are above, and else even; without an interval, as with
+one seed, it is unknown. The scale of a task is the distance from the return of its random guide to
+the better of PPO and its intact guide.
 
 With `--others 10` the seeds from 10 on, which were run once afterwards, have a column of their own
 beside those below 10; the other columns are of all.
@@ -18,13 +19,15 @@ beside those below 10; the other columns are of all.
 import argparse
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from coil_rl.errors import UserError
 from coil_rl.files import write_text
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.curves import points
@@ -67,20 +70,44 @@ class Arm:
     runs: dict[int, Run]
 
     def reward(self, seed: int) -> float:
-        """Return the mean reward of the policy that a run handed over."""
-        return _reward(self.runs[seed], self.runs[seed].label)
+        """Return the mean reward of the policy that a run handed over, see `mean_reward`."""
+        return mean_reward(self.runs[seed], self.runs[seed].label)
 
     @property
     def guide(self) -> float:
         """Mean reward of the guide alone, which is the same for all seeds; NaN without one."""
-        return float(np.mean([_reward(run, GUIDE) for run in self.runs.values()]))
+        return float(np.mean([mean_reward(run, GUIDE) for run in self.runs.values()]))
 
 
-def _reward(run: Run, driver: str) -> float:
-    """Return a mean reward with deterministic actions; NaN if there is no such policy."""
+def plain_episodes(run: Run, driver: str) -> pd.DataFrame:
+    """Return the evaluation of a policy with deterministic actions and the advice as it is.
+
+    Args:
+        run: of the policy.
+        driver: the policy, as in the evaluation.
+    """
     table = run.evaluation
     plain = (table["advice"] == "") & (table["actions"] == "deterministic")
-    return float(table[plain & (table["driver"] == driver)]["reward"].mean())
+    return table[plain & (table["driver"] == driver)]
+
+
+def mean_reward(run: Run, driver: str) -> float:
+    """Return the mean reward of a policy; NaN if there is no such policy.
+
+    Args:
+        run: of the policy.
+        driver: the policy, as in the evaluation.
+
+    Raises:
+        ValueError: if the reward of an episode is NaN.
+    """
+    rewards = plain_episodes(run, driver)["reward"]
+    if unknown := int(rewards.isna().sum()):
+        raise ValueError(
+            f"{run.folder}: the reward of {driver} is nan in {unknown} of {len(rewards)} cases of "
+            "evaluation.csv; find out why, or remove the run from the folder"
+        )
+    return float(rewards.mean())
 
 
 def arms_of(runs: Sequence[Run]) -> dict[Key, Arm]:
@@ -146,7 +173,7 @@ def _part(arm: Arm, alone: Arm, scale: float, seeds: range) -> str:
 
 
 def scale_of(arms: dict[Key, Arm], alone: Arm) -> float:
-    """Return the scale of a task; NaN without a random guide.
+    """Return the scale of a task; NaN without a random guide, or if it is as good as the better.
 
     Args:
         arms: of the task.
@@ -156,7 +183,7 @@ def scale_of(arms: dict[Key, Arm], alone: Arm) -> float:
     intact = guide_of(arms, INTACT)
     if not math.isnan(intact):
         best = max(best, intact)
-    return abs(best - guide_of(arms, RANDOM))
+    return abs(best - guide_of(arms, RANDOM)) or math.nan
 
 
 def guide_of(arms: dict[Key, Arm], name: str) -> float:
@@ -211,12 +238,34 @@ def _interval(values: np.ndarray) -> tuple[float, float, float]:
 
 
 def verdict(mean: float, low: float, high: float) -> str:
-    """Return "gain", "even" or "loss" for a mean difference and its interval, in % of the scale."""
+    """Return "gain", "even", "loss" or "unknown" for a mean difference and its interval.
+
+    Args:
+        mean: in % of the scale.
+        low: end of its interval; NaN if it has none, as with one seed or without a scale.
+        high: end of its interval.
+    """
+    if any(map(math.isnan, (mean, low, high))):
+        return "unknown"
     if high < 0 and mean < -100 * MATERIAL:
         return "loss"
     if low > 0 and mean > 100 * MATERIAL:
         return "gain"
     return "even"
+
+
+def counted_verdicts(verdicts: Iterable[object]) -> str:
+    """Return how many verdicts there are of each kind, unknown ones only if there are any.
+
+    Args:
+        verdicts: see `verdict`.
+    """
+    counts = Counter(verdicts)
+    unknown = f"{counts['unknown']} unknown, " if counts["unknown"] else ""
+    return (
+        f"{counts['gain']} gains, {counts['even']} even (undecided), {unknown}"
+        f"{counts['loss']} losses"
+    )
 
 
 def _lowest(run: Run) -> float:
@@ -235,6 +284,39 @@ def _counted(values: object) -> str:
     return ", ".join(f"{value}: {count}" for value, count in counts.most_common())
 
 
+def runs_of(folder: Path, pages: Path | None = None) -> dict[str, list[Run]]:
+    """Return the runs of each task.
+
+    Args:
+        folder: with a folder for each task.
+        pages: a folder in it that is no task.
+
+    Raises:
+        UserError: if a folder has no runs, or a damaged one.
+    """
+    tasks = [path for path in sorted(folder.iterdir()) if path.is_dir() and path != pages]
+    return {path.name: read_runs([path]) for path in tasks if not path.name.startswith(".")}
+
+
+def with_ppo(folder: Path, runs: Mapping[str, list[Run]]) -> dict[str, list[Run]]:
+    """Return the runs of the tasks that have plain PPO, and say which tasks are left out.
+
+    Args:
+        folder: of the runs, for messages.
+        runs: of each task.
+
+    Raises:
+        ValueError: if no task has a finished run of plain PPO.
+    """
+    found = {task: own for task, own in runs.items() if (PPO, ALONE) in arms_of(own)}
+    if not found:
+        raise ValueError(f"{folder} has no task with plain PPO; train it: +arm=alone method=ppo")
+    for task in runs:
+        if task not in found:
+            print(f"{task} is left out: it has no plain PPO; train +arm=alone method=ppo")
+    return found
+
+
 def main() -> None:
     """Print the table and write it into the folder."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -242,23 +324,34 @@ def main() -> None:
     parser.add_argument("--others", type=int, help="smallest of the seeds that confirm the claim")
     given = parser.parse_args()
     folder = given.folder
-    rows: list[dict[str, object]] = []
-    for task in sorted(path for path in folder.iterdir() if path.is_dir()):
-        runs = read_runs([task])
-        found = rows_of_task(task.name, runs)
-        if found and given.others is not None:
-            add_parts(found, runs, given.others)
-        rows += found
-    counts = Counter(row["verdict"] for row in rows)
+    if not folder.is_dir():
+        parser.error(f"{folder} does not exist; give the folder of the experiments")
+    try:
+        rows = _all_rows(folder, given.others)
+    except (ValueError, UserError) as error:
+        parser.error(str(error))
     losses = [f"{row['task']} {row['arm']}" for row in rows if row["verdict"] == "loss"]
-    sentence = f"{counts['gain']} gains, {counts['even']} even, {counts['loss']} losses"
+    sentence = counted_verdicts(row["verdict"] for row in rows)
     if losses:
         sentence += f": {', '.join(losses)}"
-    columns = {name: COLUMNS[name] for name in COLUMNS if rows and name in rows[0]}
+    columns = {name: COLUMNS[name] for name in COLUMNS if name in rows[0]}
     page = f"{markdown_table(rows, columns)}\n\n{sentence}."
     write_text(folder / "promise.md", page)
     write_csv(rows, folder / "promise.csv")
     print(page)
+
+
+def _all_rows(folder: Path, others: int | None) -> list[dict[str, Any]]:
+    """Return the rows of all tasks, with two more columns if the smallest other seed is given."""
+    rows: list[dict[str, Any]] = []
+    for task, runs in with_ppo(folder, runs_of(folder)).items():
+        found = rows_of_task(task, runs)
+        if others is not None:
+            add_parts(found, runs, others)
+        rows += found
+    if not rows:
+        raise ValueError(f"{folder} has plain PPO alone; train it with a guide: +arm=intact,random")
+    return rows
 
 
 if __name__ == "__main__":

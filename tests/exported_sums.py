@@ -67,5 +67,5 @@ def write(folder: Path, change: Change = lambda contract: None) -> Path:
     change(contract)
     folder.mkdir(exist_ok=True)
     (folder / ONNX).write_bytes(content)
-    (folder / CONTRACT).write_text(json.dumps(contract))
+    (folder / CONTRACT).write_text(json.dumps(contract, ensure_ascii=False), "utf-8")
     return folder

@@ -11,16 +11,17 @@ page of a task has, and adds another one.
 import argparse
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from benchmarks.guide_benchmark.pages import write_all, write_task
 from benchmarks.guide_benchmark.rows import benchmark_rows, check_row, numbers_of, read_rows
+from benchmarks.promise import runs_of, with_ppo
 from coil_rl.errors import UserError
-from coil_rl.report import read_runs, write_csv
-from coil_rl.report.runs import Run, failed_jobs
+from coil_rl.report import write_csv
+from coil_rl.report.runs import failed_jobs
 
 SAME = ("task", "method", "arm", "fingerprint")  # of two rows that replace each other
 
@@ -36,45 +37,12 @@ def added(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         ValueError: if a row is not valid.
     """
     for row in rows:
-        check_row({name: str(value) for name, value in row.items()})
+        check_row({name: "" if value is None else str(value) for name, value in row.items()})
     if not file.exists():
         return list(rows)
     known: list[dict[str, Any]] = [numbers_of(row) for row in read_rows(file)]
     new = {tuple(row[name] for name in SAME) for row in rows}
     return [row for row in known if tuple(row[name] for name in SAME) not in new] + list(rows)
-
-
-def runs_of(folder: Path, pages: Path) -> dict[str, list[Run]]:
-    """Return the runs of each task.
-
-    Args:
-        folder: with a folder for each task.
-        pages: where pages are written, which is no task.
-
-    Raises:
-        UserError: if a folder has no runs, or a damaged one.
-    """
-    tasks = [path for path in sorted(folder.iterdir()) if path.is_dir() and path != pages]
-    return {path.name: read_runs([path]) for path in tasks if not path.name.startswith(".")}
-
-
-def measured(folder: Path, runs: Mapping[str, Sequence[Run]]) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of the table by task, without tasks that have none.
-
-    Args:
-        folder: of the runs, for messages.
-        runs: of each task.
-
-    Raises:
-        ValueError: if a task has no reference, or none a finished run of plain PPO.
-    """
-    rows = {task: benchmark_rows(task, runs[task]) for task in runs}
-    if not any(rows.values()):
-        raise ValueError(f"{folder} has no task with plain PPO; train it: +arm=alone method=ppo")
-    for task, found in rows.items():
-        if not found:
-            print(f"{task} is left out: it has no plain PPO; train +arm=alone method=ppo")
-    return {task: found for task, found in rows.items() if found}
 
 
 def main() -> None:
@@ -93,8 +61,8 @@ def main() -> None:
         parser.error(f"--curves={given.curves} must be of small letters, digits and _")
     pages = given.pages or given.folder / "pages"
     try:
-        runs = runs_of(given.folder, pages)
-        rows = measured(given.folder, runs)
+        runs = with_ppo(given.folder, runs_of(given.folder, pages))
+        rows = {task: benchmark_rows(task, runs[task]) for task in runs}
         found = list(chain.from_iterable(rows.values()))
         table = added(given.add, found) if given.add else found
     except (ValueError, UserError, csv.Error) as error:

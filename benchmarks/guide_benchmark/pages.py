@@ -10,9 +10,10 @@ import numpy as np
 
 from benchmarks.guide_benchmark.picture import ARMS, LIMIT, draw
 from benchmarks.guide_benchmark.rows import references
-from benchmarks.promise import ALONE, GUIDE, INTACT, PPO, arms_of
+from benchmarks.promise import ALONE, GUIDE, INTACT, PPO, arms_of, counted_verdicts
 from coil_rl.files import write_text
 from coil_rl.report import draw_learning_curves, markdown_table
+from coil_rl.report.page import some_of
 from coil_rl.report.runs import Run
 
 Row = dict[str, Any]
@@ -44,6 +45,7 @@ ALL = {
     "difference": ("end - better of guide and PPO (%)", "+.1f"),
     "gain": ("gains", "d"),
     "even": ("even", "d"),
+    "unknown": ("unknown", "d"),
     "loss": ("losses", "d"),
     "worst": ("worst task (%)", "+.1f"),
     "lowest": ("lowest - guide, worst task (%)", "+.1f"),
@@ -54,6 +56,7 @@ METHODS = {
     "pairs": ("pairs of task and guide", "d"),
     "gain": ("gains", "d"),
     "even": ("even", "d"),
+    "unknown": ("unknown", "d"),
     "loss": ("losses", "d"),
     "difference": ("end - better of guide and PPO (%)", "+.1f"),
     "worst": ("worst pair (%)", "+.1f"),
@@ -108,11 +111,22 @@ def write_task(
         "random guide to the better of PPO and the intact guide.",
         *(f"![learning curves]({name})" for name in _pictures(folder, task)),
         "## Ladder",
-        markdown_table(rows, LADDER),
+        markdown_table([{**row, "frames_to_guide": _frames_to_guide(row)} for row in rows], LADDER),
         f"Runs in the table: {sum(row['seeds'] for row in rows)}. Of the last sweep "
         f"{len(runs) + jobs} were started, {finished} finished, {jobs} were refused or failed.",
     ]
     write_text(folder / f"{task}.md", "\n\n".join(lines) + "\n")
+
+
+def _frames_to_guide(row: Row) -> float | str:
+    """Return the mean frames to the guide, with the number of seeds if some did not reach it.
+
+    Without the mean, and in older rows without the number, it is the mean alone.
+    """
+    frames = float(row["frames_to_guide"])
+    if math.isnan(frames) or row["reached"] is None:
+        return frames
+    return f"{frames:.0f}{some_of(row['reached'], row['seeds'])}"
 
 
 def _pictures(folder: Path, task: str) -> list[str]:
@@ -141,11 +155,11 @@ def write_all(folder: Path, rows: Sequence[Row]) -> str:
     if summary:
         draw(rows, folder / "all.png")
         lines += ["![all tasks](all.png)", EDGE]
-        lines += ["## By method, the fewest losses first", markdown_table(by_method(rows), METHODS)]
-        lines += ["## By guide and method", markdown_table(summary, ALL)]
-    counts = Counter(row["verdict"] for row in rows if row["arm"] != ALONE)
+        lines += ["## By method, the fewest losses first", _table(by_method(rows), METHODS)]
+        lines += ["## By guide and method", _table(summary, ALL)]
+    counted = counted_verdicts(row["verdict"] for row in rows if row["arm"] != ALONE)
     lines.append(
-        f"{counts['gain']} gains, {counts['even']} even (undecided), {counts['loss']} losses. "
+        f"{counted}. "
         "Means are over tasks; score 0 is the random guide, score 1 the reference of the task."
     )
     tasks = sorted({row["task"] for row in rows})
@@ -154,6 +168,14 @@ def write_all(folder: Path, rows: Sequence[Row]) -> str:
     text = "\n\n".join(lines) + "\n"
     write_text(folder / "README.md", text)
     return text
+
+
+def _table(rows: Sequence[Row], columns: Mapping[str, Sequence[str]]) -> str:
+    """Return a table, with the column of unknown verdicts only if there are any."""
+    shown = dict(columns)
+    if not any(row["unknown"] for row in rows):
+        del shown["unknown"]
+    return markdown_table(rows, shown)
 
 
 def summarised(rows: Sequence[Row]) -> list[Row]:
@@ -184,7 +206,7 @@ def by_method(rows: Sequence[Row]) -> list[Row]:
             groups.setdefault(row["method"], []).append(row)
     found = []
     for method, own in groups.items():
-        worst = min(own, key=lambda row: row["difference"])
+        worst = own[int(np.argmin([row["difference"] for row in own]))]
         found.append(
             _summary("", method, own)
             | {"pairs": len(own), "where": f"{worst['task']}, {worst['arm']}"}
@@ -202,7 +224,7 @@ def _summary(arm: str, method: str, rows: Sequence[Row]) -> Row:
         "tasks": len({row["task"] for row in rows}),
         "score": float(np.mean([row["score"] for row in rows])),
         "difference": float(np.mean([row["difference"] for row in rows])),
-        **{name: counts[name] for name in ("gain", "even", "loss")},
-        "worst": min(row["difference"] for row in rows),
+        **{name: counts[name] for name in ("gain", "even", "unknown", "loss")},
+        "worst": float(np.min([row["difference"] for row in rows])),
         "lowest": min(lowest, default=math.nan),
     }

@@ -26,6 +26,7 @@ from benchmarks.promise import (
     Key,
     arms_of,
     guide_of,
+    plain_episodes,
     rows_of_task,
     scale_of,
     verdict,
@@ -47,8 +48,9 @@ NUMBERS = (
 )
 KNOWN = ("frames", "random", "reference", "ppo", "end", "score_ppo", "score", "seconds")
 VERSIONS = ("coil-rl", "torch", "torchrl", "gymnasium", "commit")
+REACHED = "reached"  # seeds that `frames_to_guide` is the mean of; empty where it was not counted
 COLUMNS = (
-    *("task", "method", "arm", "effort", "seeds", *NUMBERS, "verdict"),
+    *("task", "method", "arm", "effort", "seeds", *NUMBERS, REACHED, "verdict"),
     *("fingerprint", *VERSIONS),
 )
 VARIES = ("seed", "run_dir", "logger", "existing", "trust", "defaults", "workers")
@@ -174,12 +176,18 @@ def score(value: float, row: Mapping[str, Any]) -> float:
     return (float(value) - float(row["random"])) / distance if distance else math.nan
 
 
-def _learning(runs: Sequence[Run]) -> dict[str, float]:
+def _learning(runs: Sequence[Run]) -> dict[str, float | None]:
     """Return the means over seeds of what learning curves and tables say."""
     measured = [_of_run(run) for run in runs]
-    result = {name: _mean([each[name] for each in measured]) for name in measured[0]}
+    result: dict[str, float | None] = {
+        name: _mean([each[name] for each in measured]) for name in measured[0]
+    }
     lowest = [each["lowest"] for each in measured if not math.isnan(each["lowest"])]
-    return result | {"lowest": min(lowest, default=math.nan)}
+    result["lowest"] = min(lowest, default=math.nan)
+    result[REACHED] = None
+    if lowest:  # so curves and guides are known
+        result[REACHED] = sum(not math.isnan(each["frames_to_guide"]) for each in measured)
+    return result
 
 
 def _of_run(run: Run) -> dict[str, float]:
@@ -187,8 +195,7 @@ def _of_run(run: Run) -> dict[str, float]:
     curve = points(run.curve, RETURN) if run.curve else np.zeros((0, 2))
     guide = max(run.guide_returns.values(), default=math.nan)
     last = run.curve[-1] if run.curve else {}
-    table = run.evaluation[run.evaluation["driver"] == run.label]
-    crashed = table[table["actions"] == "deterministic"].get("crashed")
+    crashed = plain_episodes(run, run.label).get("crashed")
     return {
         "frames": last.get("frames", math.nan),
         "guide_calls": last.get("guide/calls", math.nan),
@@ -210,12 +217,13 @@ def check_row(row: Mapping[str, str]) -> None:
     """Check a row of the table, as it is in the file.
 
     Args:
-        row: its cells by column.
+        row: its cells by column; `reached` may be missing, as in older tables.
 
     Raises:
         ValueError: if it is not complete, contradicts itself, or belongs to no task.
     """
-    if tuple(row) != COLUMNS or None in row.values():
+    expected = tuple(name for name in COLUMNS if name != REACHED or name in row)
+    if tuple(row) != expected or None in row.values():
         raise ValueError(
             f"the columns are {', '.join(map(str, row))}; expected: {', '.join(COLUMNS)}"
         )
@@ -224,7 +232,7 @@ def check_row(row: Mapping[str, str]) -> None:
     if row["task"] not in known:
         raise ValueError(f"{place}: no such task; add it to {REFERENCES.name}")
     try:
-        numbers, seeds = _numbers(row), int(row["seeds"])
+        numbers, seeds, reached = _numbers(row), int(row["seeds"]), _reached(row)
     except ValueError as error:
         raise ValueError(f"{place}: a number is expected ({error})") from error
     unknown = [name for name in KNOWN if not math.isfinite(numbers[name])]
@@ -232,6 +240,12 @@ def check_row(row: Mapping[str, str]) -> None:
         raise ValueError(f"{place}: {', '.join(unknown)} must be known; random needs its arm")
     if seeds < 1 or numbers["frames"] <= 0 or any(map(math.isinf, numbers.values())):
         raise ValueError(f"{place}: seeds and frames must be above 0, and no number infinite")
+    if reached is not None and not 0 <= reached <= seeds:
+        raise ValueError(f"{place}: reached={reached}, but the row has {seeds} seeds")
+    if reached is not None and (reached == 0) != math.isnan(numbers["frames_to_guide"]):
+        raise ValueError(
+            f"{place}: reached={reached}, but frames_to_guide={row['frames_to_guide']}"
+        )
     _check_numbers(place, row, numbers, known[row["task"]])
     if not re.fullmatch("[0-9a-f]{10}", row["fingerprint"]):
         raise ValueError(f"{place}: fingerprint={row['fingerprint']} is not ten hexadecimal digits")
@@ -258,12 +272,19 @@ def read_rows(file: Path) -> list[dict[str, str]]:
 
 def numbers_of(row: Mapping[str, str]) -> dict[str, Any]:
     """Return a checked row of a table with numbers in place of their text."""
-    return {**row, **_numbers(row), "seeds": int(row["seeds"])}
+    numbers = {**row, **_numbers(row), "seeds": int(row["seeds"]), REACHED: _reached(row)}
+    return {name: numbers[name] for name in COLUMNS}
 
 
 def _numbers(row: Mapping[str, str]) -> dict[str, float]:
     """Return the numbers of a row by column."""
     return {name: float(row[name]) for name in NUMBERS}
+
+
+def _reached(row: Mapping[str, str]) -> int | None:
+    """Return how many seeds reached the guide; None if that was not counted."""
+    cell = row.get(REACHED)
+    return int(cell) if cell else None
 
 
 def _check_numbers(

@@ -13,7 +13,7 @@ class Policy:
     """The policy in a folder; call `reset()` at the start of each episode."""
 
     def __init__(self, folder: Path = Path(__file__).parent) -> None:
-        self.contract = json.loads((folder / "contract.json").read_text())
+        self.contract = json.loads((folder / "contract.json").read_text("utf-8"))
         content = (folder / "policy.onnx").read_bytes()
         if hashlib.sha256(content).hexdigest() != self.contract["files"]["policy.onnx"]["sha256"]:
             raise SystemExit("policy.onnx is not the file that contract.json is about")

@@ -68,7 +68,9 @@ class ExportedPolicy:
             observation: as the env gives it: for a Gymnasium env what its `reset` and `step`
                 return; for a TorchRL env its entries as a mapping, or the value of the only entry.
             guide_action: what the guides advise in the unit and numbering of the env, where the
-                contract says that they are outside.
+                contract says that they are outside: [guides, A] as in the contract, the action of
+                the only guide as the env takes it, or, for an env with one agent, these of all
+                guides, [guides, *shape].
 
         Returns:
             The action in the unit and numbering of the env: for a Gymnasium env what its `step`
@@ -87,13 +89,29 @@ class ExportedPolicy:
             )
         for entry in self.contract["inputs"]:
             if entry["name"] == ADVICE:
-                value = _advice(observation, guide_action)
+                value = self._in_rows(_advice(observation, guide_action), entry["shape"])
             else:
                 value = _found(observation, entry, only=len(entries) == 1)
             inputs[entry["name"]] = _row(value, entry)
         action = self.act_on(inputs)[0]
         space = self.contract["outputs"][0]["space"]
         return action.reshape(space["shape"]).astype(space["dtype"])[()]
+
+    def _in_rows(self, advice: Any, rows: Sequence[int]) -> Any:
+        """Return actions in the shape that the env takes as rows of the contract, others as given.
+
+        Args:
+            advice: actions of the guides.
+            rows: shape in the contract, [*agents, guides, A].
+        """
+        given, guides = np.asarray(advice), len(self.contract["guide"]["names"])
+        own = tuple(self.contract["outputs"][0]["space"]["shape"])
+        taken = [own] if guides == 1 else []
+        if len(rows) <= 2:  # with several agents the guides are not the first dimension
+            taken.append((guides, *own))
+        if given.shape in taken and given.size == np.prod(rows, dtype=int):
+            return given.reshape(rows)
+        return advice
 
     def act_on(self, inputs: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
         """Return the action for the inputs of the contract.

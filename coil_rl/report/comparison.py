@@ -454,13 +454,21 @@ def _shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[_Guide]:
         for name, rows in frame[_is_guide(frame)].groupby("driver", sort=False):
             results = {}
             for _, of_seed in rows.groupby("seed", sort=False):
-                results[(*of_seed["case"], *of_seed["reward"].round(3))] = of_seed
+                results[(*of_seed["case"], *map(_digits, of_seed["reward"]))] = of_seed
             same = _same_guide(guides, name, results)
             if same is None:
                 guides.append(_Guide(name, [label], results))
             else:
                 same.add(label, results)
     return guides
+
+
+def _digits(reward: float) -> str:
+    """Return six digits of a reward as a text, so that equal rewards in any unit are equal here.
+
+    In a text NaN equals NaN, and -0 becomes 0 by the addition.
+    """
+    return f"{reward + 0.0:.5e}"
 
 
 def _same_guide(

@@ -13,7 +13,7 @@ from typing import Any
 
 from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning
-from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run
+from coil_rl.report.runs import GUIDE, PER_STEP, TERM, UNTESTED, Run
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
 from coil_rl.report.table import AUTO_FORMAT, TABLES, Table, fitted, return_format
 
@@ -176,8 +176,17 @@ def _reached(frames: Sequence[float]) -> str | None:
     reached = [number for number in frames if not math.isnan(number)]
     if not reached:
         return None
-    some = f" ({len(reached)} of {len(frames)} seeds)" if len(reached) < len(frames) else ""
-    return f"{mean(reached):,.0f}{some}"
+    return f"{mean(reached):,.0f}{some_of(len(reached), len(frames))}"
+
+
+def some_of(reached: int, seeds: int) -> str:
+    """Return the end of a cell whose mean leaves seeds out, ` (3 of 5 seeds)`; else nothing.
+
+    Args:
+        reached: number of seeds that the mean is of.
+        seeds: of all runs.
+    """
+    return f" ({reached} of {seeds} seeds)" if reached < seeds else ""
 
 
 def notes(against: str | None, compared: Mapping[str, Comparison]) -> str:
@@ -198,19 +207,29 @@ def notes(against: str | None, compared: Mapping[str, Comparison]) -> str:
 
 
 def handed_over(runs: Sequence[Run]) -> list[str]:
-    """Return a sentence for each label whose runs tested at their end what they hand over.
+    """Return sentences for each label whose runs test at their end what they hand over.
+
+    Runs that had no frames left for a test are in a sentence of their own.
 
     Args:
         runs: finished runs.
     """
     sentences = []
-    for label in dict.fromkeys(run.label for run in runs if run.handed_over):
-        counts = Counter(run.handed_over for run in runs if run.label == label)
-        listed = ", ".join(f"{policy} {count}" for policy, count in counts.most_common())
-        sentences.append(
-            f"The runs of {label} handed over the policy that was best in a test at their end, "
-            f"whose steps are among their frames: {listed}."
-        )
+    tested = [run for run in runs if run.handed_over]
+    for label in dict.fromkeys(run.label for run in tested):
+        counts = Counter(run.handed_over for run in tested if run.label == label)
+        untested = counts.pop(UNTESTED, 0)
+        if counts:
+            listed = ", ".join(f"{policy} {count}" for policy, count in counts.most_common())
+            sentences.append(
+                f"The runs of {label} handed over the policy that was best in a test at their end, "
+                f"whose steps are among their frames: {listed}."
+            )
+        if untested:
+            sentences.append(
+                f"Of the runs of {label} {untested} had no frames left for a test and handed over "
+                "their last policy."
+            )
     return sentences
 
 

@@ -33,6 +33,7 @@ RETURN, CHOICE = f"{EVALUATION}/return", f"{SELECTION}/return"  # columns of met
 PER_STEP = "per_step_"  # prefix of the measures of tasks
 TERM = "reward_"  # prefix of the measures of the terms of the reward
 DELIVERY = "delivery.json"  # of a run: which policy it hands over, and why
+UNTESTED = "last_untested"  # in that file: the last policy, as no frames were left for a test
 RESTORE = "restore the file, or remove the run from the folder"
 
 
@@ -59,7 +60,8 @@ class Run:
         curve: rows of metrics.csv; empty without training.
         guide_returns: mean return of each guide in the evaluation, if known.
         seconds: duration of the training; None if unknown, as for an interrupted run.
-        handed_over: which policy a test at its end chose, such as "last"; empty without a test.
+        handed_over: which policy a test at its end chose, such as "last"; `UNTESTED` if no frames
+            were left for it; empty without a test.
         settings: its configuration.
     """
 

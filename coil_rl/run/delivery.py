@@ -26,13 +26,12 @@ from coil_rl.files import write_text
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.anchor import hold_of
 from coil_rl.learners.learner import Learner
-from coil_rl.report.runs import DELIVERY
+from coil_rl.report.runs import DELIVERY, UNTESTED
 from coil_rl.report.statistics import mean_interval
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
 from coil_rl.run.curve import EvaluationCurve
 from coil_rl.run.judge import guide_titles
-from coil_rl.run.reasons import UNTESTED
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.combined_actions import GradualResidual, ResidualAction
 

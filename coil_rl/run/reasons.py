@@ -9,11 +9,10 @@ from typing import Any
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import LARGEST_NUMBERS, read_file
 from coil_rl.learners.anchor import StartTest
-from coil_rl.report.runs import DELIVERY
+from coil_rl.report.runs import DELIVERY, UNTESTED
 from coil_rl.report.table import return_format
 
 FIRST = "first"  # policy of a run that holds its guide
-UNTESTED = "last_untested"  # the last policy, where no frames were left for a test
 POLICIES = {
     "last": "the last policy",
     UNTESTED: "the last policy",

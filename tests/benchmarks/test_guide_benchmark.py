@@ -1,6 +1,7 @@
 """The guide benchmark: its rows, their check, its pages, and the tasks of other packages."""
 
 import csv
+import json
 import math
 import shutil
 import sys
@@ -11,16 +12,19 @@ import gymnasium
 import pytest
 from hydra import compose, initialize_config_module
 from programs import TINY_ARM, called
+from run_folders import driven, make_run
 
 from benchmarks.guide_benchmark import __main__ as program
-from benchmarks.guide_benchmark.pages import by_method
+from benchmarks.guide_benchmark.pages import by_method, summarised, write_all, write_task
 from benchmarks.guide_benchmark.rows import (
     COLUMNS,
+    VERSIONS,
     Reference,
     benchmark_rows,
     check_row,
     effort,
     fingerprint,
+    numbers_of,
     read_rows,
     references,
 )
@@ -72,6 +76,10 @@ def test_row_of_the_table_is_valid(row):
         ({"lowest": "-inf"}, "no number infinite"),
         ({"seeds": "0"}, "must be above 0"),
         ({"torch": ""}, "versions of torch are missing"),
+        ({"reached": "some"}, "a number is expected"),
+        ({"reached": "99"}, "reached=99, but the row has"),
+        ({"reached": "0"}, "reached=0, but frames_to_guide="),
+        ({"low": "nan", "high": "nan"}, "but its interval says unknown"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
@@ -79,6 +87,19 @@ def test_row_that_contradicts_itself_is_refused(changed, message):
     row = next(each for each in table() if each["arm"] == "intact")
     with pytest.raises(ValueError, match=message):
         check_row(row | changed)
+
+
+def test_row_without_an_interval_is_valid_if_its_verdict_is_unknown():
+    row = next(each for each in table() if each["arm"] == "intact")
+    check_row(row | {"low": "nan", "high": "nan", "verdict": "unknown"})
+
+
+def test_row_of_before_the_seeds_that_reach_the_guide_were_counted_is_valid():
+    row = table()[0]
+    assert row.pop("reached") == ""
+    check_row(row)
+    assert numbers_of(row)["reached"] is None
+    assert tuple(numbers_of(row)) == COLUMNS
 
 
 def test_row_without_a_column_is_refused():
@@ -154,6 +175,51 @@ def test_scores_are_0_for_the_random_guide_and_1_for_the_reference(folder):
     assert math.isnan(arms["ppo", "alone"]["difference"])
     assert {row["effort"] for row in rows} == {"smoke"}
     assert all(tuple(row) == COLUMNS for row in rows)
+
+
+@pytest.fixture
+def made(tmp_path):
+    """Three seeds of PPO and of two guides, of which one seed of PPO does not reach its guide."""
+    for label, reward in (("ppo_alone", 200.0), ("coil_intact", 250.0), ("coil_random", 150.0)):
+        guide = driven("guide", {"a": 10.0 if label == "coil_random" else 300.0})
+        for seed in range(3):
+            rows = guide + driven(label, {"a": reward + seed})
+            rows += driven(label, {"a": 0.0}, advice="zeroed", crashed=1.0)
+            level = 1000.0 if (label, seed) == ("ppo_alone", 2) else 300.0
+            folder = make_run(tmp_path / label / str(seed), label, seed, rows, guide=level)
+            (folder / "versions.json").write_text(json.dumps(dict.fromkeys(VERSIONS, "1")))
+            (folder / "training_time.json").write_text('{"seconds": 1}')
+    return tmp_path
+
+
+def test_seeds_that_reach_the_guide_are_counted(made, tmp_path):
+    runs = read_runs([made])
+    rows = benchmark_rows("pendulum", runs)
+    assert {row["method"] + row["arm"]: row["reached"] for row in rows} == {
+        "ppoalone": 2,
+        "coilintact": 3,
+        "coilrandom": 3,
+    }
+    assert program.added(tmp_path / "rows.csv", rows) == rows
+    write_task(tmp_path, "pendulum", rows, runs, 0)
+    ladder = (tmp_path / "pendulum.md").read_text()
+    mean = next(row["frames_to_guide"] for row in rows if row["method"] == "ppo")
+    assert f" {mean:.0f} (2 of 3 seeds) |" in ladder
+    assert ladder.count(" seeds)") == 1
+
+
+def test_failures_are_those_with_the_advice_as_it_is(made):
+    assert {row["failures"] for row in benchmark_rows("pendulum", read_runs([made]))} == {0.0}
+
+
+def test_unknown_verdicts_have_a_column_only_if_there_are_any(tmp_path):
+    rows = [numbers_of(row) for row in table() if row["arm"] != "alone"]
+    assert "unknown" not in write_all(tmp_path, rows)
+    rows[0] |= {"verdict": "unknown", "low": math.nan, "high": math.nan}
+    page = write_all(tmp_path, rows)
+    assert page.count("| unknown |") == 2
+    assert ", 1 unknown, " in page
+    assert sum(row["unknown"] for row in summarised(rows)) == 1
 
 
 def test_methods_are_ordered_by_their_share_of_losses_and_name_their_worst_pair():

@@ -1,9 +1,11 @@
 """The table of the promise: its verdicts, and a run of one arm."""
 
 import json
+import math
 
 import pytest
 from programs import TINY_ARM, called
+from run_folders import driven, make_run
 
 from benchmarks import promise
 from coil_rl.report.runs import read_runs
@@ -20,11 +22,86 @@ SMALL = ["env.max_steps=15", *TINY_ARM]
         (-5, -12, 2, "even"),
         (5, 2, 8, "gain"),
         (0.5, 0.1, 0.9, "even"),
+        (-50, math.nan, math.nan, "unknown"),
+        (math.nan, math.nan, math.nan, "unknown"),
     ],
-    ids=["clear loss", "not material", "undecided", "clear gain", "gain that is not material"],
+    ids=[
+        *("clear loss", "not material", "undecided", "clear gain", "gain that is not material"),
+        *("one seed", "no scale"),
+    ],
 )
 def test_verdict_needs_an_interval_and_a_material_mean(mean, low, high, expected):
     assert promise.verdict(mean, low, high) == expected
+
+
+def test_unknown_verdicts_are_counted_only_if_there_are_any():
+    assert promise.counted_verdicts(["gain", "even", "even"]) == (
+        "1 gains, 2 even (undecided), 0 losses"
+    )
+    assert promise.counted_verdicts(["unknown", "loss"]) == (
+        "0 gains, 0 even (undecided), 1 unknown, 1 losses"
+    )
+
+
+def small(folder, arms, seeds=1):
+    """Write runs of a task by the returns of their arms, with the guide at 100."""
+    for arm, reward in arms.items():
+        for seed in range(seeds):
+            rows = driven("guide", {"a": 100.0, "b": 100.0})
+            rows += driven(arm, {"a": reward, "b": 20.0})
+            make_run(folder / f"{arm}_{seed}", arm, seed, rows)
+    return folder
+
+
+def printed(monkeypatch, capsys, *words):
+    """Return what the program prints."""
+    monkeypatch.setattr("sys.argv", ["promise", *map(str, words)])
+    promise.main()
+    return capsys.readouterr().out
+
+
+def test_one_seed_has_no_verdict(tmp_path, monkeypatch, capsys):
+    small(tmp_path / "task", {"ppo_alone": 10.0, "coil_intact": 5.0, "coil_random": 5.0})
+    (row, _) = promise.rows_of_task("task", read_runs([tmp_path / "task"]))
+    assert row["verdict"] == "unknown"
+    assert "0 even (undecided), 2 unknown, 0 losses." in printed(monkeypatch, capsys, tmp_path)
+
+
+def test_task_whose_random_guide_is_as_good_as_the_better_has_no_verdict(tmp_path):
+    arms = {"ppo_alone": 10.0, "coil_intact": 5.0, "coil_random": 5.0}
+    runs = read_runs([small(tmp_path, arms, seeds=2)])
+    rows = promise.rows_of_task("task", runs)
+    assert [row["verdict"] for row in rows] == ["unknown", "unknown"]
+
+
+def test_reward_that_is_nan_is_no_part_of_a_mean(tmp_path, monkeypatch, capsys):
+    small(tmp_path / "task", {"ppo_alone": math.nan, "coil_intact": 5.0}, seeds=2)
+    with pytest.raises(SystemExit) as refused:
+        printed(monkeypatch, capsys, tmp_path)
+    assert refused.value.code == 2
+    assert "the reward of ppo_alone is nan in 1 of 2 cases" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arms", "message"),
+    [
+        (None, "does not exist; give the folder of the experiments"),
+        ({}, "has no task with plain PPO; train it: +arm=alone method=ppo"),
+        ({"coil_intact": 5.0}, "has no task with plain PPO; train it: +arm=alone method=ppo"),
+        ({"ppo_alone": 5.0}, "has plain PPO alone; train it with a guide"),
+    ],
+    ids=["no folder", "empty folder", "no PPO", "only PPO"],
+)
+def test_folder_without_results_is_one_sentence(arms, message, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "promise"
+    if arms is not None:
+        folder.mkdir()
+        small(folder / "task", arms) if arms else None
+    with pytest.raises(SystemExit) as refused:
+        printed(monkeypatch, capsys, folder)
+    assert refused.value.code == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.rglob("promise.*"))
 
 
 @pytest.fixture(scope="module")

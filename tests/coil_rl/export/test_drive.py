@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import os
 import shutil
 import subprocess
 import sys
@@ -53,6 +54,22 @@ def test_input_that_is_missing_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"guide_action must be \[1\] finite numbers"):
         policy.act({"observation": [1.0, 2.0]})
     assert policy.act({"observation": [2.0, 3.0], "guide_action": [10.0]}) == 16.0
+
+
+def test_contract_is_read_in_any_locale(tmp_path):
+    def degrees(contract):
+        contract["outputs"][0]["unit"] = "°"
+
+    shutil.copy(SOURCE, write(tmp_path, degrees) / SOURCE.name)
+    done = subprocess.run(
+        [sys.executable, "-X", "utf8=0", "-c", "import drive; drive.Policy()"],
+        cwd=tmp_path,
+        env=os.environ | {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("wrong", [[0], [5], [2.5]])

@@ -64,6 +64,38 @@ def test_inputs_that_do_not_fit_the_contract_are_named(tmp_path):
         policy.act([1.0, 2.0], [1.0])
 
 
+def matrix(guides):
+    """Return a change of the contract: the action is a matrix, and so many guides are outside."""
+
+    def change(contract):
+        contract["inputs"][1]["shape"] = [guides, 4]
+        contract["outputs"][0]["space"]["shape"] = [2, 2]
+        contract["guide"]["names"] = ["sum"] * guides
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("guides", "shape"),
+    [(1, (1, 4)), (1, (4,)), (1, (2, 2)), (1, (1, 2, 2)), (2, (2, 4)), (2, (2, 2, 2))],
+)
+def test_advice_may_have_the_shape_of_the_contract_or_of_the_env(guides, shape, tmp_path):
+    policy = ExportedPolicy(write(tmp_path, matrix(guides)))
+    numbers, given = np.arange(4.0 * guides), []
+    policy.act_on = lambda inputs: given.append(inputs["guide_action"]) or np.zeros((1, 4))
+    assert policy.act([1.0, 2.0], numbers.reshape(shape)).shape == (2, 2)
+    np.testing.assert_array_equal(given[0], numbers.reshape(1, guides, 4))
+
+
+@pytest.mark.parametrize(
+    ("guides", "shape"), [(1, (4, 1, 2)), (1, (2, 1)), (2, (2, 2)), (2, (4, 2))]
+)
+def test_advice_of_another_shape_is_refused(guides, shape, tmp_path):
+    policy = ExportedPolicy(write(tmp_path, matrix(guides)))
+    with pytest.raises(ValueError, match=rf"but must have \[{guides}, 4\]"):
+        policy.act([1.0, 2.0], np.zeros(shape))
+
+
 def test_choices_are_encoded_as_the_contract_says(tmp_path):
     def of_choices(contract):
         contract["inputs"][0]["from"] = {"path": ["gear"], "choices": [2], "start": [5]}
@@ -128,9 +160,9 @@ def test_file_of_another_export_is_refused(tmp_path):
 def test_file_that_is_no_onnx_is_refused(tmp_path):
     write(tmp_path)
     content = b"no model"
-    contract = json.loads((tmp_path / CONTRACT).read_text())
+    contract = json.loads((tmp_path / CONTRACT).read_text("utf-8"))
     contract["files"][ONNX]["sha256"] = checksum(content)
-    (tmp_path / CONTRACT).write_text(json.dumps(contract))
+    (tmp_path / CONTRACT).write_text(json.dumps(contract), "utf-8")
     (tmp_path / ONNX).write_bytes(content)
     with pytest.raises(coil_rl.UserError, match="no file that onnxruntime can read"):
         ExportedPolicy(tmp_path)

@@ -36,7 +36,7 @@ def test_next_step_of_a_guide_outside_is_python():
 
 def test_contract_says_what_the_numbers_mean(exported):
     folder, _ = exported
-    contract = json.loads((folder / CONTRACT).read_text())
+    contract = json.loads((folder / CONTRACT).read_text("utf-8"))
     (observation,) = contract["inputs"]
     assert (observation["shape"], observation["dtype"]) == ([3], "float32")
     assert observation["bounds"] == {"low": [-1.0, -1.0, -8.0], "high": [1.0, 1.0, 8.0]}

@@ -129,6 +129,24 @@ def test_labels_are_appended_to_guides_of_the_same_name(tmp_path):
     assert rows["guide (e)", ""]["reward"] == pytest.approx(450)
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1e-4, 1.0, 1e6])
+def test_guides_are_told_apart_in_any_unit_of_the_reward(unit, tmp_path):
+    small = {"a": 3.0 * unit, "b": -0.0}
+    others = {"b": {"a": 4.0 * unit, "b": 0.0}, "c": {"a": 3.0 * unit * (1 + 1e-9), "b": 0.0}}
+    for index, label in enumerate("abc"):
+        guide = driven("guide", others.get(label, small))
+        make_run(tmp_path / str(index), label, 0, guide + driven(label, small))
+    guides = [name for name, _ in table(tmp_path) if name.startswith("guide")]
+    assert sorted(guides) == ["guide (a, c)", "guide (b)"]
+
+
+def test_guide_without_a_number_in_a_case_is_one_guide(tmp_path):
+    for index, label in enumerate("ab"):
+        guide = driven("guide", {"a": 500.0, "b": math.nan})
+        make_run(tmp_path / str(index), label, 0, guide + driven(label, CASES))
+    assert [group.title for group in compare(read_runs([tmp_path])).guides] == ["guide"]
+
+
 def test_guide_with_random_actions_has_an_interval_over_its_different_evaluations(tmp_path):
     for index, (label, seed) in enumerate(
         [("ppo", 0), ("ppo", 1), ("coil", 0), ("coil", 1), ("coil", 2)]

@@ -1,10 +1,11 @@
 import math
+from pathlib import Path
 
 from run_folders import driven, make_run, make_sweep
 
 from coil_rl.report import page, write_csv
 from coil_rl.report.comparison import compare
-from coil_rl.report.runs import read_runs
+from coil_rl.report.runs import UNTESTED, Run, read_runs
 
 
 def section(folder, against=None):
@@ -134,6 +135,21 @@ def test_training_is_summarised_by_the_evaluation_curve(tmp_path):
     ]
     (table,) = page.training(read_runs([tmp_path]))
     assert cells(table)[2][5:7] == ["2,400 (1 of 2 seeds)", "2,500 (1 of 2 seeds)"]
+
+
+def test_runs_without_a_test_at_their_end_are_counted_apart():
+    def sentences(*chosen):
+        return page.handed_over([Run(Path(), "any", 0, True, handed_over=name) for name in chosen])
+
+    tested, untested = sentences("last", UNTESTED, "guide", "last", UNTESTED)
+    assert tested.endswith(
+        "best in a test at their end, whose steps are among their frames: last 2, guide 1."
+    )
+    assert untested == (
+        "Of the runs of any 2 had no frames left for a test and handed over their last policy."
+    )
+    assert sentences(UNTESTED, UNTESTED) == [untested]
+    assert sentences("last", "last", "guide", "") == [tested]
 
 
 def test_empty_columns_and_many_cases_are_omitted(tmp_path):

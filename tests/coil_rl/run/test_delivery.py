@@ -143,7 +143,8 @@ def test_test_at_the_end_is_left_out_where_the_start_test_took_the_frames_of_bot
     assert all(torch.equal(state[key], given[key]) for key in state)
     page = (run / "evaluation.md").read_text()
     assert "Handed over is the last policy, without a test at the end" in page
-    assert "last_untested 1" in called("report", f"folder={run.parent}").stdout
+    page = called("report", f"folder={run.parent}").stdout
+    assert "1 had no frames left for a test and handed over their last policy" in page
 
 
 @pytest.mark.slow
