@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -190,34 +191,40 @@ def episodes(
         cases: number of different cases; row i has case `i % cases`. None: as many as rows.
         tick: as above.
     """
-    _draw_by_case(env, cases)
-    carrier = env.eval().reset()
-    lean = LeanEnv(env) if LeanEnv.covers(env) else None
-    running = torch.ones_like(env.full_done_spec["done"].zero())
-    for count in itertools.count(1):
-        acted = _act(policy, carrier, sampled)
-        # Entries of a policy for the next step, `("next", KEY)`, are left to TorchRL.
-        if lean is None or "next" in acted:
-            step = env.step(acted)
-            after, carrier = step["next"], env.step_mdp(step)
-        else:
-            after = lean.step(acted["action"], acted)
-            carrier = acted.exclude(*after.keys()).update(after)
-        yield after, running
-        running = running & ~after["done"]
-        # The test waits for the device.
-        if count % 8 == 0 and not running.any():
-            return
-        if tick is not None:
-            tick()
+    with _drawn_by_case(env, cases):
+        carrier = env.eval().reset()
+        lean = LeanEnv(env) if LeanEnv.covers(env) else None
+        running = torch.ones_like(env.full_done_spec["done"].zero())
+        for count in itertools.count(1):
+            acted = _act(policy, carrier, sampled)
+            # Entries of a policy for the next step, `("next", KEY)`, are left to TorchRL.
+            if lean is None or "next" in acted:
+                step = env.step(acted)
+                after, carrier = step["next"], env.step_mdp(step)
+            else:
+                after = lean.step(acted["action"], acted)
+                carrier = acted.exclude(*after.keys()).update(after)
+            yield after, running
+            running = running & ~after["done"]
+            # The test waits for the device.
+            if count % 8 == 0 and not running.any():
+                return
+            if tick is not None:
+                tick()
 
 
-def _draw_by_case(env: EnvBase, cases: int | None) -> None:
+@contextmanager
+def _drawn_by_case(env: EnvBase, cases: int | None) -> Iterator[None]:
     """Let transforms and guides draw the same random numbers for all rows of a case."""
     several = cases is not None and env.batch_dims == 1 and env.batch_size.numel() > cases
-    for part in env.modules():
-        if isinstance(part, SeededGenerator):
+    parts = [part for part in env.modules() if isinstance(part, SeededGenerator)]
+    try:
+        for part in parts:
             part.different = cases if several else None
+        yield
+    finally:  # a guide may be a part of another env too
+        for part in parts:
+            part.different = None
 
 
 def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool) -> TensorDictBase:

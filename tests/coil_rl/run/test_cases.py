@@ -10,6 +10,7 @@ from coil_rl.learners.anchor import hold_of
 from coil_rl.run.cases import TrainingCases, further_cases, guide_calls
 from coil_rl.run.delivery import GuideActs
 from coil_rl.run.parts import TESTS, TRAIN
+from coil_rl.transforms.guide_transform import SeededGenerator
 
 pytest.importorskip("gymnasium.envs.classic_control")
 
@@ -184,6 +185,8 @@ def test_policies_side_by_side_have_the_same_noise_and_delays(words):
     assert len(first.unique()) == 3
     (alone,) = cases.compared([learner.policy])
     torch.testing.assert_close(first, alone, rtol=1e-3, atol=0.1)
+    drawing = [part for part in cases.env.modules() if isinstance(part, SeededGenerator)]
+    assert [part.different for part in drawing] == [None] * len(drawing)  # a training draws all
 
 
 def test_a_block_of_cases_makes_one_env():
