@@ -43,10 +43,11 @@ from coil_rl.worth.baselines import (
     read_baselines,
 )
 from coil_rl.worth.jobs import job_name, run_jobs
+from coil_rl.worth.entry import IDLE, Entry
 from coil_rl.worth.outcome import Outcome, first_of, read_outcome
 from coil_rl.worth.page import command_of, delayed_sentence, draw, guide_lines, page_of
 from coil_rl.worth.timing import Plan
-from coil_rl.worth.verdict import NOTHING, Entry, Verdict, verdict
+from coil_rl.worth.verdict import NOTHING, Verdict, verdict
 
 PLAN, TABLE, PAGE, PICTURE = "compare.json", "compare.csv", "compare.md", "compare.png"
 FOUND = "verdict.json"
@@ -284,8 +285,8 @@ class Comparison:
         return Worth(self.folder, found, pd.DataFrame(outcome.rows), command, page)
 
     def _delayed(self, found: Verdict, outcome: Outcome, base: DictConfig) -> str:
-        """Return the sentence about a delay of what came out best; empty where it cannot act."""
-        if found.use == NOTHING:
+        """Return the sentence about a delay of a guide or policy; empty for everything else."""
+        if found.use in (NOTHING, *IDLE):
             return ""
         run = first_of(outcome, found.use)
         with decoration("the delay"):

@@ -19,7 +19,8 @@ from coil_rl.report.runs import RETURN, Run
 from coil_rl.report.table import AUTO_FORMAT, return_format
 from coil_rl.worth.arms import ARMS, TUNE
 from coil_rl.worth.outcome import Outcome
-from coil_rl.worth.verdict import Entry, Verdict, difference
+from coil_rl.worth.verdict import Verdict
+from coil_rl.worth.entry import Entry, difference
 
 COLUMNS = {
     "policy": ("policy", ""),
@@ -78,13 +79,15 @@ def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> str:
     """
     found = difference(late, Entry(entry.name, entry.returns[:1]))
     own = float(entry.returns[0].mean())
-    lost = (own - late.mean) / (own - random.mean)
-    kept = f"it keeps {1 - lost:.0%} of its distance from random actions"
+    kept = ""
+    if own > random.mean:  # else there is no distance to keep
+        share = (late.mean - random.mean) / (own - random.mean)
+        kept = f": it keeps {share:.0%} of its distance from random actions"
     spec = return_format([late.mean, own])
     which = f"{entry.name} of the first seed" if len(entry.returns) > 1 else entry.name
     return (
         f"With one step of delay on observation and action, which it was not trained with, "
-        f"{which} has {late.mean:{spec}} instead of {own:{spec}} ({found}): {kept}."
+        f"{which} has {late.mean:{spec}} instead of {own:{spec}} ({found}){kept}."
     )
 
 
