@@ -18,8 +18,8 @@ from coil_rl.config.build import env_maker
 from coil_rl.config.check import check_parts
 from coil_rl.config.python import Named, composed, named
 from coil_rl.config.trust import trust_own
-from coil_rl.errors import UserError, file_of_a_run
-from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, read_file, write_text
+from coil_rl.errors import UserError
+from coil_rl.files import FAILED_JOBS, write_text
 from coil_rl.output import decoration, quietly, say
 from coil_rl.report import write_csv
 from coil_rl.run.folder import locked
@@ -47,6 +47,7 @@ from coil_rl.worth.entry import IDLE, Entry
 from coil_rl.worth.outcome import Outcome, first_of, read_outcome
 from coil_rl.worth.page import command_of, delayed_sentence, draw, guide_lines, page_of
 from coil_rl.worth.timing import Plan
+from coil_rl.worth.same import identity_of, keep_plan, known_plan
 from coil_rl.worth.verdict import NOTHING, Verdict, verdict
 
 PLAN, TABLE, PAGE, PICTURE = "compare.json", "compare.csv", "compare.md", "compare.png"
@@ -214,15 +215,11 @@ class Comparison:
     def _plan(self, config: DictConfig) -> Plan:
         """Return what is going to be done, and say it; a comparison that goes on has its plan."""
         file = self.folder / PLAN
-        identity = {
-            "words": list(self.given.words),
-            "objects": sorted(self.given.nodes),
-            "tune": self.given.nodes.get("tune"),
-            "minutes": self.minutes,
-            "seed": self.seed,
-        }
+        identity = identity_of(self.given, config, self.minutes, self.seed)
         if file.exists():
-            return self._known_plan(file, json.loads(json.dumps(identity)))
+            plan = known_plan(file, identity)
+            say(f"{self.folder} goes on. {plan.described(self.minutes)}", error=True)
+            return plan
         if any(self.folder.rglob("config.yaml")):
             raise UserError(f"{self.folder} holds runs of something else; choose another folder")
         if self.command:
@@ -233,22 +230,8 @@ class Comparison:
             env = env_maker(config).bare(1, TEST, None)
         arms = arms_for(env, pace.step, tunes=self.tunes)
         plan = timing.plan(config, pace, arms, self.minutes)
-        write_text(file, json.dumps({"identity": identity, "plan": plan.to_dict()}, indent=2))
+        keep_plan(file, identity, plan)
         say(f"{pace.sentence}\n{plan.described(self.minutes)}", error=True)
-        return plan
-
-    def _known_plan(self, file: Path, identity: Mapping[str, Any]) -> Plan:
-        """Return the plan in a file, which must be that of the same comparison."""
-        with file_of_a_run(file, "choose another folder"):
-            saved = json.loads(read_file(file, LARGEST_NUMBERS))
-            for key, value in identity.items():
-                if saved["identity"][key] != value:
-                    raise UserError(
-                        f"{self.folder} holds a comparison with {key}={saved['identity'][key]}, "
-                        f"not {value}; give the same arguments to go on, or choose another folder"
-                    )
-            plan = Plan(**saved["plan"])
-        say(f"{self.folder} goes on. {plan.described(self.minutes)}", error=True)
         return plan
 
     def _jobs(self, plan: Plan, short: Sequence[str]) -> dict[str, Named]:
