@@ -134,7 +134,8 @@ class Comparison:
         command: by which it goes on if it is stopped; empty for none.
 
     Raises:
-        UserError: for a word that a comparison decides itself, and for no time.
+        UserError: for a word that a comparison decides itself, for no time, and for a file where
+            the folder is to be.
     """
 
     def __init__(
@@ -150,6 +151,8 @@ class Comparison:
         if not 0 < minutes < math.inf:
             raise UserError(f"minutes={minutes:g} must be above 0; 2 is the default")
         self.given, self.folder, self.minutes, self.seed = given, folder, minutes, seed
+        if folder.is_file():
+            raise UserError(f"folder={folder} is a file; give a folder, or a name that is not used")
         self.command = command
         self.overhead = 0.0  # s, to prepare a training
 
@@ -163,7 +166,7 @@ class Comparison:
         start = time.perf_counter()
         config = self._checked()
         self.overhead = time.perf_counter() - start
-        with self._new_or_kept(), locked(self.folder):
+        with self._new_or_kept():
             (self.folder / FAILED_JOBS).unlink(missing_ok=True)
             plan = self._plan(config)
             short = short_words(self.given.words, config, plan.cases)
@@ -175,15 +178,21 @@ class Comparison:
 
     @contextmanager
     def _new_or_kept(self) -> Iterator[None]:
-        """Remove the folder again if nothing was written into it."""
-        try:
-            yield
-        except BaseException:
-            if not (self.folder / PLAN).exists():
-                (self.folder / ".lock").unlink(missing_ok=True)
-                with suppress(OSError):  # it is not empty
-                    self.folder.rmdir()
-            raise
+        """Lock the folder, and remove what was made for that if nothing else was written.
+
+        What another process or the user made stays.
+        """
+        lock = self.folder / ".lock"
+        made = [each for each in (lock, self.folder, *self.folder.parents) if not each.exists()]
+        with locked(self.folder):
+            try:
+                yield
+            except BaseException:
+                if not (self.folder / PLAN).exists():
+                    for each in made:
+                        with suppress(OSError):  # it is not empty
+                            each.unlink() if each == lock else each.rmdir()
+                raise
 
     @property
     def tunes(self) -> bool:

@@ -14,7 +14,8 @@ from programs import called
 
 import coil_rl
 from coil_rl.report.runs import read_runs
-from coil_rl.worth import jobs
+from coil_rl.run.folder import locked
+from coil_rl.worth import jobs, timing
 
 pytest.importorskip("gymnasium.envs.classic_control")
 SMALL = ["env.max_steps=20", "budget={frames: 2000, num_envs: 2, steps: 16, minibatches: 2}"]
@@ -250,3 +251,29 @@ def test_mistake_is_one_sentence_and_writes_nothing(words, sentence, tmp_path):
 
 def test_help_is_printed():
     assert "is my guide worth it?" in called("compare", "--help").stdout
+def test_second_process_is_refused_and_leaves_the_folder_of_the_first_one(tmp_path):
+    folder = tmp_path / "it"
+    with locked(folder):
+        done = called("compare", *PENDULUM, f"folder={folder}", code=2)
+        assert "another process is running in" in done.stderr
+        assert (folder / ".lock").exists()
+
+
+def test_comparison_that_wrote_nothing_removes_what_it_made_only(tmp_path, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(timing, "measure", stopped)
+    (tmp_path / "empty").mkdir()
+    for name in ("empty", "new/it"):
+        called("compare", *PENDULUM, f"folder={tmp_path / name}", code=130)
+    assert list(tmp_path.rglob("*")) == [tmp_path / "empty"]
+
+
+def test_folder_that_is_a_file_is_said_to_be_one(tmp_path):
+    (tmp_path / "it").write_text("mine")
+    done = called("compare", *PENDULUM, f"folder={tmp_path / 'it'}", code=2)
+    assert f"folder={tmp_path / 'it'} is a file; give a folder" in done.stderr
+    assert (tmp_path / "it").read_text() == "mine"
+
+
