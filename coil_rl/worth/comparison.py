@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -42,12 +43,12 @@ from coil_rl.worth.baselines import (
     measure_network,
     read_baselines,
 )
-from coil_rl.worth.jobs import job_name, run_jobs
 from coil_rl.worth.entry import IDLE, Entry
+from coil_rl.worth.jobs import job_name, run_jobs
 from coil_rl.worth.outcome import Outcome, first_of, read_outcome
 from coil_rl.worth.page import command_of, delayed_sentence, draw, guide_lines, page_of
-from coil_rl.worth.timing import Plan
 from coil_rl.worth.same import identity_of, keep_plan, known_plan
+from coil_rl.worth.timing import Plan
 from coil_rl.worth.verdict import NOTHING, Verdict, verdict
 
 PLAN, TABLE, PAGE, PICTURE = "compare.json", "compare.csv", "compare.md", "compare.png"
@@ -150,9 +151,9 @@ class Comparison:
         check_words(given.words)
         if not 0 < minutes < math.inf:
             raise UserError(f"minutes={minutes:g} must be above 0; 2 is the default")
-        self.given, self.folder, self.minutes, self.seed = given, folder, minutes, seed
         if folder.is_file():
             raise UserError(f"folder={folder} is a file; give a folder, or a name that is not used")
+        self.given, self.folder, self.minutes, self.seed = given, folder, minutes, seed
         self.command = command
         self.overhead = 0.0  # s, to prepare a training
 
@@ -273,7 +274,9 @@ class Comparison:
             cases = base.evaluation.curve.num_envs
             if outcome.runs:
                 draw(outcome, guide_lines(outcome), cases, self.folder / PICTURE)
-        say(f"{page}\nSee {self.folder}; coil-report folder={self.folder} has more.")
+        report = shlex.join(["coil-report", f"folder={self.folder}"])
+        more = f"; {report} has more" if outcome.runs else ""
+        say(f"{page}\nSee {self.folder}{more}.")
         return Worth(self.folder, found, pd.DataFrame(outcome.rows), command, page)
 
     def _delayed(self, found: Verdict, outcome: Outcome, base: DictConfig) -> str:
