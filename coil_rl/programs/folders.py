@@ -12,9 +12,10 @@ from hydra.errors import HydraException
 
 from coil_rl.config.written import quoted
 
-# Keys that hold one folder or file.
+# Keys that hold one folder or file; `folder` of coil-report may be a list of folders, too.
 KEYS = (
     "run",
+    "folder",
     "exported",
     "hydra.run.dir",
     "run_dir",

@@ -39,6 +39,7 @@ def report(config: DictConfig) -> None:
     from coil_rl.report.figures import draw_report
     from coil_rl.report.html import Section, html_page
     from coil_rl.report.runs import failed_jobs, read_runs
+    from coil_rl.run.stopping import resume_command
 
     folders = _folders(config)
     runs = read_runs(folders)
@@ -46,7 +47,7 @@ def report(config: DictConfig) -> None:
     if not finished:
         raise UserError(
             f"none of the runs in folder={config.folder} is finished; "
-            f"continue one with coil-train resume={runs[0].folder}, "
+            f"continue one with {resume_command(runs[0].folder)}, "
             "or repeat the command that started them"
         )
     finished, differences = distinguish(finished)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
@@ -144,7 +145,8 @@ def _read_run(folder: Path) -> Run:
     path = folder / "evaluation.csv"
     if not path.exists():
         return run
-    with file_of_a_run(path, f"remove the file and write it again by coil-train resume={folder}"):
+    again = shlex.join(["coil-train", f"resume={folder}"])
+    with file_of_a_run(path, f"remove the file and write it again by {again}"):
         shown = [name for name, measure in measures.items() if measure.title]
         evaluation = _read_evaluation(path, shown)
     path = folder / "metrics.csv"

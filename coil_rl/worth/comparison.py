@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -18,8 +19,8 @@ from coil_rl.config.build import env_maker
 from coil_rl.config.check import check_parts
 from coil_rl.config.python import Named, composed, named
 from coil_rl.config.trust import trust_own
-from coil_rl.errors import UserError, file_of_a_run
-from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, read_file, write_text
+from coil_rl.errors import UserError
+from coil_rl.files import FAILED_JOBS, write_text
 from coil_rl.output import decoration, quietly, say
 from coil_rl.report import write_csv
 from coil_rl.run.folder import locked
@@ -42,11 +43,13 @@ from coil_rl.worth.baselines import (
     measure_network,
     read_baselines,
 )
+from coil_rl.worth.entry import IDLE, Entry
 from coil_rl.worth.jobs import job_name, run_jobs
 from coil_rl.worth.outcome import Outcome, first_of, read_outcome
 from coil_rl.worth.page import command_of, delayed_sentence, draw, guide_lines, page_of
+from coil_rl.worth.same import identity_of, keep_plan, known_plan
 from coil_rl.worth.timing import Plan
-from coil_rl.worth.verdict import NOTHING, Entry, Verdict, verdict
+from coil_rl.worth.verdict import NOTHING, Verdict, verdict
 
 PLAN, TABLE, PAGE, PICTURE = "compare.json", "compare.csv", "compare.md", "compare.png"
 FOUND = "verdict.json"
@@ -132,7 +135,8 @@ class Comparison:
         command: by which it goes on if it is stopped; empty for none.
 
     Raises:
-        UserError: for a word that a comparison decides itself, and for no time.
+        UserError: for a word that a comparison decides itself, for no time, and for a file where
+            the folder is to be.
     """
 
     def __init__(
@@ -147,6 +151,8 @@ class Comparison:
         check_words(given.words)
         if not 0 < minutes < math.inf:
             raise UserError(f"minutes={minutes:g} must be above 0; 2 is the default")
+        if folder.is_file():
+            raise UserError(f"folder={folder} is a file; give a folder, or a name that is not used")
         self.given, self.folder, self.minutes, self.seed = given, folder, minutes, seed
         self.command = command
         self.overhead = 0.0  # s, to prepare a training
@@ -161,7 +167,7 @@ class Comparison:
         start = time.perf_counter()
         config = self._checked()
         self.overhead = time.perf_counter() - start
-        with self._new_or_kept(), locked(self.folder):
+        with self._new_or_kept():
             (self.folder / FAILED_JOBS).unlink(missing_ok=True)
             plan = self._plan(config)
             short = short_words(self.given.words, config, plan.cases)
@@ -173,15 +179,21 @@ class Comparison:
 
     @contextmanager
     def _new_or_kept(self) -> Iterator[None]:
-        """Remove the folder again if nothing was written into it."""
-        try:
-            yield
-        except BaseException:
-            if not (self.folder / PLAN).exists():
-                (self.folder / ".lock").unlink(missing_ok=True)
-                with suppress(OSError):  # it is not empty
-                    self.folder.rmdir()
-            raise
+        """Lock the folder, and remove what was made for that if nothing else was written.
+
+        What another process or the user made stays.
+        """
+        lock = self.folder / ".lock"
+        made = [each for each in (lock, self.folder, *self.folder.parents) if not each.exists()]
+        with locked(self.folder):
+            try:
+                yield
+            except BaseException:
+                if not (self.folder / PLAN).exists():
+                    for each in made:
+                        with suppress(OSError):  # it is not empty
+                            each.unlink() if each == lock else each.rmdir()
+                raise
 
     @property
     def tunes(self) -> bool:
@@ -213,15 +225,11 @@ class Comparison:
     def _plan(self, config: DictConfig) -> Plan:
         """Return what is going to be done, and say it; a comparison that goes on has its plan."""
         file = self.folder / PLAN
-        identity = {
-            "words": list(self.given.words),
-            "objects": sorted(self.given.nodes),
-            "tune": self.given.nodes.get("tune"),
-            "minutes": self.minutes,
-            "seed": self.seed,
-        }
+        identity = identity_of(self.given, config, self.minutes, self.seed)
         if file.exists():
-            return self._known_plan(file, json.loads(json.dumps(identity)))
+            plan = known_plan(file, identity)
+            say(f"{self.folder} goes on. {plan.described(self.minutes)}", error=True)
+            return plan
         if any(self.folder.rglob("config.yaml")):
             raise UserError(f"{self.folder} holds runs of something else; choose another folder")
         if self.command:
@@ -232,22 +240,8 @@ class Comparison:
             env = env_maker(config).bare(1, TEST, None)
         arms = arms_for(env, pace.step, tunes=self.tunes)
         plan = timing.plan(config, pace, arms, self.minutes)
-        write_text(file, json.dumps({"identity": identity, "plan": plan.to_dict()}, indent=2))
+        keep_plan(file, identity, plan)
         say(f"{pace.sentence}\n{plan.described(self.minutes)}", error=True)
-        return plan
-
-    def _known_plan(self, file: Path, identity: Mapping[str, Any]) -> Plan:
-        """Return the plan in a file, which must be that of the same comparison."""
-        with file_of_a_run(file, "choose another folder"):
-            saved = json.loads(read_file(file, LARGEST_NUMBERS))
-            for key, value in identity.items():
-                if saved["identity"][key] != value:
-                    raise UserError(
-                        f"{self.folder} holds a comparison with {key}={saved['identity'][key]}, "
-                        f"not {value}; give the same arguments to go on, or choose another folder"
-                    )
-            plan = Plan(**saved["plan"])
-        say(f"{self.folder} goes on. {plan.described(self.minutes)}", error=True)
         return plan
 
     def _jobs(self, plan: Plan, short: Sequence[str]) -> dict[str, Named]:
@@ -280,12 +274,14 @@ class Comparison:
             cases = base.evaluation.curve.num_envs
             if outcome.runs:
                 draw(outcome, guide_lines(outcome), cases, self.folder / PICTURE)
-        say(f"{page}\nSee {self.folder}; coil-report folder={self.folder} has more.")
+        report = shlex.join(["coil-report", f"folder={self.folder}"])
+        more = f"; {report} has more" if outcome.runs else ""
+        say(f"{page}\nSee {self.folder}{more}.")
         return Worth(self.folder, found, pd.DataFrame(outcome.rows), command, page)
 
     def _delayed(self, found: Verdict, outcome: Outcome, base: DictConfig) -> str:
-        """Return the sentence about a delay of what came out best; empty where it cannot act."""
-        if found.use == NOTHING:
+        """Return the sentence about a delay of a guide or policy; empty for everything else."""
+        if found.use in (NOTHING, *IDLE):
             return ""
         run = first_of(outcome, found.use)
         with decoration("the delay"):

@@ -19,7 +19,7 @@ from coil_rl.run.reasons import POLICIES
 from coil_rl.run.tuned_run import TUNED
 from coil_rl.worth.arms import GUIDE, OPPOSITE, TUNE
 from coil_rl.worth.baselines import NAME, read_baselines
-from coil_rl.worth.verdict import Entry
+from coil_rl.worth.entry import Entry
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def _row(entry: Entry, tables: Sequence[pd.DataFrame], calls: float = 0) -> dict
         "return": entry.mean,
         "worst": float(entry.returns.min()),
         "failures": _failures(tables),
-        "seeds": len(entry.returns) if entry.learns or entry.name == TUNE else None,
+        "seeds": len(entry.returns) if entry.trained else None,
         "frames": 0,
         "seconds": 0.0,
         "calls": calls,

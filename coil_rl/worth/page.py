@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
@@ -18,8 +20,9 @@ from coil_rl.report.curves import RETURNS, draw_guides, mean_curve, points
 from coil_rl.report.runs import RETURN, Run
 from coil_rl.report.table import AUTO_FORMAT, return_format
 from coil_rl.worth.arms import ARMS, TUNE
+from coil_rl.worth.entry import Entry, difference
 from coil_rl.worth.outcome import Outcome
-from coil_rl.worth.verdict import Entry, Verdict, difference
+from coil_rl.worth.verdict import Verdict
 
 COLUMNS = {
     "policy": ("policy", ""),
@@ -78,13 +81,15 @@ def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> str:
     """
     found = difference(late, Entry(entry.name, entry.returns[:1]))
     own = float(entry.returns[0].mean())
-    lost = (own - late.mean) / (own - random.mean)
-    kept = f"it keeps {1 - lost:.0%} of its distance from random actions"
+    kept = ""
+    if own > random.mean:  # else there is no distance to keep
+        share = (late.mean - random.mean) / (own - random.mean)
+        kept = f": it keeps {share:.0%} of its distance from random actions"
     spec = return_format([late.mean, own])
     which = f"{entry.name} of the first seed" if len(entry.returns) > 1 else entry.name
     return (
         f"With one step of delay on observation and action, which it was not trained with, "
-        f"{which} has {late.mean:{spec}} instead of {own:{spec}} ({found}): {kept}."
+        f"{which} has {late.mean:{spec}} instead of {own:{spec}} ({found}){kept}."
     )
 
 
@@ -119,8 +124,18 @@ def command_of(given: Named, verdict: Verdict) -> str:
 
 
 def _plain(word: str) -> str:
-    """Return a word without the quotes that its value does not need."""
-    return re.sub(r"^([\w.+@/]+)='([\w.:/-]+)'$", r"\1=\2", word)
+    """Return a word without the quotes of its value, if Hydra reads the same value without them."""
+    bare = re.sub(r"^([\w.+@/]+)='([\w.:/-]+)'$", r"\1=\2", word)
+    return bare if _read(bare) == _read(word) else word
+
+
+def _read(word: str) -> tuple[type, Any] | None:
+    """Return the value of a word as Hydra reads it, with its type; None for what it cannot read."""
+    try:
+        value = OverridesParser.create().parse_override(word).value()
+    except HydraException:
+        return None
+    return type(value), value
 
 
 def _bounds(each: Any) -> str:

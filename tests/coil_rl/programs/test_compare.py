@@ -14,7 +14,8 @@ from programs import called
 
 import coil_rl
 from coil_rl.report.runs import read_runs
-from coil_rl.worth import jobs
+from coil_rl.run.folder import locked
+from coil_rl.worth import jobs, timing
 
 pytest.importorskip("gymnasium.envs.classic_control")
 SMALL = ["env.max_steps=20", "budget={frames: 2000, num_envs: 2, steps: 16, minibatches: 2}"]
@@ -29,7 +30,7 @@ def rows_of(path):
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("compare") / "it"
+    folder = tmp_path_factory.mktemp("compare") / "a b,c=[d]{\u00e9}"
     done = called("compare", *PENDULUM, "tune={gain: [0.1, 10, log]}", f"folder={folder}")
     return folder, done
 
@@ -52,7 +53,7 @@ def test_it_says_before_what_it_runs_and_how_to_go_on(compared):
     assert "trainings of 128 frames each" in done.stderr
     assert "go on with: coil-compare env=pendulum" in done.stderr
     assert "minutes=0.01 is not enough" in done.stderr
-    assert f"folder={folder}" in done.stderr
+    assert shlex.quote(f"folder={folder}") in done.stderr
 
 
 def test_verdict_is_a_file_for_programs(compared):
@@ -76,12 +77,14 @@ def test_page_has_three_sentences_and_a_command_that_composes(compared):
     assert coil_rl.compose_train([*words, "run_dir=unused"]).env.id == "Pendulum-v1"
 
 
-def test_folder_is_one_for_reports(compared):
-    folder, _ = compared
+def test_folder_is_one_for_reports_by_the_printed_command(compared):
+    folder, done = compared
     assert (folder / "compare.png").stat().st_size > 10_000
     labels = {run.label for run in read_runs([folder]) if run.finished}
     assert {"tune", "ppo", "coil_anchored", "residual"} <= labels
-    page = called("report", f"folder={folder}", cwd=folder.parent).stdout
+    program, *words = shlex.split(done.stdout.rpartition("; ")[2].removesuffix(" has more.\n"))
+    assert program == "coil-report"
+    page = called("report", *words, cwd=folder.parent).stdout
     assert "coil_anchored" in page
 
 
@@ -246,6 +249,32 @@ def test_mistake_is_one_sentence_and_writes_nothing(words, sentence, tmp_path):
     assert sentence in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "it").exists()
+
+
+def test_second_process_is_refused_and_leaves_the_folder_of_the_first_one(tmp_path):
+    folder = tmp_path / "it"
+    with locked(folder):
+        done = called("compare", *PENDULUM, f"folder={folder}", code=2)
+        assert "another process is running in" in done.stderr
+        assert (folder / ".lock").exists()
+
+
+def test_comparison_that_wrote_nothing_removes_what_it_made_only(tmp_path, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(timing, "measure", stopped)
+    (tmp_path / "empty").mkdir()
+    for name in ("empty", "new/it"):
+        called("compare", *PENDULUM, f"folder={tmp_path / name}", code=130)
+    assert list(tmp_path.rglob("*")) == [tmp_path / "empty"]
+
+
+def test_folder_that_is_a_file_is_said_to_be_one(tmp_path):
+    (tmp_path / "it").write_text("mine")
+    done = called("compare", *PENDULUM, f"folder={tmp_path / 'it'}", code=2)
+    assert f"folder={tmp_path / 'it'} is a file; give a folder" in done.stderr
+    assert (tmp_path / "it").read_text() == "mine"
 
 
 def test_help_is_printed():

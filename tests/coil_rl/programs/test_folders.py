@@ -36,6 +36,16 @@ def test_existing_folder_is_found_by_its_name(name, tmp_path, monkeypatch):
     assert (tmp_path / by_hydra(name)).samefile(expected)
 
 
+def test_folder_of_a_report_has_the_same_spellings_and_may_be_a_list(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in NAMES:
+        (tmp_path / name).mkdir(exist_ok=True)
+        read = OverridesParser.create().parse_override(spelled(f"folder={name}"))
+        assert (tmp_path / read.value()).samefile(tmp_path / folder(name))
+    for text in ("[one,other]", "['a b','c,d']"):
+        assert spelled(f"folder={text}") == f"folder={text}"
+
+
 @pytest.mark.parametrize("text", ["'a=b'", '"a=b"', "a=b", "~/x", "'a b'", "~nobody/x", "x" * 300])
 def test_quotes_of_hydra_may_be_around_a_name(text, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

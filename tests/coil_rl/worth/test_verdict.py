@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from coil_rl.worth.verdict import NOTHING, Entry, difference, verdict
+from coil_rl.worth.entry import Entry, difference
+from coil_rl.worth.verdict import NOTHING, verdict
 
 CASES = np.linspace(-1, 1, 8)  # of all entries: some cases are easier
 
@@ -100,15 +101,100 @@ def test_failed_arms_are_named_as_undecided():
     assert verdict(entries(), failed=["ppo", "coil_anchored"]).use == "guide"
 
 
-def test_one_seed_and_one_case_are_never_clear_of_themselves():
-    one, other = Entry("one", np.array([[1.0]])), Entry("other", np.array([[1.0]]))
-    assert not difference(one, other).above(0.0)
+def test_good_guide_is_kept_where_the_best_mean_is_of_a_policy_with_one_bad_seed():
+    found = verdict(entries(guide=60.0, ppo=[-20.0, 180.0], coil_anchored=[50.0, 61.0]))
+    assert (found.use, found.train) == ("guide", "coil_anchored")
+    assert found.score == pytest.approx(0.75)
+    assert "whether ppo" in found.sentences[2]
 
 
-@pytest.mark.parametrize("seeds", [1, 2, 3])
-def test_difference_is_paired_by_case(seeds):
-    one = Entry("one", np.tile(100 * CASES + 1, (seeds, 1)))
-    found = difference(one, Entry("other", 100 * CASES[None]))
-    assert (found.mean, found.low, found.high) == pytest.approx((1, 1, 1))
-    assert found.above(0.5)
-    assert not found.above(2.0)
+def test_best_of_what_is_clearly_better_is_used_though_another_mean_is_higher():
+    found = verdict(entries(ppo=[10.0, 200.0], coil_anchored=[80.0, 82.0], residual=[70.0, 71.0]))
+    assert (found.use, found.train) == ("coil_anchored", "coil_anchored")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("zero", "Doing nothing"), ("first network", "The un")]
+)
+def test_doing_nothing_is_used_where_it_is_clearly_better_than_everything_else(name, words):
+    low = {"zero": -120.0, "first network": -130.0}
+    given = {"random": -160.0, "guide": -40.0, "opposite": -150.0, "ppo": [-90.0, -80.0]}
+    found = verdict(entries(**(low | given | {name: 40.0})))
+    assert (found.use, found.train) == (name, "ppo")
+    assert found.score == pytest.approx(0.6)
+    assert found.sentences[0].startswith(words)
+    assert "40.0) is clearly better than everything else here; your guide" in found.sentences[0]
+    assert "your guide has -40.0, at 0.60 of it" in found.sentences[0]
+    assert "+80.0" in found.sentences[1]
+
+
+def test_guide_is_not_called_the_best_where_doing_nothing_is_as_good():
+    given = {"random": -200.0, "opposite": -190.0, "zero": 0.0, "first network": 0.0}
+    found = verdict(entries(guide=-80.0, ppo=-90.0, **given))
+    assert found.use in ("zero", "first network")
+    assert "everything else here but" in found.sentences[0]
+    found = verdict(entries(guide=50.0, ppo=[40.0, 30.0], zero=[50.1]))
+    assert found.use == "guide"
+    assert "zero" in found.sentences[2]
+
+
+def test_policy_is_used_where_doing_nothing_is_clearly_better_than_the_guide_only():
+    found = verdict(entries(guide=20.0, zero=60.0, ppo=[90.0, 92.0]))
+    assert found.use == "ppo"
+
+
+def test_doing_nothing_may_be_all_that_is_better_than_random_actions():
+    given = {"random": -200.0, "opposite": -220.0, "zero": -100.0, "first network": -210.0}
+    found = verdict(entries(guide=-230.0, ppo=[-300.0, 0.0], **given))
+    assert (found.use, found.train) == ("zero", "ppo")
+    assert "random actions (-200.0), which no guide and no trained policy" in found.sentences[0]
+
+
+def variable(made, name, mean, spread):
+    """Let the returns of an entry vary from case to case."""
+    returns = mean + spread * np.array([1, -1, 1, -1, 1, -1, 1, -1.0])
+    return made | {name: Entry(name, np.tile(returns, (len(made[name].returns), 1)))}
+
+
+@pytest.mark.parametrize("mean", [-382.0, -150.0])
+def test_guide_that_is_not_clearly_better_than_random_gives_way_to_a_policy_that_is(mean):
+    low = {"random": -200.0, "opposite": -210.0, "zero": -220.0, "first network": -230.0}
+    made = variable(entries(ppo=-100.0, coil_anchored=-101.0, **low), "guide", mean, 900.0)
+    found = verdict(made)
+    assert (found.use, found.train) == ("ppo", "ppo")
+    assert found.sentences[0].startswith(
+        "Your guide is not clearly better than random actions (-200.0). Use ppo: -100.0"
+    )
+    assert "guide" in found.sentences[2]
+
+
+def test_only_what_is_clearly_better_than_random_is_recommended():
+    generator = np.random.default_rng(0)
+    names = ("guide", "opposite", "zero", "tune", "ppo", "coil_anchored", "residual")
+    for _ in range(300):
+        means = {name: list(generator.normal(0, 50, 2)) for name in names}
+        made = entries(**means)
+        for name in names:
+            made = variable(made, name, made[name].mean, generator.choice([0.0, 100.0]))
+        random = made["random"]
+        sure = [name for name in names if difference(made[name], random).above(0)]
+        found = verdict(made)
+        assert found.use in (sure or [NOTHING])
+        assert found.score <= 1 or not sure
+
+
+def test_nothing_is_recommended_on_one_case_and_it_is_said_why():
+    made = entries(guide=90.0, ppo=[80.0, 99.0])
+    found = verdict({name: Entry(name, each.returns[:, :1]) for name, each in made.items()})
+    assert found.use == NOTHING
+    assert "no interval: one case" in found.sentences[1]
+    assert "give more cases than one" in found.sentences[2]
+
+
+def test_no_training_that_finished_is_said():
+    found = verdict(entries(), failed=["ppo", "coil_anchored"])
+    assert found.sentences[2].endswith("which failed. No training finished.")
+    found = verdict(entries(guide=-5.0, opposite=-6.0), failed=["ppo"])
+    assert (found.use, found.train) == (NOTHING, "")
+    assert "no training finished" in found.sentences[0]
+    assert "what made the trainings fail" in found.sentences[2]

@@ -1,0 +1,45 @@
+"""The page of a comparison: the sentence about a delay, and the command to go on with."""
+
+import shlex
+
+import numpy as np
+import pytest
+
+from coil_rl.config.python import Named, compose_train
+from coil_rl.worth.entry import Entry
+from coil_rl.worth.page import command_of, delayed_sentence
+from coil_rl.worth.verdict import Verdict
+
+
+def entry(mean):
+    return Entry("guide", mean + np.linspace(-1, 1, 5)[None])
+
+
+def test_delay_says_what_is_kept_of_the_distance_from_random_actions():
+    said = delayed_sentence(entry(100.0), entry(75.0), entry(0.0))
+    assert said.endswith("it keeps 75% of its distance from random actions.")
+
+
+@pytest.mark.parametrize("own", [-382.0, -200.0])
+def test_delay_says_nothing_of_a_distance_that_there_is_not(own):
+    said = delayed_sentence(entry(own), entry(-400.0), entry(-200.0))
+    assert "keeps" not in said
+    assert said.endswith(").")
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        f"+env.options.mode={value}"
+        for value in ("'null'", "'3'", "'1e3'", "'true'", "'inf'", "'a'", "'a b'", "'a:b'", "null")
+    ],
+)
+def test_printed_command_has_the_values_of_the_comparison(word):
+    words = ["env=gym", "env.id='Pendulum-v1'", word]
+    command = command_of(Named(words, {}), Verdict("ppo", "ppo", 1.0, False))
+    program, *printed = shlex.split(command)
+    assert (program, printed[1]) == ("coil-train", "env.id=Pendulum-v1")
+    place = ["method=ppo", "run_dir=unused"]
+    expected = compose_train([*words, *place]).env.options.mode
+    found = compose_train([*printed, "run_dir=unused"]).env.options.mode
+    assert (type(found), found) == (type(expected), expected)
