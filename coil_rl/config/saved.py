@@ -1,5 +1,6 @@
 """The configuration in the folder of a run: written, read without running code, and compared."""
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -104,7 +105,13 @@ def holds(folder: Path, config: DictConfig) -> bool:
 
 
 def identity(config: DictConfig) -> dict[str, Any]:
-    """Return the values on which the numbers of a run depend, by their full keys."""
+    """Return the values on which the numbers of a run depend, by their full keys.
+
+    Args:
+        config: composed, or read from a folder, whose measures are complete.
+    """
+    config = copy.deepcopy(config)
+    complete_measures(config)
     values: Any = OmegaConf.to_container(config, resolve=True)
     if values.get("recording") is None:  # of all envs but one
         values.pop("recording", None)

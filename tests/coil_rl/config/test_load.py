@@ -5,7 +5,10 @@ from drives import drive
 from programs import ROOT
 from run_folders import make_untrained_run
 
+from coil_rl.config.build import assemble
 from coil_rl.config.load import open_run
+from coil_rl.config.python import compose_train
+from coil_rl.config.saved import holds
 from coil_rl.envs import McapReplayEnv
 from coil_rl.errors import UserError
 from coil_rl.guides import SplineGuide
@@ -84,3 +87,12 @@ def test_weights_that_are_not_finite_are_refused(replay, tmp_path):
     checkpoint.save(state, run / "policy_last.pt")
     with pytest.raises(UserError, match=r"policy_last\.pt holds weights that are NaN or infinite"):
         acts(run, replay)
+
+
+@pytest.mark.parametrize("env", ["cone_track", "simulated_robot", "pendulum"])
+def test_repeated_words_are_about_the_same_run(env, tmp_path):
+    words = [f"env={env}", f"run_dir={tmp_path / 'run'}"]
+    assemble(compose_train(words)).begin()
+    assert holds(tmp_path / "run", compose_train(words))
+    with pytest.raises(UserError, match=r"holds a run with learner.gamma="):
+        holds(tmp_path / "run", compose_train([*words, "learner.gamma=0.5"]))
