@@ -191,7 +191,7 @@ class ActionSpace:
             raise ValueError(f"is neither an index below {max(self.choices)} nor a one-hot vector")
 
     def _check_one_hot(self, vectors: Tensor) -> None:
-        """Raise a `ValueError` for vectors [..., A] of 0 and 1 that do not choose one option."""
+        """Raise a `ValueError` for vectors [..., A] without exactly one 1 for each choice."""
         chosen = torch.stack([part.sum(-1) for part in vectors.split(self.choices, -1)], -1)
         if (chosen != 1).any():
             raise ValueError("is no one-hot vector: it must have exactly one 1 for each choice")

@@ -139,7 +139,7 @@ class SeededGenerator(nn.Module):
         self.different: int | None = None
 
     def sample(self, sample: Callable[..., Tensor], shape: Sequence[int], dim: int = 0) -> Tensor:
-        """Draw a tensor.
+        """Draw random numbers for all rows.
 
         Args:
             sample: draws a tensor of a shape with a generator, such as `torch.randn`.

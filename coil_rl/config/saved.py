@@ -108,7 +108,7 @@ def identity(config: DictConfig) -> dict[str, Any]:
     """Return the values on which the numbers of a run depend, by their full keys.
 
     Args:
-        config: composed, or read from a folder, whose measures are complete.
+        config: composed, or read from a folder; it stays as it is.
     """
     config = copy.deepcopy(config)
     complete_measures(config)

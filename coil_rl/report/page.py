@@ -180,11 +180,11 @@ def _reached(frames: Sequence[float]) -> str | None:
 
 
 def some_of(reached: int, seeds: int) -> str:
-    """Return the end of a cell whose mean leaves seeds out, ` (3 of 5 seeds)`; else nothing.
+    """Return ` (3 of 5 seeds)` for a mean of some seeds only; empty for a mean of all.
 
     Args:
         reached: number of seeds that the mean is of.
-        seeds: of all runs.
+        seeds: number of all seeds.
     """
     return f" ({reached} of {seeds} seeds)" if reached < seeds else ""
 

@@ -30,6 +30,16 @@ TRAIN = "train"  # episodes of the training: random starts, tracks or seeds
 TEST = "test"  # cases of the table, which training never sees
 TESTS = "tests"  # new cases in which a training compares policies
 SOME_ROWS = 2  # of an env that is only looked at; some ways to degrade advice need several
+# Entries that transforms, policies and learners write. `last_action`, `row` and `is_init` are not
+# among them: where the env has its own, that is used.
+WRITTEN = {
+    *("action_log_prob", "action_value", "advantage", "agent_acts", "agent_weight"),
+    *("chosen_action", "chosen_action_value", "concatenated", "episode_reward"),
+    *("executed_action", "exploration_noise", "guide_action", "guide_distance", "guide_number"),
+    *("guide_state", "guide_steps", "limit_count", "loc", "logits", "normalised", "policy_state"),
+    *("remembered", "scale", "shown", "state_action_value", "state_value", "task_reward"),
+    *("unclipped_action", "value_target"),
+}
 
 
 class BareEnv(Protocol):
@@ -156,18 +166,6 @@ class EnvMaker:
         env = transformed(env, transforms, "disturb, degrade" if disturb else "degrade")
         of_row = [guide for guide in range(len(guides)) for _ in range(rows)]
         return env, FollowAdvice(env, of_row)
-
-
-# Entries that transforms, policies and learners write. `last_action`, `row` and `is_init` are not
-# among them: where the env has its own, that is used.
-WRITTEN = {
-    *("action_log_prob", "action_value", "advantage", "agent_acts", "agent_weight"),
-    *("chosen_action", "chosen_action_value", "concatenated", "episode_reward"),
-    *("executed_action", "exploration_noise", "guide_action", "guide_distance", "guide_number"),
-    *("guide_state", "guide_steps", "limit_count", "loc", "logits", "normalised", "policy_state"),
-    *("remembered", "scale", "shown", "state_action_value", "state_value", "task_reward"),
-    *("unclipped_action", "value_target"),
-}
 
 
 def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> EnvBase:

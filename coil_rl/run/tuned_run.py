@@ -235,7 +235,7 @@ class TunedRun(Run):
         (name,) = self.make_env.guides()
         env, _ = self.make_env.guided(len(kept) * cases, EVALUATION, {name: Candidates(guides)})
         with torch.random.fork_rng():
-            results = measures(env, FollowAdvice(env), watch=self.watch)
+            results = measures(env, FollowAdvice(env), cases=cases, watch=self.watch)
         rows: dict[int, dict[str, float]] = {each: {} for each in kept}
         for measured, numbers in results.items():
             means = numbers.view(len(kept), -1).double().mean(1).tolist()

@@ -184,15 +184,17 @@ class Comparison:
         What another process or the user made stays.
         """
         lock = self.folder / ".lock"
-        made = [each for each in (lock, self.folder, *self.folder.parents) if not each.exists()]
+        is_new = not lock.exists()
+        made = [each for each in (self.folder, *self.folder.parents) if not each.exists()]
         with locked(self.folder):
             try:
                 yield
             except BaseException:
-                if not (self.folder / PLAN).exists():
+                if is_new and not (self.folder / PLAN).exists():
+                    lock.unlink(missing_ok=True)
                     for each in made:
                         with suppress(OSError):  # it is not empty
-                            each.unlink() if each == lock else each.rmdir()
+                            each.rmdir()
                 raise
 
     @property

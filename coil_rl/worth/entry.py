@@ -40,7 +40,7 @@ class Entry:
 
     @property
     def learns(self) -> bool:
-        """Whether it is the policy of a training."""
+        """Whether it is a policy that a training learned, not a guide with tuned numbers."""
         return self.trained and self.name != TUNE
 
     @property

@@ -8,10 +8,10 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from coil_rl.config.fingerprint import fingerprint
 from coil_rl.config.given import kept
 from coil_rl.config.python import Named
 from coil_rl.config.saved import identity
-from coil_rl.config.told_apart import told_apart
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
 from coil_rl.run.folder import check_same
@@ -44,7 +44,7 @@ def identity_of(given: Named, config: DictConfig, minutes: float, seed: int) -> 
         for key, node in given.nodes.items():
             # The node of an object contains the folder, which may be moved.
             if key != "tune":
-                OmegaConf.update(described, key, told_apart(kept(node["name"])), merge=False)
+                OmegaConf.update(described, key, fingerprint(kept(node["name"])), merge=False)
     return {"identity": arguments, "configuration": identity(described)}
 
 

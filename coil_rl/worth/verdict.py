@@ -94,7 +94,13 @@ def _mean(entry: Entry) -> float:
 
 
 def _leading(entries: Sequence[Entry], sure: Collection[str]) -> str:
-    """Return the name of the best of what learned, if it can be of a `sure` one; empty for none."""
+    """Return the name of the policy with the highest mean of those that learned; empty for none.
+
+    Args:
+        entries: of all that was compared.
+        sure: names of those that are clearly better than random actions. If some of these learned,
+            the others are left out.
+    """
     learned = [each for each in entries if each.learns]
     leading = [each for each in learned if each.name in sure] or learned
     return max(leading, key=_mean).name if leading else ""
@@ -103,7 +109,7 @@ def _leading(entries: Sequence[Entry], sure: Collection[str]) -> str:
 def _chosen(
     entries: Mapping[str, Entry], sure: Collection[str], scale: float
 ) -> tuple[Entry, Entry]:
-    """Return what to use, and what to use if zero and the untrained policy are left out.
+    """Return what is recommended, and what is without zero actions and the untrained policy.
 
     Args:
         entries: by name.

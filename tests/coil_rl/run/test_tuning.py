@@ -79,6 +79,14 @@ def test_run_is_read_by_reports_with_its_curve(run):
     assert returns[-1] > returns[0]
 
 
+def test_noise_of_a_case_is_the_same_for_all_numbers(tmp_path):
+    words = [*SLOW_SWING, "disturb=[observation_noise]", "disturb.observation_noise.sigma=0.3"]
+    tuned(tmp_path / "run", *words, "budget.frames=3000")
+    [found] = read_runs([tmp_path / "run"])
+    own = found.curve[0]["evaluation/return"]
+    assert own == pytest.approx(found.guide_returns["guide"])  # which acts alone in its rows
+
+
 def test_tuned_guide_is_a_guide_that_acts_as_the_policy_of_its_run(run):
     opened = open_run(run)
     evaluation = opened.trial.evaluation

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from coil_rl.config.told_apart import told_apart
+from coil_rl.config.fingerprint import fingerprint
 
 
 class Thing:
@@ -62,26 +62,26 @@ MAKERS = {
 
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 def test_objects_with_the_same_state_look_the_same_and_others_do_not(make):
-    assert told_apart(make(1)) == told_apart(make(1))
-    assert told_apart(make(1)) != told_apart(make(2))
+    assert fingerprint(make(1)) == fingerprint(make(1))
+    assert fingerprint(make(1)) != fingerprint(make(2))
 
 
 def test_functions_differ_by_their_code():
-    assert told_apart(scaled(1)) != told_apart(another(1))
+    assert fingerprint(scaled(1)) != fingerprint(another(1))
 
 
 def test_network_is_the_same_after_it_was_used():
     network = linear(0)
-    before = told_apart(network)
+    before = fingerprint(network)
     network.eval()(torch.zeros(2))
-    assert told_apart(network) == before
+    assert fingerprint(network) == before
 
 
 def test_object_that_holds_itself_has_a_state():
     one, other = Thing(gain=1), Thing(gain=1)
     one.own, other.own = [one], [other]
-    assert told_apart(one) == told_apart(other)
-    assert told_apart(one).startswith(f"{__name__}.Thing (state ")
+    assert fingerprint(one) == fingerprint(other)
+    assert fingerprint(one).startswith(f"{__name__}.Thing (state ")
 
 
 def test_object_whose_state_cannot_be_read_is_its_class():
@@ -90,5 +90,5 @@ def test_object_whose_state_cannot_be_read_is_its_class():
         def __dict__(self):
             raise RuntimeError("no")
 
-    assert told_apart(Odd()).endswith("Odd")
-    assert told_apart(deque([1])) == told_apart(deque([2]))  # Python shows no state of it
+    assert fingerprint(Odd()).endswith("Odd")
+    assert fingerprint(deque([1])) == fingerprint(deque([2]))  # Python shows no state of it

@@ -1,8 +1,8 @@
-"""A text that tells the objects of a user apart, in this process and in the next one.
+"""Fingerprints of the objects of a user, which are the same in every process.
 
-A configuration holds only a name for such an object, so that two of them look the same there. Here
-an object is its class with a hash of its state: numbers, texts, arrays, and the code of functions.
-What has no state that Python shows counts as its class.
+A configuration holds only a name for such an object, so that two of them look the same there. A
+fingerprint is the class of an object with a hash of its state: numbers, texts, arrays, and the code
+of functions. For an object whose state Python does not show it is the class alone.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 NAMED = (type, ModuleType, BuiltinFunctionType)
 
 
-def told_apart(thing: Any) -> str:
+def fingerprint(thing: Any) -> str:
     """Return the class of an object, with a hash of its state where that can be read.
 
     Args:
@@ -76,7 +76,7 @@ def _parts(thing: Any, seen: dict[int, tuple[int, Any]]) -> Iterator[bytes]:
 
 
 def _inside(thing: Any) -> list[Any]:
-    """Return the objects that the state of an object consists of."""
+    """Return the parts of the state of an object."""
     if isinstance(thing, Mapping):
         return [each for item in thing.items() for each in item]
     if isinstance(thing, (list, tuple)):
