@@ -5,7 +5,7 @@ pandas is imported where it is used, because a training does without it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
@@ -22,6 +22,7 @@ from coil_rl.report.table import return_format
 if TYPE_CHECKING:
     import pandas as pd
 
+SAME_RETURN = 1e-5  # of the range of all returns
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
 
@@ -392,17 +393,17 @@ class _Guide:
     Attributes:
         name: "guide", or "guide NAME".
         labels: which share the guide.
-        results: the different evaluations of the guide, by their cases and rewards.
+        results: the different evaluations of the guide.
     """
 
     name: str
     labels: list[str]
-    results: dict[Any, pd.DataFrame]
+    results: list[pd.DataFrame]
 
-    def add(self, label: str, results: Mapping[Any, pd.DataFrame]) -> None:
+    def add(self, label: str, results: Iterable[pd.DataFrame], tolerance: float) -> None:
         """Let another label share the guide."""
         self.labels.append(label)
-        self.results.update(results)
+        self.results[:] = _different([*self.results, *results], tolerance)
 
     def listed(self) -> str:
         """Return the labels as a text, the first ones of many."""
@@ -415,7 +416,7 @@ class _Guide:
         """Return all different evaluations, numbered by the column of the seed."""
         import pandas as pd
 
-        numbered = [rows.assign(seed=number) for number, rows in enumerate(self.results.values())]
+        numbered = [rows.assign(seed=number) for number, rows in enumerate(self.results)]
         return _index(f"the guide of {self.labels[0]}", pd.concat(numbered))
 
 
@@ -449,35 +450,59 @@ def _shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[_Guide]:
     if the results of one contain those of the other. A guide with random actions has one result per
     seed.
     """
+    tolerance = _tolerance(labels.values())
     guides: list[_Guide] = []
     for label, frame in labels.items():
         for name, rows in frame[_is_guide(frame)].groupby("driver", sort=False):
-            results = {}
-            for _, of_seed in rows.groupby("seed", sort=False):
-                results[(*of_seed["case"], *map(_digits, of_seed["reward"]))] = of_seed
-            same = _same_guide(guides, name, results)
+            results = _different((each for _, each in rows.groupby("seed", sort=False)), tolerance)
+            same = _same_guide(guides, name, results, tolerance)
             if same is None:
                 guides.append(_Guide(name, [label], results))
             else:
-                same.add(label, results)
+                same.add(label, results, tolerance)
     return guides
 
 
-def _digits(reward: float) -> str:
-    """Return six digits of a reward as a text, so that equal rewards in any unit are equal here.
+def _tolerance(frames: Iterable[pd.DataFrame]) -> float:
+    """Return up to which difference two returns of a guide in one case are the same.
 
-    In a text NaN equals NaN, and -0 becomes 0 by the addition.
+    It is small beside the range of all returns, so that it fits any unit and any centre, and large
+    beside what the rounding of a batch of another size makes of one guide: 2e-6 of the range in the
+    cone world.
     """
-    return f"{reward + 0.0:.5e}"
+    returns = np.concatenate([frame["reward"].to_numpy(float) for frame in frames])
+    returns = returns[np.isfinite(returns)]
+    return SAME_RETURN * float(np.ptp(returns)) if returns.size else 0.0
+
+
+def _different(results: Iterable[pd.DataFrame], tolerance: float) -> list[pd.DataFrame]:
+    """Return the first of each of several evaluations that are the same."""
+    different: list[pd.DataFrame] = []
+    for result in results:
+        if not _contains(different, result, tolerance):
+            different.append(result)
+    return different
+
+
+def _contains(results: Iterable[pd.DataFrame], result: pd.DataFrame, tolerance: float) -> bool:
+    """Return whether one of several evaluations has the cases and returns of another one."""
+    cases, returns = result["case"].tolist(), result["reward"]
+    return any(
+        other["case"].tolist() == cases
+        and np.allclose(other["reward"], returns, rtol=1e-7, atol=tolerance, equal_nan=True)
+        for other in results
+    )
 
 
 def _same_guide(
-    guides: Sequence[_Guide], name: str, results: Mapping[Any, pd.DataFrame]
+    guides: Sequence[_Guide], name: str, results: Sequence[pd.DataFrame], tolerance: float
 ) -> _Guide | None:
     """Return the first guide with a name whose results contain the given ones, or the reverse."""
     for guide in guides:
-        ours, theirs = results.keys(), guide.results.keys()
-        if guide.name == name and (ours <= theirs or theirs <= ours):
+        if guide.name != name:
+            continue
+        pairs = ((results, guide.results), (guide.results, results))
+        if any(all(_contains(ours, each, tolerance) for each in theirs) for theirs, ours in pairs):
             return guide
     return None
 

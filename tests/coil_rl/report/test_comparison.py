@@ -140,6 +140,18 @@ def test_guides_are_told_apart_in_any_unit_of_the_reward(unit, tmp_path):
     assert sorted(guides) == ["guide (a, c)", "guide (b)"]
 
 
+@pytest.mark.parametrize("centre", [0.0, 1e6])
+def test_one_guide_whose_returns_differ_by_rounding_is_one_guide(centre, tmp_path):
+    cases = {"a": centre + 500.00049, "b": centre - 100.0}
+    for index, label in enumerate("abc"):
+        # On both sides of any limit of a rounded number; b is another guide by a thousandth.
+        rounded = {"a": cases["a"] + (0.6 if label == "b" else 1e-3 * index), "b": cases["b"]}
+        guide = driven("guide", rounded)
+        make_run(tmp_path / str(index), label, 0, guide + driven(label, cases))
+    guides = [name for name, _ in table(tmp_path) if name.startswith("guide")]
+    assert sorted(guides) == ["guide (a, c)", "guide (b)"]
+
+
 def test_guide_without_a_number_in_a_case_is_one_guide(tmp_path):
     for index, label in enumerate("ab"):
         guide = driven("guide", {"a": 500.0, "b": math.nan})
