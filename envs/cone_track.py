@@ -146,7 +146,7 @@ class ConeTrackEnv(SeededEnv):
             car_length=car_length,
         )
         check_range(0, 100, above=True, sight=sight)
-        check_range(1, LARGEST_STARTS, starts=starts or 1)
+        check_range(1, LARGEST_STARTS, starts=1 if starts is None else starts)
         check_range(0, 1000, above=True, rate=rate)
         check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
         check_range(0, 90, above=True, max_steering=max_steering)

@@ -390,7 +390,10 @@ class GuideActions(ActionTransform):
         if self.needs_past:
             advice, memory = self._advice_with_past(data, None, self.rows[rows])
         elif self._cache is not None:
+            before = self.calls
             advice = self._cache(data, self._advice)
+            # What is kept counts too: a process that resumes the run has kept nothing yet.
+            self.calls = before + data.numel() * len(self.names)
         else:
             advice = self._advice(data)
 

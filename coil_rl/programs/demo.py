@@ -16,6 +16,11 @@ if TYPE_CHECKING:
 POLICY, TRACK = "cone_track/coil_anchored", "test_1"
 PICTURE = "coil_demo.png"
 USAGE = "coil-demo takes nothing, or the name of the picture: coil-demo FILE.png"
+HELP = """coil-demo: a picture of a trained agent beside its guide, from a shipped policy.
+
+  coil-demo
+  coil-demo lap.png
+  coil-demo ~/pictures/lap.png"""
 
 
 def demo(path: Path) -> None:
@@ -109,7 +114,7 @@ def target(arguments: Sequence[str]) -> Path:
 def main() -> None:
     """Entry point."""
     if sys.argv[1:] in (["--help"], ["-h"]):
-        print(USAGE)
+        print(HELP)
         return
     with app.program("demo"):
         demo(target(sys.argv[1:]))

@@ -7,6 +7,11 @@ from pathlib import Path
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.run.folder import COMMAND, is_begun, versions
 
+HELP = """coil-info: the versions that a bug report needs, or the command that made a run.
+
+  coil-info
+  coil-info run=outputs/train/FOLDER"""
+
 
 def describe(folder: Path) -> dict[str, str]:
     """Return the command that made a run, and the versions that it was begun with.
@@ -34,6 +39,9 @@ def describe(folder: Path) -> dict[str, str]:
 def main() -> None:
     """Print one name and its value a line."""
     arguments = sys.argv[1:]
+    if arguments in (["--help"], ["-h"]):
+        print(HELP)
+        return
     try:
         if not arguments:
             result = versions()

@@ -347,7 +347,9 @@ class Experiment:
         self.learner.load_state_dict(state["learner"])
         self.rollout.load_state_dict(state["rollout"])
         self.updates, self.ends = state["updates"], dict(state["ends"])
-        self.frames_before, self.calls_before = state["frames_before"], state["calls"]
+        self.frames_before = state["frames_before"]
+        # What building this process's env has asked its guides for is no part of the run.
+        self.calls_before = state["calls"] - guide_calls(self.rollout.env)
         if self.cases is not None:
             self.cases.load_state_dict(state["cases"])
         self.returns = deque(state["returns"], maxlen=self.EPISODES)

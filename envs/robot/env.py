@@ -109,7 +109,7 @@ class SimulatedRobotEnv(SeededEnv):
         seed: int = 0,
     ) -> None:
         check_range(0, above=True, num_envs=num_envs, speed=speed, car_length=car_length)
-        check_range(1, LARGEST_STARTS, starts=starts or 1)
+        check_range(1, LARGEST_STARTS, starts=1 if starts is None else starts)
         check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
         check_range(0, 90, above=True, max_steering=max_steering)
         check_choice(("random", "drawn", "cyclic"), assignment=assignment)

@@ -285,6 +285,7 @@ def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
             for value in (0, -1)
         ),
         ({"rate": math.nan}, "rate=nan must be more than 0"),
+        ({"starts": 0}, "starts=0 must be at least 1 and at most"),
         ({"held_steps": -1}, "held_steps=-1 must be at least 0"),
         ({"seed": -1}, "seed=-1 must be at least 0"),
         ({"time_limit": 0.01}, "time_limit=0.01 must be at least one step"),

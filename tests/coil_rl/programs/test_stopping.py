@@ -34,6 +34,8 @@ def test_signal_saves_the_present_update_and_says_how_to_go_on(tmp_path, number)
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
+        # As in a terminal: under nohup the tests ignore SIGHUP, and so would the program.
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),
     )
     log = folder / "metrics.csv"
     deadline = time.monotonic() + 120

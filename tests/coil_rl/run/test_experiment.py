@@ -94,7 +94,8 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize(
-    ("guide", "last"), [(RandomGuide, 1), (RandomGuide, 5), (SplineMemoryGuide, 4)]
+    ("guide", "last"),
+    [(RandomGuide, 1), (RandomGuide, 5), (SplineMemoryGuide, 4), (SplineGuide, 4)],
 )
 def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last, capsys):
     frames = 16 * 8 * 5
