@@ -103,6 +103,13 @@ def _number(name: str, bounds: Any, own: float, whole: bool) -> Number:
     low, high = map(float, bounds[:2])
     if low >= high:
         raise UserError(f"tune.{name}={given}: the lower bound must be below the upper one")
+    if whole:
+        low, high = float(math.ceil(low)), float(math.floor(high))
+        if low >= high:
+            raise UserError(
+                f"tune.{name}={given}: {name} is a whole number, and there are no two between "
+                "these bounds; give others"
+            )
     if len(bounds) == 3 and low <= 0:
         raise UserError(
             f"tune.{name}={given}: the lower bound of a logarithm must be above 0; leave log out, "

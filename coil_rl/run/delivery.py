@@ -39,6 +39,7 @@ GUIDE = "guide"  # entry of a file of weights that stands for a guide: its numbe
 SHARE = 0.05  # of the frames of a run that the test may take; its first cases may take more
 FIRST_CASES = 2
 RETURN_IN_TRAINING = "train/return"
+FINISHED = "train/episodes"
 
 
 class GuideActs(TensorDictModuleBase):
@@ -110,13 +111,26 @@ class Delivery:
     def _fits(self) -> bool:
         """Return whether there is a test: its first cases fit into the frames, or a guide is held.
 
-        Episodes are taken to be as long as in the start test. A run that holds a guide is always
-        tested, as it promises to be no worse than this guide.
+        Episodes are taken to be as long as in the start test, and without one as in the training. A
+        run that holds a guide is always tested, as it promises to be no worse than this guide.
         """
-        if not self.cases.episodes or self._holds():
+        if self._holds():
             return True
-        length = self.cases.steps / self.cases.episodes
-        return FIRST_CASES * self._compared() * length <= self._left()
+        if self.cases.episodes:
+            length = self.cases.steps / self.cases.episodes
+            return FIRST_CASES * self._compared() * length <= self._left()
+        return FIRST_CASES * self._compared() * self._length_in_training() <= self._affordable()
+
+    def _length_in_training(self) -> float:
+        """Return the mean length of the episodes of the training, 0 where it is not logged.
+
+        Where none is finished it is the length of the training of a row.
+        """
+        rows = [] if self.curve is None else self.curve.metrics.rows
+        if not rows or FINISHED not in rows[-1]:
+            return 0.0
+        finished = sum(row[FINISHED] for row in rows if not math.isnan(row[FINISHED]))
+        return rows[-1]["frames/rollout"] / max(finished, self.env.batch_size.numel())
 
     def _compared(self) -> int:
         """Return the smallest number of policies that act in the first cases."""

@@ -105,8 +105,8 @@ def handed_over(folder: Path) -> str | None:
     chosen, returns, ahead = report["policy"], report["returns"], report["ahead"]
     if chosen == UNTESTED:
         return (
-            "Handed over is the last policy, without a test at the end: the start test has left no "
-            "frames for it, and no guide is held."
+            "Handed over is the last policy, without a test at the end: the frames that are left "
+            "for it are too few for two cases, and no guide is held."
         )
     names = dict(POLICIES)
     if report["frames"] is not None:

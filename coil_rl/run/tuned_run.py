@@ -113,6 +113,12 @@ class TunedRun(Run):
         values = read_tuned(self.folder, self.numbers)
         if values is not None:
             found.append(numbers_sentence(values, {each.name: each.own for each in self.numbers}))
+        taken = json.loads(read_file(self.folder / DELIVERY, LARGEST_NUMBERS))["steps"]
+        if taken > self.budget.frames:
+            found.append(
+                f"The search took {taken:,} frames, more than "
+                f"budget.frames={self.budget.frames:,}: that is too little for a generation and a test of its result."
+            )
         return found
 
     def _env_of(self, candidates: Candidates) -> Any:

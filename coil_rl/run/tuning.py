@@ -188,6 +188,9 @@ class Tuner:
         reserve = self.cases.frames - self.cases.steps
         found: dict[str, list[Tensor]] = {name: [] for name in values}
         begun, count = self.cases.steps, FIRST_CASES
+        if self.cases.episodes:
+            length = self.cases.steps / self.cases.episodes
+            count = max(LEAST_CASES, min(count, int(reserve / (len(values) * length))))
         while count >= LEAST_CASES:
             new = self.returns(list(values.values()), count)
             for known, returns in zip(found.values(), new, strict=True):

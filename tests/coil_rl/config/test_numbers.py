@@ -3,7 +3,13 @@
 import pytest
 from hydra import compose, initialize_config_module
 
-from coil_rl.config.numbers import GuideWithNumbers, numbers_of, numbers_to_tune, with_numbers
+from coil_rl.config.numbers import (
+    GuideWithNumbers,
+    _number,
+    numbers_of,
+    numbers_to_tune,
+    with_numbers,
+)
 from coil_rl.errors import UserError
 
 
@@ -73,6 +79,13 @@ def test_bounds_are_read_with_the_own_value():
 def test_items_of_lists_may_be_named_by_nested_keys():
     config = composed("env=cart_pole", "tune={weights: {2: [0, 2]}}")
     assert [number.name for number in numbers_to_tune(config)] == ["weights.2"]
+
+
+def test_bounds_of_a_whole_number_are_whole():
+    number = _number("n", [2.6, 4.9], 3.0, True)
+    assert {number.value(place / 10) for place in range(11)} == {3.0, 4.0}
+    with pytest.raises(UserError, match="there are no two between these bounds"):
+        _number("n", [3.55, 4.9], 3.0, True)
 
 
 @pytest.mark.parametrize(

@@ -147,6 +147,16 @@ def test_test_at_the_end_is_left_out_where_the_start_test_took_the_frames_of_bot
     assert "1 had no frames left for a test and handed over their last policy" in page
 
 
+def test_run_without_a_start_test_knows_from_its_training_how_long_a_test_would_be(tmp_path):
+    small = ["method=coil", "delivery=tested", "budget.frames=1200", "budget.num_envs=2"]
+    run = trained(tmp_path / "run", *small)
+    last = rows_of(run / "metrics.csv")[-1]
+    # Two cases of 40 steps with two policies are more than 5 % of the frames.
+    assert float(last["frames/tests"]) == 0
+    assert float(last["frames"]) <= 1200
+    assert report(run)["policy"] == "last_untested"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("frames", [8000, 11_000])  # for three and for four cases
 def test_placebo_of_other_rows_always_has_other_rows(frames, tmp_path):

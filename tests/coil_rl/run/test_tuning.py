@@ -70,6 +70,15 @@ def test_every_step_is_a_frame_and_frames_are_bounded(run):
     assert int(rows[-1]["guide/calls"]) >= frames[-1]
 
 
+def test_budget_that_is_too_small_for_a_generation_and_its_test_is_said(tmp_path):
+    folder = tmp_path / "run"
+    tuned(folder, *SLOW_SWING, "budget.frames=300")
+    taken = int(rows_of(folder / "metrics.csv")[-1]["frames"])
+    assert taken > 300
+    sentence = f"The search took {taken:,} frames, more than budget.frames=300"
+    assert sentence in (folder / "evaluation.md").read_text()
+
+
 def test_run_is_read_by_reports_with_its_curve(run):
     [found] = read_runs([run])
     assert found.finished
