@@ -117,7 +117,8 @@ class TunedRun(Run):
         if taken > self.budget.frames:
             found.append(
                 f"The search took {taken:,} frames, more than "
-                f"budget.frames={self.budget.frames:,}: that is too little for a generation and a test of its result."
+                f"budget.frames={self.budget.frames:,}: that is too little for a generation and a "
+                "test of its result."
             )
         return found
 
