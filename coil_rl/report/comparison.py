@@ -22,7 +22,7 @@ from coil_rl.report.table import return_format
 if TYPE_CHECKING:
     import pandas as pd
 
-SAME_RETURN = 1e-5  # of the range of all returns
+SAME_RETURN = 1e-5  # of the range of the compared returns
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
 
@@ -400,10 +400,10 @@ class _Guide:
     labels: list[str]
     results: list[pd.DataFrame]
 
-    def add(self, label: str, results: Iterable[pd.DataFrame], tolerance: float) -> None:
+    def add(self, label: str, results: Iterable[pd.DataFrame]) -> None:
         """Let another label share the guide."""
         self.labels.append(label)
-        self.results[:] = _different([*self.results, *results], tolerance)
+        self.results[:] = _different([*self.results, *results])
 
     def listed(self) -> str:
         """Return the labels as a text, the first ones of many."""
@@ -450,59 +450,58 @@ def _shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[_Guide]:
     if the results of one contain those of the other. A guide with random actions has one result per
     seed.
     """
-    tolerance = _tolerance(labels.values())
     guides: list[_Guide] = []
     for label, frame in labels.items():
         for name, rows in frame[_is_guide(frame)].groupby("driver", sort=False):
-            results = _different((each for _, each in rows.groupby("seed", sort=False)), tolerance)
-            same = _same_guide(guides, name, results, tolerance)
+            results = _different(each for _, each in rows.groupby("seed", sort=False))
+            same = _same_guide(guides, name, results)
             if same is None:
                 guides.append(_Guide(name, [label], results))
             else:
-                same.add(label, results, tolerance)
+                same.add(label, results)
     return guides
 
 
-def _tolerance(frames: Iterable[pd.DataFrame]) -> float:
-    """Return up to which difference two returns of a guide in one case are the same.
-
-    It is small beside the range of all returns, so that it fits any unit and any centre, and large
-    beside what the rounding of a batch of another size makes of one guide: 2e-6 of the range in the
-    cone world.
-    """
-    returns = np.concatenate([frame["reward"].to_numpy(float) for frame in frames])
-    returns = returns[np.isfinite(returns)]
-    return SAME_RETURN * float(np.ptp(returns)) if returns.size else 0.0
-
-
-def _different(results: Iterable[pd.DataFrame], tolerance: float) -> list[pd.DataFrame]:
+def _different(results: Iterable[pd.DataFrame]) -> list[pd.DataFrame]:
     """Return the first of each of several evaluations that are the same."""
     different: list[pd.DataFrame] = []
     for result in results:
-        if not _contains(different, result, tolerance):
+        if not _contains(different, result):
             different.append(result)
     return different
 
 
-def _contains(results: Iterable[pd.DataFrame], result: pd.DataFrame, tolerance: float) -> bool:
+def _contains(results: Iterable[pd.DataFrame], result: pd.DataFrame) -> bool:
     """Return whether one of several evaluations has the cases and returns of another one."""
-    cases, returns = result["case"].tolist(), result["reward"]
+    cases, returns = result["case"].tolist(), result["reward"].to_numpy(float)
     return any(
-        other["case"].tolist() == cases
-        and np.allclose(other["reward"], returns, rtol=1e-7, atol=tolerance, equal_nan=True)
+        other["case"].tolist() == cases and _same_returns(other["reward"].to_numpy(float), returns)
         for other in results
     )
 
 
+def _same_returns(one: Array, other: Array) -> bool:
+    """Return whether two evaluations of guides in the same cases have the same returns.
+
+    The allowed difference is small beside the range of these returns, so that it fits any unit and
+    any centre, and large beside what the rounding of a batch of another size makes of one guide:
+    2e-6 of the range in the cone world.
+    """
+    both = np.concatenate([one, other])
+    both = both[np.isfinite(both)]
+    tolerance = SAME_RETURN * float(np.ptp(both)) if both.size else 0.0
+    return np.allclose(one, other, rtol=1e-7, atol=tolerance, equal_nan=True)
+
+
 def _same_guide(
-    guides: Sequence[_Guide], name: str, results: Sequence[pd.DataFrame], tolerance: float
+    guides: Sequence[_Guide], name: str, results: Sequence[pd.DataFrame]
 ) -> _Guide | None:
     """Return the first guide with a name whose results contain the given ones, or the reverse."""
     for guide in guides:
         if guide.name != name:
             continue
         pairs = ((results, guide.results), (guide.results, results))
-        if any(all(_contains(ours, each, tolerance) for each in theirs) for theirs, ours in pairs):
+        if any(all(_contains(ours, each) for each in theirs) for theirs, ours in pairs):
             return guide
     return None
 

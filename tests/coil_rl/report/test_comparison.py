@@ -152,6 +152,18 @@ def test_one_guide_whose_returns_differ_by_rounding_is_one_guide(centre, tmp_pat
     assert sorted(guides) == ["guide (a, c)", "guide (b)"]
 
 
+@pytest.mark.parametrize("driver", ["guide", "c"])
+def test_guides_are_told_apart_beside_a_policy_that_diverged(driver, tmp_path):
+    for index, label in enumerate("abc"):
+        rows = {"guide": {"a": -100.0 - 30 * index, "b": -110.0}, label: {"a": -90.0, "b": -95.0}}
+        if label == "c":
+            rows[driver]["a"] = -5e6
+        drivers = [row for name, rewards in rows.items() for row in driven(name, rewards)]
+        make_run(tmp_path / label, label, 0, drivers)
+    guides = [name for name, _ in table(tmp_path) if name.startswith("guide")]
+    assert sorted(guides) == ["guide (a)", "guide (b)", "guide (c)"]
+
+
 def test_guide_without_a_number_in_a_case_is_one_guide(tmp_path):
     for index, label in enumerate("ab"):
         guide = driven("guide", {"a": 500.0, "b": math.nan})
