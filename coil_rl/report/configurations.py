@@ -109,10 +109,20 @@ def differing(runs: Sequence[Run]) -> list[str]:
     differ = []
     for key in keys:
         values = [configuration.get(key) for configuration in configurations]
-        follows = all(value == run.seed for value, run in zip(values, runs, strict=True))
-        if not follows and any(value != values[0] for value in values):
+        if not _follows_seed(key, values, runs) and any(value != values[0] for value in values):
             differ.append(key)
     return differ
+
+
+def _follows_seed(key: str, values: Sequence[Any], runs: Sequence[Run]) -> bool:
+    """Return whether a key is called a seed and has the value of the run's seed in each run.
+
+    Other values may equal the seed by chance, as a flag and the seeds 0 and 1.
+    """
+    return key.endswith("seed") and all(
+        value == run.seed and not isinstance(value, bool)
+        for value, run in zip(values, runs, strict=True)
+    )
 
 
 def relevant(run: Run) -> dict[str, Any]:

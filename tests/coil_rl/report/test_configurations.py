@@ -38,6 +38,8 @@ def labels(runs):
         ({"guide": {"a": {"x": 1}}}, {"guide": {}}, "guide.a.x"),
         ({"env": {"first_seed": 5}}, {"env": {"first_seed": 6}}, "env.first_seed"),
         ({"observes": ["a"]}, {"observes": ["a", "b"]}, "observes"),
+        ({"learner": {"normalise": False}}, {"learner": {"normalise": True}}, "learner.normalise"),
+        ({"disturb": {"lag": 0}}, {"disturb": {"lag": 1}}, "disturb.lag"),
         ({"init": None}, {"init": "policy.pt"}, "init"),
     ],
 )
