@@ -93,3 +93,12 @@ def test_many_differences_are_numbered(runs):
         "coil (2: a=7, b=7, c=7, ...)",
     ]
     assert "a, b, c and others" in sentences[0]
+
+
+@pytest.mark.parametrize(
+    ("one", "two"), [("a" * 60 + "x", "a" * 60 + "y"), (3, "3"), (None, "null")]
+)
+def test_values_that_look_alike_are_numbered(one, two, runs):
+    found = labels(runs({"of": one}, {"of": two}, {"of": one}))
+    assert found[0] == found[2] != found[1]
+    assert [label.partition(": ")[0] for label in found[:2]] == ["coil (1", "coil (2"]
