@@ -190,8 +190,8 @@ class Comparison:
     def table(self, against: str | None = None) -> list[dict[str, Any]]:
         """Return one row per policy, guides first.
 
-        `difference` is the score of an agent minus that of another policy with the same seed; `p`
-        is corrected for all rows.
+        `difference` is the score of an agent minus that of another policy with the same seed, the
+        mean over the `difference_seeds` that both have; `p` is corrected for all rows.
 
         Args:
             against: label of the agent to compare with; "guide" for the guide of each agent; None
@@ -220,6 +220,7 @@ class Comparison:
                     "difference": difference.mean,
                     "difference_low": difference.low,
                     "difference_high": difference.high,
+                    "difference_seeds": difference.seeds if pairs else None,
                     "p": difference.p,
                     "better": pairs.better if pairs else None,
                     "needs_guide": group.needs_guide,
@@ -511,7 +512,7 @@ class Paired:
     """Difference between two policies with the same seeds.
 
     Attributes:
-        difference: of a measure, mean over cases.
+        difference: of a measure, mean over cases, for the seeds that both have.
         better: share of seeds and cases with a higher value, ties counting half.
     """
 

@@ -112,6 +112,8 @@ def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, A
         score = Estimate(row["score"], row["low"], row["high"])
         difference = Estimate(row["difference"], row["difference_low"], row["difference_high"])
         cells = {"score cell": score.cell(spec), "difference cell": difference.cell(f"+{spec}")}
+        if cells["difference cell"]:
+            cells["difference cell"] += some_of(row["difference_seeds"], row["seeds"])
         low, high = row["low_of_cases"], row["high_of_cases"]
         cells["cases cell"] = None if math.isnan(low) else f"{low:{spec}} to {high:{spec}}"
         shown.append({**row, **cells})
@@ -163,6 +165,8 @@ def training(runs: Sequence[Run]) -> list[Table]:
         row: dict[str, Any] = {key: mean(seed[key] for seed in numbers) for key in numbers[0]}
         row["label"], row["seeds"] = label, len(of_label)
         row["seconds"] = mean(seconds) if seconds else None
+        if 0 < len(seconds) < len(of_label):
+            row["seconds"] = f"{mean(seconds):.0f}{some_of(len(seconds), len(of_label))}"
         for key in ("until_90", "until_100"):
             row[f"{key} cell"] = _reached([seed[key] for seed in numbers])
         if not math.isnan(row["area"]):

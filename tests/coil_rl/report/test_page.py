@@ -161,3 +161,17 @@ def test_empty_columns_and_many_cases_are_omitted(tmp_path):
     compared = {"sampled": compare(read_runs([tmp_path]))}
     assert "Difference" not in page.notes(None, compared)
     assert "Difference to its guide: of the same seed" in page.notes("guide", compared)
+
+
+def test_means_of_some_seeds_only_say_so(tmp_path):
+    for label, seeds in (("coil", 3), ("ppo", 2)):
+        for seed in range(seeds):
+            rows = driven(label, {"a": 10.0 + seed, "b": 20.0})
+            make_run(tmp_path / f"{label}{seed}", label, seed, rows)
+    (tmp_path / "coil1" / "training_time.json").write_text('{"seconds": 100}')
+    rows = compare(read_runs([tmp_path])).table("ppo")
+    assert [row["difference_seeds"] for row in rows if row["driver"] == "coil"] == [2]
+    drivers, _ = section(tmp_path, "ppo")
+    assert "+0.0 (+0.0 to +0.0) (2 of 3 seeds)" in drivers
+    (training,) = page.training(read_runs([tmp_path]))
+    assert "100 (1 of 3 seeds)" in str(training)
