@@ -5,6 +5,7 @@ pandas is imported where it is used, because a training does without it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -106,10 +107,14 @@ class Group:
         return int(self.table[measure].notna().sum()) if measure in self.table else 0
 
     @property
-    def rank(self) -> tuple[float, float]:
-        """Sort key: the completed share, then the mean score, the best first."""
+    def rank(self) -> tuple[bool, float, float]:
+        """Sort key: the completed share, then the mean score, the best first.
+
+        A policy without a score, because a return is no number, is the last one.
+        """
         completed = self.table["completed"].mean() if "completed" in self.table else 0.0
-        return -float(np.nan_to_num(completed)), -self.score.mean
+        mean = self.score.mean
+        return math.isnan(mean), -float(np.nan_to_num(completed)), -float(np.nan_to_num(mean))
 
     @property
     def crashes(self) -> str | None:
@@ -523,7 +528,9 @@ class Paired:
 def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
     """Compare two policies seed by seed.
 
-    A case counts for a seed if both have a number there, as lap times where both completed one.
+    A case counts for a seed if both have a number there, as lap times where both completed one. Of
+    rewards and scores every one has to be a number: a policy that diverged in a case is not judged
+    by the others.
 
     Args:
         group: the first policy.
@@ -531,7 +538,7 @@ def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
         measure: name of the measure to compare, "reward", or "score".
 
     Returns:
-        None without common cases and seeds, or if a seed has no such case.
+        None without common cases and seeds, if a seed has no such case, or a reward is no number.
     """
     if group.cases != other.cases or (other.is_guide and other.seeds is not None):
         return None
@@ -542,6 +549,8 @@ def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
     x, y = ours.to_numpy(), theirs.to_numpy()
     counts = np.isfinite(x) & np.isfinite(y)
     if not x.size or not counts.any(axis=1).all():
+        return None
+    if measure in ("reward", "score") and not counts.all():
         return None
     differences = np.where(counts, x - y, 0).sum(axis=1) / counts.sum(axis=1)
     return Paired(estimate(differences), float(wins(x, y)[counts].mean()))

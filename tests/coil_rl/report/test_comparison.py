@@ -267,3 +267,15 @@ def test_guide_is_paired_with_every_seed(sweep, tmp_path):
     assert paired(groups_by_title(tmp_path / "other")["coil"], groups["ppo"]) is None, (
         "no common seed"
     )
+
+
+def test_policy_whose_return_is_no_number_is_last_and_has_no_difference(tmp_path):
+    for label, rewards in {"a": {"x": 30.0, "y": math.nan}, "b": {"x": 1.0, "y": 1.0}}.items():
+        for seed in range(2):
+            make_run(tmp_path / f"{label}{seed}", label, seed, driven(label, rewards))
+    rows = table(tmp_path, against="b")
+    assert list(rows) == [("b", ""), ("a", "")]
+    row = rows["a", ""]
+    assert math.isnan(row["score"])
+    assert math.isnan(row["difference"])
+    assert row["better"] is None
