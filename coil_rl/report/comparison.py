@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SAME_RETURN = 1e-5  # of the range of the compared returns
+EPISODES = "_episodes"  # suffix of the columns of `with_denominators`
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
 
@@ -98,13 +99,16 @@ class Group:
         """Mean score, with the interval over the cases: of the means over seeds in each case."""
         return estimate(self.scores.mean(axis=0))
 
-    def known(self, measure: str) -> int:
-        """Return in how many of the results, one for each seed and case, a measure is known.
+    def known(self, measure: str) -> tuple[int, int]:
+        """Return in how many of the episodes a measure is known, and the number of episodes.
 
         Args:
             measure: name of the measure.
         """
-        return int(self.table[measure].notna().sum()) if measure in self.table else 0
+        if measure not in self.table:
+            return 0, 0
+        known, episodes = _episodes(self.table, measure)
+        return int(known.sum()), int(episodes.sum())
 
     @property
     def rank(self) -> tuple[bool, float, float]:
@@ -143,6 +147,8 @@ class Group:
     def means(self, case: int | None = None) -> dict[str, float]:
         """Return reward and measures over seeds and cases: means, of minima the smallest.
 
+        A measure counts as often as there are episodes that have it.
+
         Args:
             case: index of the only case to count; None for all of them.
         """
@@ -150,7 +156,8 @@ class Group:
         means = {"reward": float(rows["reward"].mean(skipna=False))}
         for name, each in self.measures.items():
             if name in rows:
-                means[name] = each.pool(rows[name].tolist())
+                known, _ = _episodes(rows, name)
+                means[name] = each.pool(rows[name].tolist(), known.tolist())
         return means
 
     def parts(self, prefix: str) -> dict[str, float]:
@@ -159,8 +166,26 @@ class Group:
         Args:
             prefix: PER_STEP or TERM.
         """
-        columns = [column for column in self.table if column.startswith(prefix)]
+        columns = [
+            column
+            for column in self.table
+            if column.startswith(prefix) and not column.endswith(EPISODES)
+        ]
         return {column: float(self.table[column].mean()) for column in columns}
+
+
+def _episodes(rows: pd.DataFrame, measure: str) -> tuple[pd.Series, pd.Series]:
+    """Return how many episodes of each result have a measure, and how many episodes there are.
+
+    The columns are those of `with_denominators`. A run leaves them out if all of its episodes have
+    all measures; it has as many episodes as the others, or, if none has the columns, one.
+    """
+    known = rows[measure].notna()
+    if "episodes" not in rows:
+        return known.astype(int), known * 0 + 1
+    episodes = rows["episodes"].fillna(rows["episodes"].max()).fillna(1)
+    counts = rows.get(f"{measure}{EPISODES}", episodes).fillna(episodes)
+    return counts.clip(lower=1).where(known, 0), episodes
 
 
 @dataclass(frozen=True)
@@ -236,13 +261,14 @@ class Comparison:
         return rows
 
     def _partial(self, group: Group) -> dict[str, int]:
-        """Return in how many results each measure is known, unless it is in all results of all."""
+        """Return in how many episodes each measure is known, unless it is in all episodes."""
         names: dict[str, None] = {}
         for each in self.groups:
             for name in each.measures:
-                if 0 < each.known(name) < len(each.table):
+                known, episodes = each.known(name)
+                if 0 < known < episodes:
                     names[name] = None
-        return {f"{name}_results": group.known(name) for name in names}
+        return {f"{name}{EPISODES}": group.known(name)[0] for name in names}
 
     def case_table(self) -> list[dict[str, Any]]:
         """Return one row per policy and case."""

@@ -48,7 +48,7 @@ def section(
 def _shares(
     row: Mapping[str, Any], group: Group, columns: Mapping[str, tuple[str, str]]
 ) -> dict[str, str]:
-    """Return the cells of a policy whose means leave results out, as `12.3 (4 of 8)`.
+    """Return the cells of a policy whose means leave episodes out, as `12.3 (4 of 8)`.
 
     Args:
         row: of the table.
@@ -57,9 +57,9 @@ def _shares(
     """
     cells = {}
     for name in group.measures:
-        known, results = group.known(name), len(group.table)
-        if name in columns and 0 < known < results:
-            cells[name] = f"{row[name]:{columns[name][1]}} ({known} of {results})"
+        known, episodes = group.known(name)
+        if name in columns and 0 < known < episodes:
+            cells[name] = f"{row[name]:{columns[name][1]}} ({known} of {episodes})"
     return cells
 
 

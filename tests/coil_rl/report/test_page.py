@@ -175,3 +175,18 @@ def test_means_of_some_seeds_only_say_so(tmp_path):
     assert "+0.0 (+0.0 to +0.0) (2 of 3 seeds)" in drivers
     (training,) = page.training(read_runs([tmp_path]))
     assert "100 (1 of 3 seeds)" in str(training)
+
+
+def test_measure_of_some_episodes_counts_as_often_as_it_is_known(tmp_path):
+    rows = driven("coil", {"a": 1.0, "b": 2.0}, "sampled")
+    for row, lap, known in zip(rows, (50.0, 80.0, 55.0), (5, 1, 6), strict=True):
+        row |= {"lap_time": lap, "episodes": 5 * (1 + (row["case"] == "mean"))}
+        row["lap_time_episodes"] = known
+    make_run(tmp_path / "0", "coil", 0, rows)
+    make_run(tmp_path / "1", "coil", 1, driven("coil", {"a": 1.0, "b": 2.0}, "sampled"))
+    comparison = compare(read_runs([tmp_path]), "sampled")
+    # The second run has no such columns: all of its ten episodes have a lap.
+    row = comparison.table()[0]
+    assert row["lap_time"] == (5 * 50 + 80 + 10 * 50) / 16
+    assert row["lap_time_episodes"] == 16
+    assert "51.88 (16 of 20)" in str(page.section(comparison, [row], None)[0])
