@@ -16,7 +16,7 @@ import numpy as np
 
 from coil_rl.errors import UserError
 from coil_rl.measures import Measure
-from coil_rl.report.runs import DRIVER, GUIDE, Run
+from coil_rl.report.runs import DRIVER, FALLBACK, GUIDE, Run
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
 from coil_rl.report.table import return_format
 
@@ -33,8 +33,8 @@ class Group:
     """Evaluations of one policy over seeds.
 
     Attributes:
-        name: the label of an agent, "guide" or "guide NAME" for a guide; the labels are appended if
-            several guides share it.
+        name: the label of an agent, "LABEL or guide" for it with a fallback, "guide" or "guide
+            NAME" for a guide; the labels are appended if several guides share it.
         advice: modification of the advice; empty for none.
         table: indexed by (seed, case); for a guide the seeds number its different evaluations.
         is_guide: whether the policy is a guide alone.
@@ -314,9 +314,9 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     for label, frame in labels.items():
         rows = frame[~_is_guide(frame) & (frame["actions"] == actions)]
         best_guide = normalised[guides[label][0]] if label in guides else None
-        variants = _variants(label, rows, references, measures, best_guide, needs_guide[label])
+        variants = _variants(rows, references, measures, best_guide, needs_guide[label])
         agents += sorted(variants, key=lambda group: (group.advice != "", group.rank))
-    # The first group of a label is the one with unaltered advice.
+    # The first group of a name is the one with unaltered advice.
     best = {group.name: group.rank for group in reversed(agents)}
     agents.sort(key=lambda group: (best[group.name], group.name))
     ranked = sorted(normalised.values(), key=lambda group: group.rank)
@@ -337,31 +337,29 @@ def _is_guide(frame: pd.DataFrame) -> pd.Series:
 
 
 def _variants(
-    label: str,
     rows: pd.DataFrame,
     references: Mapping[tuple[str, ...], Array],
     measures: Mapping[str, Measure],
     guide: Group | None,
     needs_guide: bool | None,
 ) -> list[Group]:
-    """Return the agent of a label, and the same agent with each alteration of its advice.
+    """Return the agent of a label, with each alteration of its advice, and with a fallback.
 
     Args:
-        label: of the agent.
-        rows: its evaluations.
+        rows: evaluations of the agent of a label.
         references: the rewards that scores are divided by, by cases.
         measures: definitions by name.
         guide: its best guide.
         needs_guide: whether it needs the guide during evaluation.
     """
     variants = []
-    for advice, own in rows.groupby("advice", sort=False):
+    for (driver, advice), own in rows.groupby(["driver", "advice"], sort=False):
         variant = Group(
-            label,
+            driver,
             advice,
-            _index(label, own),
+            _index(driver, own),
             guide=guide,
-            needs_guide=None if advice else needs_guide,
+            needs_guide=None if advice else needs_guide or driver.endswith(FALLBACK),
             measures=measures,
         )
         variants.append(replace(variant, reference=references.get(variant.cases)))

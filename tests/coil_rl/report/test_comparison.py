@@ -279,3 +279,18 @@ def test_policy_whose_return_is_no_number_is_last_and_has_no_difference(tmp_path
     assert math.isnan(row["score"])
     assert math.isnan(row["difference"])
     assert row["better"] is None
+
+
+def test_policy_with_a_fallback_is_a_row_of_its_own(tmp_path):
+    for seed in range(2):
+        rows = [
+            *driven("guide", CASES),
+            *driven("coil", {"a": 510.0, "b": 610.0}),
+            *driven("coil", {"a": 5.0, "b": 6.0}, advice="zeroed"),
+            *driven("coil or guide", {"a": 520.0, "b": 620.0}),
+        ]
+        make_run(tmp_path / str(seed), "coil", seed, rows)
+    rows = table(tmp_path, against="coil")
+    assert list(rows) == [("guide", ""), ("coil or guide", ""), ("coil", ""), ("coil", "zeroed")]
+    assert rows["coil or guide", ""]["reward"] == pytest.approx(570)
+    assert rows["coil or guide", ""]["better"] == 1
