@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from coil_rl.report.runs import Run
+from coil_rl.report.runs import FALLBACK, Run
 
 # Keys, or parents of keys, on which the numbers of a run do not depend, or only by rounding.
 IRRELEVANT = (
@@ -172,7 +172,6 @@ def _text(value: Any) -> str:
 def _relabelled(run: Run, label: str) -> Run:
     """Return a run with another label, also in its evaluation."""
     evaluation = run.evaluation.copy()
-    own = evaluation["driver"].str.startswith(run.label)
-    renamed = label + evaluation["driver"].str.removeprefix(run.label)
-    evaluation["driver"] = evaluation["driver"].where(~own, renamed)
+    renamed = {f"{run.label}{suffix}": f"{label}{suffix}" for suffix in ("", FALLBACK)}
+    evaluation["driver"] = evaluation["driver"].replace(renamed)
     return replace(run, label=label, evaluation=evaluation)
