@@ -23,7 +23,7 @@ from coil_rl.report.table import return_format
 if TYPE_CHECKING:
     import pandas as pd
 
-SAME_RETURN = 1e-5  # of the range of the compared returns
+SAME_RETURN = 1e-5  # of the range of the compared returns; the rest is rounding
 EPISODES = "_episodes"  # suffix of the columns of `with_denominators`
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
