@@ -142,12 +142,19 @@ def guide_training(runs: Sequence[Run]) -> list[Table]:
     return [Table(rows, columns)] if rows else []
 
 
-def _before_to_after(curves: Sequence[Sequence[Mapping[str, float]]], key: str) -> str:
-    """Return the first and the last number of a column as a cell, means over the runs."""
-    columns = [[line[key] for line in curve if not math.isnan(line[key])] for curve in curves]
-    before, after = mean(column[0] for column in columns), mean(column[-1] for column in columns)
+def _before_to_after(curves: Sequence[Sequence[Mapping[str, float]]], key: str) -> str | None:
+    """Return the first and the last number of a column as a cell, means over the runs.
+
+    A run without a number in the column does not count.
+    """
+    columns = [[line[key] for line in curve if key in line] for curve in curves]
+    numbers = [[each for each in column if not math.isnan(each)] for column in columns]
+    known = [column for column in numbers if column]
+    if not known:
+        return None
+    before, after = mean(column[0] for column in known), mean(column[-1] for column in known)
     spec = return_format([before, after])
-    return f"{before:{spec}} to {after:{spec}}"
+    return f"{before:{spec}} to {after:{spec}}{some_of(len(known), len(curves))}"
 
 
 def training(runs: Sequence[Run]) -> list[Table]:

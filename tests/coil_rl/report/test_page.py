@@ -190,3 +190,15 @@ def test_measure_of_some_episodes_counts_as_often_as_it_is_known(tmp_path):
     assert row["lap_time"] == (5 * 50 + 80 + 10 * 50) / 16
     assert row["lap_time_episodes"] == 16
     assert "51.88 (16 of 20)" in str(page.section(comparison, [row], None)[0])
+
+
+def test_guide_in_some_runs_of_a_label_only_is_said():
+    before, after = {"frames": 0.0}, {"frames": 9.0}
+    curves = [
+        [before | {"guide/x": 1.0}, after | {"guide/x": 2.0}],
+        [before, after],
+        [before | {"guide/x": math.nan}, after],
+    ]
+    runs = [Run(Path(), "a", seed, True, curve=curve) for seed, curve in enumerate(curves)]
+    (table,) = page.guide_training(runs)
+    assert cells(table)[1] == ["a", "3", "1.00 to 2.00 (1 of 3 seeds)"]
