@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SAME_RETURN = 1e-5  # of the range of the compared returns; the rest is rounding
+NEXT_TO_NOTHING = 0.01  # for a guide in a case, of its mean over the others
 EPISODES = "_episodes"  # suffix of the columns of `with_denominators`
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
@@ -369,9 +370,9 @@ def _variants(
 def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str, ...], Array]:
     """Return by cases the rewards of the best guide in each case.
 
-    In a case where it crashes or earns nothing, its mean over the other cases is taken. The result
-    is empty if a run was evaluated in cases in which no guide earns anything: scores of all runs
-    are to be alike.
+    In a case where it crashes or earns nothing, or next to nothing, its mean over the other cases
+    is taken: a ratio to such a reward would be all of a mean. The result is empty if a run was
+    evaluated in cases in which no guide earns anything: scores of all runs are to be alike.
     """
     references: dict[tuple[str, ...], Array] = {}
     for guide in sorted(guides, key=lambda group: group.rank):
@@ -379,6 +380,9 @@ def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str,
         earned = rewards[rewards > 0]
         if guide.has("crashed"):
             earned = earned[~(guide.by_seed("crashed") > 0).any()]
+        if len(earned) > 1:
+            others = (earned.sum() - earned) / (len(earned) - 1)
+            earned = earned[earned >= NEXT_TO_NOTHING * others]
         if len(earned):
             filled = rewards.where(rewards.index.isin(earned.index), earned.mean())
             references.setdefault(guide.cases, filled.values)

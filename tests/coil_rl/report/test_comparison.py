@@ -75,7 +75,12 @@ def test_completion_ranks_before_the_mean(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "failure", [{"rewards": {"b": -1.0}}, {"rewards": {"b": 9.0}, "crashed": 1.0}]
+    "failure",
+    [
+        {"rewards": {"b": -1.0}},
+        {"rewards": {"b": 9.0}, "crashed": 1.0},
+        {"rewards": {"b": 1e-3}},
+    ],
 )
 def test_where_the_guide_fails_its_mean_over_the_other_cases_is_the_reference(failure, tmp_path):
     guide = driven("guide", {"a": 500.0, "c": 300.0})[:2] + driven("guide", **failure)[:1]
