@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import compress
 from statistics import fmean
 from typing import Any
 
@@ -57,20 +59,24 @@ class Measure:
         """Return a measure from values of a YAML file, in which keys are lists."""
         return cls(_key(entry), where=None if where is None else _key(where), **options)
 
-    def pool(self, values: Sequence[float]) -> float:
+    def pool(self, values: Sequence[float], episodes: Sequence[int] | None = None) -> float:
         """Return the mean of the episodes that have a number, see `denominators`.
 
         Of numbers it is the minimum of minima, and the maximum of maxima.
 
         Args:
-            values: of the episodes; NaN for one without a number.
+            values: of the episodes, or means of some; NaN for one without a number.
+            episodes: how many episodes each value is the mean of; None for one.
         """
-        numbers = [float(value) for value in values if not math.isnan(value)]
+        counts = [1] * len(values) if episodes is None else episodes
+        known = [not math.isnan(value) for value in values]
+        numbers = [float(value) for value in compress(values, known)]
+        mean = partial(fmean, weights=list(compress(counts, known)))
         is_flag = self.at_least is not None or self.at_most is not None
         pools: dict[str, Callable[[Sequence[float]], float]] = (
             {} if is_flag else {"min": min, "max": max}
         )
-        return pools.get(self.reduction, fmean)(numbers) if numbers else math.nan
+        return pools.get(self.reduction, mean)(numbers) if numbers else math.nan
 
 
 def _key(key: Any) -> str | tuple[str, ...]:

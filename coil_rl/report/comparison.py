@@ -5,6 +5,7 @@ pandas is imported where it is used, because a training does without it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,14 +16,16 @@ import numpy as np
 
 from coil_rl.errors import UserError
 from coil_rl.measures import Measure
-from coil_rl.report.runs import DRIVER, GUIDE, Run
+from coil_rl.report.runs import DRIVER, FALLBACK, GUIDE, Run
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
 from coil_rl.report.table import return_format
 
 if TYPE_CHECKING:
     import pandas as pd
 
-SAME_RETURN = 1e-5  # of the range of all returns
+SAME_RETURN = 1e-5  # of the range of the compared returns; the rest is rounding
+NEXT_TO_NOTHING = 0.01  # for a guide in a case, of its mean over the others
+EPISODES = "_episodes"  # suffix of the columns of `with_denominators`
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
 
@@ -31,8 +34,8 @@ class Group:
     """Evaluations of one policy over seeds.
 
     Attributes:
-        name: the label of an agent, "guide" or "guide NAME" for a guide; the labels are appended if
-            several guides share it.
+        name: the label of an agent, "LABEL or guide" for it with a fallback, "guide" or "guide
+            NAME" for a guide; the labels are appended if several guides share it.
         advice: modification of the advice; empty for none.
         table: indexed by (seed, case); for a guide the seeds number its different evaluations.
         is_guide: whether the policy is a guide alone.
@@ -97,19 +100,26 @@ class Group:
         """Mean score, with the interval over the cases: of the means over seeds in each case."""
         return estimate(self.scores.mean(axis=0))
 
-    def known(self, measure: str) -> int:
-        """Return in how many of the results, one for each seed and case, a measure is known.
+    def known(self, measure: str) -> tuple[int, int]:
+        """Return in how many of the episodes a measure is known, and the number of episodes.
 
         Args:
             measure: name of the measure.
         """
-        return int(self.table[measure].notna().sum()) if measure in self.table else 0
+        if measure not in self.table:
+            return 0, 0
+        known, episodes = _episodes(self.table, measure)
+        return int(known.sum()), int(episodes.sum())
 
     @property
-    def rank(self) -> tuple[float, float]:
-        """Sort key: the completed share, then the mean score, the best first."""
+    def rank(self) -> tuple[bool, float, float]:
+        """Sort key: the completed share, then the mean score, the best first.
+
+        A policy without a score, because a return is no number, is the last one.
+        """
         completed = self.table["completed"].mean() if "completed" in self.table else 0.0
-        return -float(np.nan_to_num(completed)), -self.score.mean
+        mean = self.score.mean
+        return math.isnan(mean), -float(np.nan_to_num(completed)), -float(np.nan_to_num(mean))
 
     @property
     def crashes(self) -> str | None:
@@ -138,6 +148,8 @@ class Group:
     def means(self, case: int | None = None) -> dict[str, float]:
         """Return reward and measures over seeds and cases: means, of minima the smallest.
 
+        A measure counts as often as there are episodes that have it.
+
         Args:
             case: index of the only case to count; None for all of them.
         """
@@ -145,7 +157,8 @@ class Group:
         means = {"reward": float(rows["reward"].mean(skipna=False))}
         for name, each in self.measures.items():
             if name in rows:
-                means[name] = each.pool(rows[name].tolist())
+                known, _ = _episodes(rows, name)
+                means[name] = each.pool(rows[name].tolist(), known.tolist())
         return means
 
     def parts(self, prefix: str) -> dict[str, float]:
@@ -154,8 +167,26 @@ class Group:
         Args:
             prefix: PER_STEP or TERM.
         """
-        columns = [column for column in self.table if column.startswith(prefix)]
+        columns = [
+            column
+            for column in self.table
+            if column.startswith(prefix) and not column.endswith(EPISODES)
+        ]
         return {column: float(self.table[column].mean()) for column in columns}
+
+
+def _episodes(rows: pd.DataFrame, measure: str) -> tuple[pd.Series, pd.Series]:
+    """Return how many episodes of each result have a measure, and how many episodes there are.
+
+    The columns are those of `with_denominators`. A run leaves them out if all of its episodes have
+    all measures; it has as many episodes as the others, or, if none has the columns, one.
+    """
+    known = rows[measure].notna()
+    if "episodes" not in rows:
+        return known.astype(int), known * 0 + 1
+    episodes = rows["episodes"].fillna(rows["episodes"].max()).fillna(1)
+    counts = rows.get(f"{measure}{EPISODES}", episodes).fillna(episodes)
+    return counts.clip(lower=1).where(known, 0), episodes
 
 
 @dataclass(frozen=True)
@@ -190,8 +221,8 @@ class Comparison:
     def table(self, against: str | None = None) -> list[dict[str, Any]]:
         """Return one row per policy, guides first.
 
-        `difference` is the score of an agent minus that of another policy with the same seed; `p`
-        is corrected for all rows.
+        `difference` is the score of an agent minus that of another policy with the same seed, the
+        mean over the `difference_seeds` that both have; `p` is corrected for all rows.
 
         Args:
             against: label of the agent to compare with; "guide" for the guide of each agent; None
@@ -220,6 +251,7 @@ class Comparison:
                     "difference": difference.mean,
                     "difference_low": difference.low,
                     "difference_high": difference.high,
+                    "difference_seeds": difference.seeds if pairs else None,
                     "p": difference.p,
                     "better": pairs.better if pairs else None,
                     "needs_guide": group.needs_guide,
@@ -230,13 +262,14 @@ class Comparison:
         return rows
 
     def _partial(self, group: Group) -> dict[str, int]:
-        """Return in how many results each measure is known, unless it is in all results of all."""
+        """Return in how many episodes each measure is known, unless it is in all episodes."""
         names: dict[str, None] = {}
         for each in self.groups:
             for name in each.measures:
-                if 0 < each.known(name) < len(each.table):
+                known, episodes = each.known(name)
+                if 0 < known < episodes:
                     names[name] = None
-        return {f"{name}_results": group.known(name) for name in names}
+        return {f"{name}{EPISODES}": group.known(name)[0] for name in names}
 
     def case_table(self) -> list[dict[str, Any]]:
         """Return one row per policy and case."""
@@ -282,9 +315,9 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     for label, frame in labels.items():
         rows = frame[~_is_guide(frame) & (frame["actions"] == actions)]
         best_guide = normalised[guides[label][0]] if label in guides else None
-        variants = _variants(label, rows, references, measures, best_guide, needs_guide[label])
+        variants = _variants(rows, references, measures, best_guide, needs_guide[label])
         agents += sorted(variants, key=lambda group: (group.advice != "", group.rank))
-    # The first group of a label is the one with unaltered advice.
+    # The first group of a name is the one with unaltered advice.
     best = {group.name: group.rank for group in reversed(agents)}
     agents.sort(key=lambda group: (best[group.name], group.name))
     ranked = sorted(normalised.values(), key=lambda group: group.rank)
@@ -305,31 +338,29 @@ def _is_guide(frame: pd.DataFrame) -> pd.Series:
 
 
 def _variants(
-    label: str,
     rows: pd.DataFrame,
     references: Mapping[tuple[str, ...], Array],
     measures: Mapping[str, Measure],
     guide: Group | None,
     needs_guide: bool | None,
 ) -> list[Group]:
-    """Return the agent of a label, and the same agent with each alteration of its advice.
+    """Return the agent of a label, with each alteration of its advice, and with a fallback.
 
     Args:
-        label: of the agent.
-        rows: its evaluations.
+        rows: evaluations of the agent of a label.
         references: the rewards that scores are divided by, by cases.
         measures: definitions by name.
         guide: its best guide.
         needs_guide: whether it needs the guide during evaluation.
     """
     variants = []
-    for advice, own in rows.groupby("advice", sort=False):
+    for (driver, advice), own in rows.groupby(["driver", "advice"], sort=False):
         variant = Group(
-            label,
+            driver,
             advice,
-            _index(label, own),
+            _index(driver, own),
             guide=guide,
-            needs_guide=None if advice else needs_guide,
+            needs_guide=None if advice else needs_guide or driver.endswith(FALLBACK),
             measures=measures,
         )
         variants.append(replace(variant, reference=references.get(variant.cases)))
@@ -339,9 +370,9 @@ def _variants(
 def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str, ...], Array]:
     """Return by cases the rewards of the best guide in each case.
 
-    In a case where it crashes or earns nothing, its mean over the other cases is taken. The result
-    is empty if a run was evaluated in cases in which no guide earns anything: scores of all runs
-    are to be alike.
+    In a case where it crashes or earns nothing, or next to nothing, its mean over the other cases
+    is taken: a ratio to such a reward would be all of a mean. The result is empty if a run was
+    evaluated in cases in which no guide earns anything: scores of all runs are to be alike.
     """
     references: dict[tuple[str, ...], Array] = {}
     for guide in sorted(guides, key=lambda group: group.rank):
@@ -349,6 +380,9 @@ def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str,
         earned = rewards[rewards > 0]
         if guide.has("crashed"):
             earned = earned[~(guide.by_seed("crashed") > 0).any()]
+        if len(earned) > 1:
+            others = (earned.sum() - earned) / (len(earned) - 1)
+            earned = earned[earned >= NEXT_TO_NOTHING * others]
         if len(earned):
             filled = rewards.where(rewards.index.isin(earned.index), earned.mean())
             references.setdefault(guide.cases, filled.values)
@@ -400,10 +434,10 @@ class _Guide:
     labels: list[str]
     results: list[pd.DataFrame]
 
-    def add(self, label: str, results: Iterable[pd.DataFrame], tolerance: float) -> None:
+    def add(self, label: str, results: Iterable[pd.DataFrame]) -> None:
         """Let another label share the guide."""
         self.labels.append(label)
-        self.results[:] = _different([*self.results, *results], tolerance)
+        self.results[:] = _different([*self.results, *results])
 
     def listed(self) -> str:
         """Return the labels as a text, the first ones of many."""
@@ -450,59 +484,58 @@ def _shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[_Guide]:
     if the results of one contain those of the other. A guide with random actions has one result per
     seed.
     """
-    tolerance = _tolerance(labels.values())
     guides: list[_Guide] = []
     for label, frame in labels.items():
         for name, rows in frame[_is_guide(frame)].groupby("driver", sort=False):
-            results = _different((each for _, each in rows.groupby("seed", sort=False)), tolerance)
-            same = _same_guide(guides, name, results, tolerance)
+            results = _different(each for _, each in rows.groupby("seed", sort=False))
+            same = _same_guide(guides, name, results)
             if same is None:
                 guides.append(_Guide(name, [label], results))
             else:
-                same.add(label, results, tolerance)
+                same.add(label, results)
     return guides
 
 
-def _tolerance(frames: Iterable[pd.DataFrame]) -> float:
-    """Return up to which difference two returns of a guide in one case are the same.
-
-    It is small beside the range of all returns, so that it fits any unit and any centre, and large
-    beside what the rounding of a batch of another size makes of one guide: 2e-6 of the range in the
-    cone world.
-    """
-    returns = np.concatenate([frame["reward"].to_numpy(float) for frame in frames])
-    returns = returns[np.isfinite(returns)]
-    return SAME_RETURN * float(np.ptp(returns)) if returns.size else 0.0
-
-
-def _different(results: Iterable[pd.DataFrame], tolerance: float) -> list[pd.DataFrame]:
+def _different(results: Iterable[pd.DataFrame]) -> list[pd.DataFrame]:
     """Return the first of each of several evaluations that are the same."""
     different: list[pd.DataFrame] = []
     for result in results:
-        if not _contains(different, result, tolerance):
+        if not _contains(different, result):
             different.append(result)
     return different
 
 
-def _contains(results: Iterable[pd.DataFrame], result: pd.DataFrame, tolerance: float) -> bool:
+def _contains(results: Iterable[pd.DataFrame], result: pd.DataFrame) -> bool:
     """Return whether one of several evaluations has the cases and returns of another one."""
-    cases, returns = result["case"].tolist(), result["reward"]
+    cases, returns = result["case"].tolist(), result["reward"].to_numpy(float)
     return any(
-        other["case"].tolist() == cases
-        and np.allclose(other["reward"], returns, rtol=1e-7, atol=tolerance, equal_nan=True)
+        other["case"].tolist() == cases and _same_returns(other["reward"].to_numpy(float), returns)
         for other in results
     )
 
 
+def _same_returns(one: Array, other: Array) -> bool:
+    """Return whether two evaluations of guides in the same cases have the same returns.
+
+    The allowed difference is small beside the range of these returns, so that it fits any unit and
+    any centre, and large beside what the rounding of a batch of another size makes of one guide:
+    2e-6 of the range in the cone world.
+    """
+    both = np.concatenate([one, other])
+    both = both[np.isfinite(both)]
+    tolerance = SAME_RETURN * float(np.ptp(both)) if both.size else 0.0
+    return np.allclose(one, other, rtol=1e-7, atol=tolerance, equal_nan=True)
+
+
 def _same_guide(
-    guides: Sequence[_Guide], name: str, results: Sequence[pd.DataFrame], tolerance: float
+    guides: Sequence[_Guide], name: str, results: Sequence[pd.DataFrame]
 ) -> _Guide | None:
     """Return the first guide with a name whose results contain the given ones, or the reverse."""
     for guide in guides:
         if guide.name != name:
             continue
         pairs = ((results, guide.results), (guide.results, results))
-        if any(all(_contains(ours, each, tolerance) for each in theirs) for theirs, ours in pairs):
+        if any(all(_contains(ours, each) for each in theirs) for theirs, ours in pairs):
             return guide
     return None
 
@@ -512,7 +545,7 @@ class Paired:
     """Difference between two policies with the same seeds.
 
     Attributes:
-        difference: of a measure, mean over cases.
+        difference: of a measure, mean over cases, for the seeds that both have.
         better: share of seeds and cases with a higher value, ties counting half.
     """
 
@@ -523,7 +556,9 @@ class Paired:
 def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
     """Compare two policies seed by seed.
 
-    A case counts for a seed if both have a number there, as lap times where both completed one.
+    A case counts for a seed if both have a number there, as lap times where both completed one. Of
+    rewards and scores every one has to be a number: a policy that diverged in a case is not judged
+    by the others.
 
     Args:
         group: the first policy.
@@ -531,7 +566,7 @@ def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
         measure: name of the measure to compare, "reward", or "score".
 
     Returns:
-        None without common cases and seeds, or if a seed has no such case.
+        None without common cases and seeds, if a seed has no such case, or a reward is no number.
     """
     if group.cases != other.cases or (other.is_guide and other.seeds is not None):
         return None
@@ -542,6 +577,8 @@ def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
     x, y = ours.to_numpy(), theirs.to_numpy()
     counts = np.isfinite(x) & np.isfinite(y)
     if not x.size or not counts.any(axis=1).all():
+        return None
+    if measure in ("reward", "score") and not counts.all():
         return None
     differences = np.where(counts, x - y, 0).sum(axis=1) / counts.sum(axis=1)
     return Paired(estimate(differences), float(wins(x, y)[counts].mean()))

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from coil_rl.report.runs import Run
+from coil_rl.report.runs import FALLBACK, Run
 
 # Keys, or parents of keys, on which the numbers of a run do not depend, or only by rounding.
 IRRELEVANT = (
@@ -51,16 +51,31 @@ def distinguish(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
         sentences.append(
             f"The runs of {label} differ in {names}, so they are not means of one another."
         )
-        numbers: dict[str, int] = {}
-        for index in of_label:
-            run = runs[index]
-            values = [f"{key}={_text(configurations[index].get(key))}" for key in keys]
-            shown = ", ".join(values[:MOST_KEYS])
-            if len(keys) > MOST_KEYS:  # the shown values may be alike
-                number = numbers.setdefault(", ".join(values), len(numbers) + 1)
-                shown = f"{number}: {shown}, ..."
-            distinguished[index] = _relabelled(run, f"{label} ({shown})")
+        values = [[configurations[index].get(key) for key in keys] for index in of_label]
+        for index, shown in zip(of_label, _shown(keys, values), strict=True):
+            distinguished[index] = _relabelled(runs[index], f"{label} ({shown})")
     return distinguished, sentences
+
+
+def _shown(keys: Sequence[str], configurations: Sequence[list[Any]]) -> list[str]:
+    """Return a text for each configuration; different ones have different texts.
+
+    Args:
+        keys: in which the configurations differ.
+        configurations: the values of these keys for each run.
+    """
+    different: list[list[Any]] = []
+    for values in configurations:
+        if values not in different:
+            different.append(values)
+    texts = []
+    for values in different:
+        pairs = list(zip(keys, values, strict=True))[:MOST_KEYS]
+        texts.append(", ".join(f"{key}={_text(value)}" for key, value in pairs))
+    more = ", ..." if len(keys) > MOST_KEYS else ""
+    if more or len(set(texts)) < len(different):  # the shown values may be alike
+        texts = [f"{number}: {text}{more}" for number, text in enumerate(texts, start=1)]
+    return [texts[different.index(values)] for values in configurations]
 
 
 def of_several_envs(runs: Sequence[Run]) -> list[str]:
@@ -86,7 +101,7 @@ def _telling_first(keys: Sequence[str], configurations: Sequence[Mapping[str, An
         keys: in which the configurations differ.
         configurations: values by key.
     """
-    texts = {key: [str(values.get(key)) for values in configurations] for key in keys}
+    texts = {key: [repr(values.get(key)) for values in configurations] for key in keys}
     first: list[str] = []
     while len(first) < min(MOST_KEYS, len(keys)):
         groups = {
@@ -109,10 +124,20 @@ def differing(runs: Sequence[Run]) -> list[str]:
     differ = []
     for key in keys:
         values = [configuration.get(key) for configuration in configurations]
-        follows = all(value == run.seed for value, run in zip(values, runs, strict=True))
-        if not follows and any(value != values[0] for value in values):
+        if not _follows_seed(key, values, runs) and any(value != values[0] for value in values):
             differ.append(key)
     return differ
+
+
+def _follows_seed(key: str, values: Sequence[Any], runs: Sequence[Run]) -> bool:
+    """Return whether a key is called a seed and has the value of the run's seed in each run.
+
+    Other values may equal the seed by chance, as a flag and the seeds 0 and 1.
+    """
+    return key.endswith("seed") and all(
+        value == run.seed and not isinstance(value, bool)
+        for value, run in zip(values, runs, strict=True)
+    )
 
 
 def relevant(run: Run) -> dict[str, Any]:
@@ -147,7 +172,6 @@ def _text(value: Any) -> str:
 def _relabelled(run: Run, label: str) -> Run:
     """Return a run with another label, also in its evaluation."""
     evaluation = run.evaluation.copy()
-    own = evaluation["driver"].str.startswith(run.label)
-    renamed = label + evaluation["driver"].str.removeprefix(run.label)
-    evaluation["driver"] = evaluation["driver"].where(~own, renamed)
+    renamed = {f"{run.label}{suffix}": f"{label}{suffix}" for suffix in ("", FALLBACK)}
+    evaluation["driver"] = evaluation["driver"].replace(renamed)
     return replace(run, label=label, evaluation=evaluation)

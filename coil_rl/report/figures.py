@@ -1,6 +1,7 @@
 """The figures of `coil-report`: as PNG files, and for its HTML page."""
 
 import io
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import read_file
 from coil_rl.report import style
-from coil_rl.report.comparison import Comparison
+from coil_rl.report.comparison import SAME_RETURN, Comparison
 from coil_rl.report.curves import draw_curve_grid, draw_learning_curves
 from coil_rl.report.guide_use import draw_guide_use, guide_use
 from coil_rl.report.html import Figure, moving, svg
@@ -90,7 +91,8 @@ def _learning_curves(runs: Sequence[Run], strokes: Mapping[str, style.Stroke]) -
             curves[label] = [run.curve for run in trained]
         if returns:
             guides[label] = sum(returns) / len(returns)
-    several_guides = len({round(value, 3) for value in guides.values()}) > 1
+    lines = list(guides.values())
+    several_guides = not all(math.isclose(line, lines[0], rel_tol=SAME_RETURN) for line in lines)
     if several_guides or len(curves) > MAX_CURVES:
         return partial(draw_curve_grid, curves, strokes=strokes, guides=guides)
     guide = {"guide": next(iter(guides.values()))} if guides else {}

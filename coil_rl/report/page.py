@@ -48,7 +48,7 @@ def section(
 def _shares(
     row: Mapping[str, Any], group: Group, columns: Mapping[str, tuple[str, str]]
 ) -> dict[str, str]:
-    """Return the cells of a policy whose means leave results out, as `12.3 (4 of 8)`.
+    """Return the cells of a policy whose means leave episodes out, as `12.3 (4 of 8)`.
 
     Args:
         row: of the table.
@@ -57,9 +57,9 @@ def _shares(
     """
     cells = {}
     for name in group.measures:
-        known, results = group.known(name), len(group.table)
-        if name in columns and 0 < known < results:
-            cells[name] = f"{row[name]:{columns[name][1]}} ({known} of {results})"
+        known, episodes = group.known(name)
+        if name in columns and 0 < known < episodes:
+            cells[name] = f"{row[name]:{columns[name][1]}} ({known} of {episodes})"
     return cells
 
 
@@ -112,6 +112,8 @@ def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, A
         score = Estimate(row["score"], row["low"], row["high"])
         difference = Estimate(row["difference"], row["difference_low"], row["difference_high"])
         cells = {"score cell": score.cell(spec), "difference cell": difference.cell(f"+{spec}")}
+        if cells["difference cell"]:
+            cells["difference cell"] += some_of(row["difference_seeds"], row["seeds"])
         low, high = row["low_of_cases"], row["high_of_cases"]
         cells["cases cell"] = None if math.isnan(low) else f"{low:{spec}} to {high:{spec}}"
         shown.append({**row, **cells})
@@ -140,12 +142,19 @@ def guide_training(runs: Sequence[Run]) -> list[Table]:
     return [Table(rows, columns)] if rows else []
 
 
-def _before_to_after(curves: Sequence[Sequence[Mapping[str, float]]], key: str) -> str:
-    """Return the first and the last number of a column as a cell, means over the runs."""
-    columns = [[line[key] for line in curve if not math.isnan(line[key])] for curve in curves]
-    before, after = mean(column[0] for column in columns), mean(column[-1] for column in columns)
+def _before_to_after(curves: Sequence[Sequence[Mapping[str, float]]], key: str) -> str | None:
+    """Return the first and the last number of a column as a cell, means over the runs.
+
+    A run without a number in the column does not count.
+    """
+    columns = [[line[key] for line in curve if key in line] for curve in curves]
+    numbers = [[each for each in column if not math.isnan(each)] for column in columns]
+    known = [column for column in numbers if column]
+    if not known:
+        return None
+    before, after = mean(column[0] for column in known), mean(column[-1] for column in known)
     spec = return_format([before, after])
-    return f"{before:{spec}} to {after:{spec}}"
+    return f"{before:{spec}} to {after:{spec}}{some_of(len(known), len(curves))}"
 
 
 def training(runs: Sequence[Run]) -> list[Table]:
@@ -163,6 +172,8 @@ def training(runs: Sequence[Run]) -> list[Table]:
         row: dict[str, Any] = {key: mean(seed[key] for seed in numbers) for key in numbers[0]}
         row["label"], row["seeds"] = label, len(of_label)
         row["seconds"] = mean(seconds) if seconds else None
+        if 0 < len(seconds) < len(of_label):
+            row["seconds"] = f"{mean(seconds):.0f}{some_of(len(seconds), len(of_label))}"
         for key in ("until_90", "until_100"):
             row[f"{key} cell"] = _reached([seed[key] for seed in numbers])
         if not math.isnan(row["area"]):

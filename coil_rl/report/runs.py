@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 GUIDE = "guide"  # in the column `driver` of evaluation.csv
+FALLBACK = f" or {GUIDE}"  # after the label, there: the policy with a guide to fall back to
 DRIVER = ("driver", "advice", "actions", "case")
 EVALUATION = "evaluation"  # set of cases for reports
 SELECTION = "selection"  # set of cases for the choice of the best policy

@@ -31,6 +31,7 @@ from coil_rl.measures import (
 from coil_rl.output import decoration, progress, say
 from coil_rl.report import Returns, markdown_table, write_csv
 from coil_rl.report.pictures import Picture
+from coil_rl.report.runs import FALLBACK
 from coil_rl.report.statistics import mean_interval
 from coil_rl.report.table import AUTO_FORMAT, fitted, return_format
 from coil_rl.run.evaluation import EvaluationResult, evaluate_policy
@@ -196,7 +197,7 @@ def judge(
             _evaluate(trial, policy, judgement, bar)
         if fallback is not None:
             result = trial.evaluation.run(trial.env(len(trial.evaluation.cases)), fallback)
-            judgement.add(result, f"{trial.label} or guide")
+            judgement.add(result, f"{trial.label}{FALLBACK}")
             share = fallback.share(result)
     write_csv(judgement.episodes, folder / "episodes.csv")
     page = _page(trial, judgement, has_policy=policy is not None, share=share)

@@ -75,7 +75,12 @@ def test_completion_ranks_before_the_mean(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "failure", [{"rewards": {"b": -1.0}}, {"rewards": {"b": 9.0}, "crashed": 1.0}]
+    "failure",
+    [
+        {"rewards": {"b": -1.0}},
+        {"rewards": {"b": 9.0}, "crashed": 1.0},
+        {"rewards": {"b": 1e-3}},
+    ],
 )
 def test_where_the_guide_fails_its_mean_over_the_other_cases_is_the_reference(failure, tmp_path):
     guide = driven("guide", {"a": 500.0, "c": 300.0})[:2] + driven("guide", **failure)[:1]
@@ -150,6 +155,18 @@ def test_one_guide_whose_returns_differ_by_rounding_is_one_guide(centre, tmp_pat
         make_run(tmp_path / str(index), label, 0, guide + driven(label, cases))
     guides = [name for name, _ in table(tmp_path) if name.startswith("guide")]
     assert sorted(guides) == ["guide (a, c)", "guide (b)"]
+
+
+@pytest.mark.parametrize("driver", ["guide", "c"])
+def test_guides_are_told_apart_beside_a_policy_that_diverged(driver, tmp_path):
+    for index, label in enumerate("abc"):
+        rows = {"guide": {"a": -100.0 - 30 * index, "b": -110.0}, label: {"a": -90.0, "b": -95.0}}
+        if label == "c":
+            rows[driver]["a"] = -5e6
+        drivers = [row for name, rewards in rows.items() for row in driven(name, rewards)]
+        make_run(tmp_path / label, label, 0, drivers)
+    guides = [name for name, _ in table(tmp_path) if name.startswith("guide")]
+    assert sorted(guides) == ["guide (a)", "guide (b)", "guide (c)"]
 
 
 def test_guide_without_a_number_in_a_case_is_one_guide(tmp_path):
@@ -255,3 +272,30 @@ def test_guide_is_paired_with_every_seed(sweep, tmp_path):
     assert paired(groups_by_title(tmp_path / "other")["coil"], groups["ppo"]) is None, (
         "no common seed"
     )
+
+
+def test_policy_whose_return_is_no_number_is_last_and_has_no_difference(tmp_path):
+    for label, rewards in {"a": {"x": 30.0, "y": math.nan}, "b": {"x": 1.0, "y": 1.0}}.items():
+        for seed in range(2):
+            make_run(tmp_path / f"{label}{seed}", label, seed, driven(label, rewards))
+    rows = table(tmp_path, against="b")
+    assert list(rows) == [("b", ""), ("a", "")]
+    row = rows["a", ""]
+    assert math.isnan(row["score"])
+    assert math.isnan(row["difference"])
+    assert row["better"] is None
+
+
+def test_policy_with_a_fallback_is_a_row_of_its_own(tmp_path):
+    for seed in range(2):
+        rows = [
+            *driven("guide", CASES),
+            *driven("coil", {"a": 510.0, "b": 610.0}),
+            *driven("coil", {"a": 5.0, "b": 6.0}, advice="zeroed"),
+            *driven("coil or guide", {"a": 520.0, "b": 620.0}),
+        ]
+        make_run(tmp_path / str(seed), "coil", seed, rows)
+    rows = table(tmp_path, against="coil")
+    assert list(rows) == [("guide", ""), ("coil or guide", ""), ("coil", ""), ("coil", "zeroed")]
+    assert rows["coil or guide", ""]["reward"] == pytest.approx(570)
+    assert rows["coil or guide", ""]["better"] == 1

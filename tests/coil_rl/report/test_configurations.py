@@ -38,6 +38,8 @@ def labels(runs):
         ({"guide": {"a": {"x": 1}}}, {"guide": {}}, "guide.a.x"),
         ({"env": {"first_seed": 5}}, {"env": {"first_seed": 6}}, "env.first_seed"),
         ({"observes": ["a"]}, {"observes": ["a", "b"]}, "observes"),
+        ({"learner": {"normalise": False}}, {"learner": {"normalise": True}}, "learner.normalise"),
+        ({"disturb": {"lag": 0}}, {"disturb": {"lag": 1}}, "disturb.lag"),
         ({"init": None}, {"init": "policy.pt"}, "init"),
     ],
 )
@@ -91,3 +93,23 @@ def test_many_differences_are_numbered(runs):
         "coil (2: a=7, b=7, c=7, ...)",
     ]
     assert "a, b, c and others" in sentences[0]
+
+
+@pytest.mark.parametrize(
+    ("one", "two"), [("a" * 60 + "x", "a" * 60 + "y"), (3, "3"), (None, "null")]
+)
+def test_values_that_look_alike_are_numbered(one, two, runs):
+    found = labels(runs({"of": one}, {"of": two}, {"of": one}))
+    assert found[0] == found[2] != found[1]
+    assert [label.partition(": ")[0] for label in found[:2]] == ["coil (1", "coil (2"]
+
+
+def test_only_the_policy_of_a_label_is_renamed(tmp_path):
+    for seed in range(2):
+        drivers = ("guide", "g", "g or guide")
+        rows = [row for driver in drivers for row in driven(driver, CASES)]
+        folder = make_run(tmp_path / str(seed), "g", seed, rows)
+        config = json.loads((folder / "config.yaml").read_text())
+        (folder / "config.yaml").write_text(json.dumps(config | {"budget": {"frames": seed + 5}}))
+    run = distinguish(read_runs([tmp_path]))[0][0]
+    assert list(run.evaluation["driver"].unique()) == ["guide", run.label, f"{run.label} or guide"]

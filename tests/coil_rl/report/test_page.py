@@ -161,3 +161,44 @@ def test_empty_columns_and_many_cases_are_omitted(tmp_path):
     compared = {"sampled": compare(read_runs([tmp_path]))}
     assert "Difference" not in page.notes(None, compared)
     assert "Difference to its guide: of the same seed" in page.notes("guide", compared)
+
+
+def test_means_of_some_seeds_only_say_so(tmp_path):
+    for label, seeds in (("coil", 3), ("ppo", 2)):
+        for seed in range(seeds):
+            rows = driven(label, {"a": 10.0 + seed, "b": 20.0})
+            make_run(tmp_path / f"{label}{seed}", label, seed, rows)
+    (tmp_path / "coil1" / "training_time.json").write_text('{"seconds": 100}')
+    rows = compare(read_runs([tmp_path])).table("ppo")
+    assert [row["difference_seeds"] for row in rows if row["driver"] == "coil"] == [2]
+    drivers, _ = section(tmp_path, "ppo")
+    assert "+0.0 (+0.0 to +0.0) (2 of 3 seeds)" in drivers
+    (training,) = page.training(read_runs([tmp_path]))
+    assert "100 (1 of 3 seeds)" in str(training)
+
+
+def test_measure_of_some_episodes_counts_as_often_as_it_is_known(tmp_path):
+    rows = driven("coil", {"a": 1.0, "b": 2.0}, "sampled")
+    for row, lap, known in zip(rows, (50.0, 80.0, 55.0), (5, 1, 6), strict=True):
+        row |= {"lap_time": lap, "episodes": 5 * (1 + (row["case"] == "mean"))}
+        row["lap_time_episodes"] = known
+    make_run(tmp_path / "0", "coil", 0, rows)
+    make_run(tmp_path / "1", "coil", 1, driven("coil", {"a": 1.0, "b": 2.0}, "sampled"))
+    comparison = compare(read_runs([tmp_path]), "sampled")
+    # The second run has no such columns: all of its ten episodes have a lap.
+    row = comparison.table()[0]
+    assert row["lap_time"] == (5 * 50 + 80 + 10 * 50) / 16
+    assert row["lap_time_episodes"] == 16
+    assert "51.88 (16 of 20)" in str(page.section(comparison, [row], None)[0])
+
+
+def test_guide_in_some_runs_of_a_label_only_is_said():
+    before, after = {"frames": 0.0}, {"frames": 9.0}
+    curves = [
+        [before | {"guide/x": 1.0}, after | {"guide/x": 2.0}],
+        [before, after],
+        [before | {"guide/x": math.nan}, after],
+    ]
+    runs = [Run(Path(), "a", seed, True, curve=curve) for seed, curve in enumerate(curves)]
+    (table,) = page.guide_training(runs)
+    assert cells(table)[1] == ["a", "3", "1.00 to 2.00 (1 of 3 seeds)"]
