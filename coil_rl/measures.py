@@ -12,6 +12,7 @@ from typing import Any
 
 from coil_rl.errors import UserError
 
+MEAN_CASE = "mean"  # in the column `case`: the means over the cases
 # Reductions of the steps of an episode to one number.
 REDUCTIONS = ("mean", "sum", "min", "max", "last", "any", "count", "mean_nonzero")
 
@@ -104,7 +105,7 @@ def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
 def summarise(
     episodes: Sequence[Mapping[str, Any]], measures: Mapping[str, Measure]
 ) -> list[dict[str, Any]]:
-    """Return the means of each case, then their mean as the case `mean`.
+    """Return the means of each case, then their mean as the case `MEAN_CASE`.
 
     The cases are in the order of the episodes. A measure is pooled over the episodes that have it,
     see `denominators`. The mean of the return is NaN if that of an episode is.
@@ -124,7 +125,7 @@ def summarise(
         }
 
     rows = [pool(case, group) for case, group in cases.items()]
-    return [*rows, pool("mean", rows)]
+    return [*rows, pool(MEAN_CASE, rows)]
 
 
 def denominators(

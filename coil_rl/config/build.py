@@ -20,7 +20,7 @@ from coil_rl.config.pretrained import run_folder
 from coil_rl.config.saved import identity, settings
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
-from coil_rl.measures import measures_of
+from coil_rl.measures import MEAN_CASE, measures_of
 from coil_rl.report import Returns
 from coil_rl.report.pictures import Picture
 from coil_rl.report.runs import EVALUATION, SELECTION
@@ -173,7 +173,7 @@ def build_evaluation(
     `record` names entries of every step that are kept.
 
     Raises:
-        UserError: if the configuration names no cases.
+        UserError: if the configuration names no cases, or one like the row of their means.
     """
     cases = config.evaluation.cases
     names = build(cases, "evaluation.cases") if isinstance(cases, DictConfig) else cases
@@ -181,8 +181,13 @@ def build_evaluation(
         names = list(range(names))
     if not isinstance(names, (list, tuple, ListConfig)) or not names:
         raise UserError(f"evaluation.cases={cases} must be at least 1, or the names of the cases")
-    measures = measures_of(config.evaluation.measures)
-    return Evaluation(list(map(str, names)), measures, record or {})
+    titles = list(map(str, names))
+    if MEAN_CASE in titles:
+        raise UserError(
+            f"evaluation.cases: a case cannot be called {MEAN_CASE}, which names the means of all "
+            "cases in evaluation.csv; give it another name"
+        )
+    return Evaluation(titles, measures_of(config.evaluation.measures), record or {})
 
 
 def build_pictures(config: DictConfig) -> list[Picture]:

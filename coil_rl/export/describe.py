@@ -24,6 +24,7 @@ from coil_rl.export.step import ADVICE, Entry, PolicyStep
 from coil_rl.files import LARGEST_TABLE, read_text
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.normaliser import Normaliser
+from coil_rl.measures import MEAN_CASE
 from coil_rl.run.controller import Controller
 from coil_rl.run.delivery import GuideActs
 from coil_rl.run.reasons import FIRST, delivered, handed_over
@@ -285,8 +286,8 @@ def results_of(run: Run) -> list[dict[str, Any]]:
     with file_of_a_run(path, "remove the file, and evaluate again"):
         text = read_text(path, LARGEST_TABLE)
         rows = list(csv.DictReader(io.StringIO(text, newline="")))
-        means = [row for row in rows if row["case"] == "mean"]
-        cases = len({row["case"] for row in rows} - {"mean"})
+        means = [row for row in rows if row["case"] == MEAN_CASE]
+        cases = len({row["case"] for row in rows} - {MEAN_CASE})
         return [_result(row, cases) for row in means]
 
 

@@ -35,7 +35,12 @@ def report(config: DictConfig) -> None:
     from coil_rl.files import write_text
     from coil_rl.report import page, write_csv
     from coil_rl.report.comparison import compare
-    from coil_rl.report.configurations import distinguish, of_several_envs
+    from coil_rl.report.configurations import (
+        distinguish,
+        of_several_conditions,
+        of_several_definitions,
+        of_several_envs,
+    )
     from coil_rl.report.figures import draw_report
     from coil_rl.report.html import Section, html_page
     from coil_rl.report.runs import failed_jobs, read_runs
@@ -62,6 +67,8 @@ def report(config: DictConfig) -> None:
         page.notes(against, compared),
         *page.handed_over(finished),
         *of_several_envs(finished),
+        *of_several_conditions(finished),
+        *of_several_definitions(finished),
         *differences,
         page.progress(len(finished), len(runs), failed_jobs(folders)),
     ]

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from coil_rl.measures import Measure
 from coil_rl.report.runs import FALLBACK, Run
 
 # Keys, or parents of keys, on which the numbers of a run do not depend, or only by rounding.
@@ -26,6 +27,18 @@ IRRELEVANT = (
     "evaluation.gif",
     "evaluation.pictures",
 )
+# Keys, or parents of keys, that runs have to share to be compared: task, test and frames.
+CONDITIONS = (
+    "env",
+    "track",
+    "disturb",
+    "evaluation.cases",
+    "evaluation.env",
+    "evaluation.disturb",
+    "evaluation.first_seed",
+    "budget.frames",
+)
+BATCH = ("num_envs", "workers", "device")  # last parts of keys of an env that are no condition
 LONGEST_VALUE = 40  # characters of a value in a label
 MOST_KEYS = 3  # in a label
 
@@ -47,9 +60,8 @@ def distinguish(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
             continue
         configurations = {index: relevant(runs[index]) for index in of_label}
         keys = _telling_first(keys, list(configurations.values()))
-        names = ", ".join(keys[:MOST_KEYS]) + (" and others" if len(keys) > MOST_KEYS else "")
         sentences.append(
-            f"The runs of {label} differ in {names}, so they are not means of one another."
+            f"The runs of {label} differ in {_listed(keys)}, so they are not means of one another."
         )
         values = [[configurations[index].get(key) for key in keys] for index in of_label]
         for index, shown in zip(of_label, _shown(keys, values), strict=True):
@@ -94,6 +106,57 @@ def of_several_envs(runs: Sequence[Run]) -> list[str]:
     ]
 
 
+def of_several_conditions(runs: Sequence[Run]) -> list[str]:
+    """Return a warning if runs in one env have another task, other cases or other frames.
+
+    What experiments compare, such as the method or the guide, is no such condition.
+
+    Args:
+        runs: finished runs.
+    """
+    if of_several_envs(runs):
+        return []
+    differ = [key for key in differing(runs) if _is_condition(key)]
+    # An empty group beside its keys says nothing.
+    keys = [key for key in differ if not any(each.startswith(f"{key}.") for each in differ)]
+    if not keys:
+        return []
+    return [f"The runs differ in {_listed(keys)}: compare those under the same conditions only."]
+
+
+def _is_condition(key: str) -> bool:
+    """Return whether runs are compared only if they have the same value of a key."""
+    is_part = any(key == each or key.startswith(f"{each}.") for each in CONDITIONS)
+    return is_part and key.rpartition(".")[2] not in BATCH
+
+
+def of_several_definitions(runs: Sequence[Run]) -> list[str]:
+    """Return a warning for each measure that runs define in different ways.
+
+    Args:
+        runs: finished runs.
+    """
+    sentences = []
+    for name in dict.fromkeys(name for run in runs for name in run.measures):
+        labels: dict[Measure, str] = {}
+        for run in runs:
+            if name in run.measures:
+                # The heading and the format change no number.
+                measured = replace(run.measures[name], title="", format="auto")
+                labels.setdefault(measured, run.label)
+        if len(labels) > 1:
+            sentences.append(
+                f"The measure {name} is defined in {len(labels)} ways (by "
+                f"{' and '.join(labels.values())}): compare its numbers of one definition only."
+            )
+    return sentences
+
+
+def _listed(keys: Sequence[str]) -> str:
+    """Return keys as a text, the first ones of many."""
+    return ", ".join(keys[:MOST_KEYS]) + (" and others" if len(keys) > MOST_KEYS else "")
+
+
 def _telling_first(keys: Sequence[str], configurations: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return keys, first those whose values distinguish the most configurations.
 
@@ -117,7 +180,7 @@ def differing(runs: Sequence[Run]) -> list[str]:
     """Return the keys in which the configurations of runs differ, besides what follows the seed.
 
     Args:
-        runs: of one label.
+        runs: of which none or all follow the seed in a key, such as those of one label.
     """
     configurations = [relevant(run) for run in runs]
     keys = dict.fromkeys(key for configuration in configurations for key in configuration)

@@ -20,6 +20,7 @@ from coil_rl.report.table import AUTO_FORMAT, TABLES, Table, fitted, return_form
 Block = Table | str  # a table or a paragraph
 
 MAX_CASES = 8  # in a table
+IN_CASE = "in "  # prefix of columns, since a case may have the name of another column
 GUIDE_RETURN = "guide/"  # prefix of columns of metrics.csv
 GUIDE_CALLS = "guide/calls"  # is no return
 
@@ -312,9 +313,11 @@ def cases_table(groups: Sequence[Group], file: str) -> Block:
             means = group.means(index)
             reward, completed = means["reward"], means.get("completed", 1.0)
             spec = return_format([reward])
-            row[case] = f"{reward:{spec}} ({completed:.0%} completed)" if completed < 1 else reward
+            row[f"{IN_CASE}{case}"] = (
+                f"{reward:{spec}} ({completed:.0%} completed)" if completed < 1 else reward
+            )
         rows.append(row)
     columns = {"driver": ("mean reward", "")}
     for name in names:
-        columns[name] = (name, AUTO_FORMAT)
+        columns[f"{IN_CASE}{name}"] = (name, AUTO_FORMAT)
     return Table(rows, columns)

@@ -20,7 +20,7 @@ import yaml
 
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, LARGEST_TABLE, read_file, read_text
-from coil_rl.measures import Measure, measures_of
+from coil_rl.measures import MEAN_CASE, Measure, measures_of
 from coil_rl.plain_yaml import read_yaml
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ def _read_evaluation(path: Path, shown: Iterable[str]) -> pd.DataFrame:
             raise ValueError(f"no column {name}")
     numbers = ["reward", *(column for column in frame if column not in (*DRIVER, "reward"))]
     frame = frame[[*DRIVER, *numbers]].astype(dict.fromkeys(numbers, float))
-    frame = frame[frame["case"] != "mean"]
+    frame = frame[frame["case"] != MEAN_CASE]
     if frame.empty:
         raise ValueError("no rows")
     if frame.duplicated(list(DRIVER)).any():

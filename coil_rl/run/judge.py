@@ -22,6 +22,7 @@ from coil_rl.errors import file_of_a_run
 from coil_rl.files import LARGEST_NUMBERS, LARGEST_TABLE, read_text, write_text
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.measures import (
+    MEAN_CASE,
     Measure,
     denominators,
     summarise,
@@ -271,7 +272,7 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, share: float 
     count = len(trial.evaluation.cases)
     pairs = list(zip(judgement.table, judgement.counts, strict=True))
     if count > MAX_CASES:
-        pairs = [(row, counts) for row, counts in pairs if row["case"] == "mean"]
+        pairs = [(row, counts) for row, counts in pairs if row["case"] == MEAN_CASE]
     rows = [row for row, _ in pairs]
     columns = fitted(rows, columns)
     page = [markdown_table(with_shares(rows, [counts for _, counts in pairs], columns), columns)]
@@ -374,7 +375,9 @@ def report_outcome(folder: Path) -> float:
     path = folder / "evaluation.csv"
     with file_of_a_run(path, "remove the file, and evaluate again"):
         rows = list(csv.DictReader(io.StringIO(read_text(path, LARGEST_TABLE), newline="")))
-        means = [row for row in rows if (row["case"], row["actions"]) == ("mean", "deterministic")]
+        means = [
+            row for row in rows if (row["case"], row["actions"]) == (MEAN_CASE, "deterministic")
+        ]
         last = [row for row in means if not row["advice"]][-1]
         reward, completed = float(last["reward"]), float(last.get("completed", "nan"))
         page = read_text(folder / "evaluation.md", LARGEST_NUMBERS).rstrip()

@@ -1,11 +1,18 @@
 """Test of runs with one label and different configurations."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from run_folders import driven, make_run
 
-from coil_rl.report.configurations import distinguish, of_several_envs
+from coil_rl.measures import Measure
+from coil_rl.report.configurations import (
+    distinguish,
+    of_several_conditions,
+    of_several_definitions,
+    of_several_envs,
+)
 from coil_rl.report.runs import read_runs
 
 CASES = {"a": 1.0, "b": 2.0}
@@ -113,3 +120,49 @@ def test_only_the_policy_of_a_label_is_renamed(tmp_path):
         (folder / "config.yaml").write_text(json.dumps(config | {"budget": {"frames": seed + 5}}))
     run = distinguish(read_runs([tmp_path]))[0][0]
     assert list(run.evaluation["driver"].unique()) == ["guide", run.label, f"{run.label} or guide"]
+
+
+@pytest.mark.parametrize(
+    ("other", "names"),
+    [
+        ({"evaluation": {"env": {"first_seed": 5}}}, "evaluation.env.first_seed"),
+        ({"env": {"kwargs": {"hard": True}}, "budget": {"frames": 3}}, "env.kwargs, budget.frames"),
+        ({"disturb": {"late": {"steps": 1}}}, "disturb.late.steps"),
+        ({"track": {"test": "hard"}}, "track.test"),
+    ],
+)
+def test_runs_under_other_conditions_are_said(other, names, runs):
+    base = {"env": {"id": "A", "kwargs": {}}, "budget": {"frames": 2}, "disturb": {}}
+    read = runs(base | {"label": "a"}, base | {"label": "b"} | _inside(base, other))
+    (sentence,) = of_several_conditions(read)
+    assert all(name in sentence for name in names.split(", "))
+    assert of_several_conditions(read[:1]) == []
+
+
+def _inside(base, other):
+    """Return what changes in a configuration, with the rest of each group."""
+    return {key: base.get(key, {}) | value for key, value in other.items()}
+
+
+def test_what_experiments_compare_is_no_other_condition(runs):
+    one = {"label": "a", "env": {"id": "A", "num_envs": 4, "seed": 0}, "guide": {"x": 1}}
+    two = {"label": "b", "env": {"id": "A", "num_envs": 8, "seed": 1}, "guide": {"x": 2}}
+    more = [
+        {"degrade": name, "learner": {"rate": name}, "method": {"needs_guide": True}}
+        for name in ("none", "zeroed")
+    ]
+    assert of_several_conditions(runs(one | more[0], two | more[1])) == []
+
+
+def test_measure_of_two_definitions_is_said(runs):
+    speed = Measure("v", title="speed")
+    ways = [speed, replace(speed, title="v"), replace(speed, reduction="max")]
+    read = [
+        replace(run, measures={"speed": way})
+        for run, way in zip(runs(*({"label": label} for label in "abc")), ways, strict=True)
+    ]
+    assert of_several_definitions(read) == [
+        "The measure speed is defined in 2 ways (by a and c): compare its numbers of one "
+        "definition only."
+    ]
+    assert of_several_definitions(read[:2]) == []

@@ -202,3 +202,8 @@ def test_guide_in_some_runs_of_a_label_only_is_said():
     runs = [Run(Path(), "a", seed, True, curve=curve) for seed, curve in enumerate(curves)]
     (table,) = page.guide_training(runs)
     assert cells(table)[1] == ["a", "3", "1.00 to 2.00 (1 of 3 seeds)"]
+
+
+def test_case_may_be_called_like_a_column(tmp_path):
+    make_run(tmp_path / "0", "coil", 0, driven("coil", {"driver": 1.0, "b": 2.0}))
+    assert cells(section(tmp_path)[1]) == [["mean reward", "driver", "b"], ["coil", "1.00", "2.00"]]

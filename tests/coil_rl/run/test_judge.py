@@ -104,6 +104,11 @@ def test_evaluation_without_cases_is_refused(composed, cases):
         build_evaluation(with_cases(composed(), cases))
 
 
+def test_case_cannot_be_called_like_the_row_of_the_means(composed):
+    with pytest.raises(UserError, match=r"evaluation\.cases: a case cannot be called mean"):
+        build_evaluation(with_cases(composed(), ["a", "mean"]))
+
+
 def test_guides_without_a_guide_are_not_driven(composed):
     assert evaluated(composed("guide=none", "method=ppo")) == {}
 
