@@ -126,6 +126,36 @@ def test_folder_made_with_an_object_is_opened_with_the_object(tmp_path, monkeypa
         coil_rl.open_run(folder, env=Held, trust=["thermostat"])
 
 
+def rewards_of_guide(table):
+    return list(table[(table["driver"] == "guide") & (table["case"] != "mean")]["reward"])
+
+
+def test_guide_alone_drives_in_as_many_cases_as_are_asked_for(tmp_path):
+    words = ["evaluation.cases=2", "evaluation.gif=false", "env.max_steps=5"]
+    run = coil_rl.prepare(
+        ENV,
+        guide="thermostat.control:PI",
+        method="guide",
+        folder=tmp_path / "run",
+        overrides=words,
+    )
+    few, more = (rewards_of_guide(run.evaluate(cases=cases)) for cases in (2, 4))
+    assert few == more[:2]
+    assert len(set(more)) == 4
+
+
+def test_rows_of_a_guide_are_those_of_the_object_that_was_handed_over(tmp_path):
+    words = ["evaluation.cases=2", "evaluation.gif=false", "env.max_steps=5"]
+    folder = tmp_path / "run"
+    run = coil_rl.prepare(ENV, guide=Held(0.7), method="guide", folder=folder, overrides=words)
+    run.begin()
+    first = rewards_of_guide(run.evaluate())
+    other = coil_rl.open_run(folder, guide=Held(0.1), trust=["thermostat"])
+    assert rewards_of_guide(other.evaluate()) != first
+    again = coil_rl.open_run(folder, guide=Held(0.7), trust=["thermostat"])
+    assert rewards_of_guide(again.evaluate()) == first
+
+
 def make_room():
     """Return an env of Gymnasium, as a maker that no folder can name."""
     from thermostat.room import Room
