@@ -9,6 +9,7 @@ its proxies into its own folder.
 import hashlib
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from torch import nn
 from coil_rl.config import load
 from coil_rl.config.build import build_guides, build_learner, env_maker
 from coil_rl.config.fingerprint import fingerprint_with_code
-from coil_rl.config.given import kept, kept_objects
+from coil_rl.config.given import kept_objects
 from coil_rl.config.nodes import find_target
 from coil_rl.config.schema import TrainConfig, fingerprint
 from coil_rl.config.start import run_configured
@@ -71,13 +72,15 @@ def _hash_of_user(config: DictConfig, name: str) -> list[str]:
         name: of the guide.
     """
     guide = config.guide[name]
-    target = find_target(guide["_target_"], f"guide.{name}")
+    target = find_target(guide.get("_target_"), f"guide.{name}")
     things = kept_objects(config, "env")
     if not target.__module__.startswith("coil_rl."):
         things.append(target)
     if target is ControllerGuide:
-        of = guide["of"]
-        things.append(load_controller(of) if isinstance(of, str) else kept(of["name"]))
+        things += kept_objects(config, "guide")
+        if isinstance(guide.get("of"), str):
+            with suppress(ValueError):  # the guide is refused where it is built
+                things.append(load_controller(guide.of))
     if not things:
         return []
     text = " ".join(map(fingerprint_with_code, things))
