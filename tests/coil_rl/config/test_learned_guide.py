@@ -5,6 +5,7 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from run_folders import make_untrained_run
+from torchrl.data import Bounded, Categorical, Unbounded
 
 from coil_rl.config.build import build_guides, env_maker
 from coil_rl.config.learned_guide import LONGEST_CHAIN, LearnedGuide
@@ -12,6 +13,7 @@ from coil_rl.config.load import open_run
 from coil_rl.errors import UserError
 from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.testing import check_guide
+from coil_rl.transforms.action_space import ActionSpace
 
 TINY = [
     "track=generated",
@@ -119,3 +121,12 @@ def test_run_that_is_its_own_guide_is_refused(length, tmp_path):
     for _ in range(2):  # the first refusal leaves nothing behind
         with pytest.raises(UserError, match=message):
             LearnedGuide(str(tmp_path / "0"))
+
+
+def test_env_with_another_action_is_refused(tmp_path):
+    run = make_untrained_run(tmp_path / "run", "env=gym", "env.id=Pendulum-v1", "method=ppo")
+    guide = LearnedGuide(str(run))
+    guide.in_space(ActionSpace(Bounded(-2, 2, (1, 1)), 1))
+    for spec in (Unbounded((1, 1)), Bounded(-1, 1, (1, 1)), Categorical(3, (1,))):
+        with pytest.raises(UserError, match=r"acts from \[-2.0\] to \[2.0\], but the action of"):
+            guide.in_space(ActionSpace(spec, 1))
