@@ -126,7 +126,7 @@ class _AllRows(TensorDictModuleBase):
         lowest = first_choices(env.base_env)
         self.first = None if lowest is None else lowest.squeeze()
         self.transforms, self.needs_past = None, False
-        if first or config.method.needs_guide or config.action:
+        if first or config.method.transforms or config.action:
             self.transforms = env.transform
             parts = env.transform.modules()
             self.needs_past = bool(memory) or any(getattr(p, "needs_past", False) for p in parts)

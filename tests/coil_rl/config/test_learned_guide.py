@@ -123,6 +123,22 @@ def test_run_that_is_its_own_guide_is_refused(length, tmp_path):
             LearnedGuide(str(tmp_path / "0"))
 
 
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "MountainCarContinuous-v0"])
+def test_policy_that_observes_its_last_actions_acts_as_in_its_own_env(env_id, tmp_path):
+    words = ["env=gym", f"env.id={env_id}", "env.max_steps=6"]
+    own = ["method=ppo", "+transform=last_action", "method.observes=[last_action]"]
+    own.append("method.transforms.last_action.steps=2")
+    run = make_untrained_run(tmp_path / "run", *words, *own, "learner.action_gain=3")
+    opened = open_run(run)
+    env = opened.make_env(2, "evaluation", count=2)
+    policy = evaluate_policy(env, opened.policy(env))
+    learned = ["method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"]
+    guided = env_maker(composed(*words, *learned)).guided(2, "evaluation", count=2)
+    assert [row["reward"] for row in evaluate_policy(*guided).episodes] == pytest.approx(
+        [row["reward"] for row in policy.episodes], rel=1e-5
+    )
+
+
 def test_env_with_another_action_is_refused(tmp_path):
     run = make_untrained_run(tmp_path / "run", "env=gym", "env.id=Pendulum-v1", "method=ppo")
     guide = LearnedGuide(str(run))
