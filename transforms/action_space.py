@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -47,6 +47,35 @@ def written_key(key: NestedKey) -> str:
 
 class ChoicesError(ValueError):
     """An error about an action that is choices, where a number is needed."""
+
+
+class ActionRange:
+    """The numbers that an action may have, in the unit and numbering of its env.
+
+    Args:
+        low: lowest ones, [*A]; of choices the number of the first of each, [n].
+        high: highest ones, of the same shape.
+        whole: whether they are choices.
+    """
+
+    def __init__(self, low: Any, high: Any, *, whole: bool) -> None:
+        self.low, self.high = (torch.as_tensor(side).cpu().double() for side in (low, high))
+        self.whole = whole
+
+    def __str__(self) -> str:
+        """Return the range as a part of a sentence."""
+        shown = f"from {self.low.tolist()} to {self.high.tolist()}"
+        return f"{shown} in whole numbers" if self.whole else shown
+
+    def same_as(self, other: ActionRange) -> bool:
+        """Return whether an action has the same numbers, up to rounding.
+
+        Args:
+            other: the range of the other action.
+        """
+        if self.whole != other.whole or self.low.shape != other.low.shape:
+            return False
+        return torch.allclose(self.low, other.low) and torch.allclose(self.high, other.high)
 
 
 class ActionSpace:
@@ -94,6 +123,16 @@ class ActionSpace:
         if isinstance(spec, Bounded):
             row = (0,) * batch_dims
             self.bounds = spec.space.low[row], spec.space.high[row]
+
+    @property
+    def range(self) -> ActionRange:
+        """The numbers that an action may have; infinite ones without bounds."""
+        if self.choices:
+            number = torch.tensor(self.choices)
+            low = torch.zeros_like(number) if self.first is None else self.first.cpu()
+            return ActionRange(low, low + number - 1, whole=True)
+        infinite = torch.full(self.event, torch.inf)
+        return ActionRange(*(self.bounds or (-infinite, infinite)), whole=False)
 
     def normalise(self, vectors: Tensor) -> Tensor:
         """Return vectors [..., A] in normalised numbers; those of choices stay as they are."""

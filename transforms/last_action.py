@@ -39,6 +39,8 @@ class LastAction(ActionTransform):
         torch.Size([8, 2])
     """
 
+    needs_past = True  # stored data of a single step are not enough
+
     def __init__(
         self,
         steps: int = 1,

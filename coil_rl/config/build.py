@@ -11,6 +11,7 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, Transform
 
+from coil_rl.config import given
 from coil_rl.config.beside import unread_controllers
 from coil_rl.config.logger import make_logger
 from coil_rl.config.measured import complete_measures
@@ -223,9 +224,10 @@ def _added(config: DictConfig) -> set[Any]:
 def guide_results(
     config: DictConfig, evaluation: Evaluation, pictures: Sequence[Picture] = ()
 ) -> Mapping[str, EvaluationResult]:
-    """Evaluate each guide of a configuration alone.
+    """Evaluate each guide of a configuration alone, in the cases of the evaluation.
 
-    The runs of a sweep share the results, unless there are `pictures` that watch the guides.
+    The runs of a sweep share the results, unless there are `pictures` that watch the guides, or a
+    part is an object of this process: its name tells nothing about its state.
     """
     nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
     nodes["disturb"] = disturbances(config, TEST)
@@ -233,8 +235,10 @@ def guide_results(
     if not nodes["guide"]:
         return {}
     node = env_node(config, config.evaluation.env)
+    if "cases" in config.evaluation.env:
+        node["cases"] = len(evaluation.cases)  # which may be another number than that of the run
     text = OmegaConf.to_yaml({"env": node, **nodes})
-    if pictures:
+    if pictures or given.TARGET in text:
         return _new_guide_results(text, evaluation, pictures)
     return dict(_guide_results(text, evaluation))
 

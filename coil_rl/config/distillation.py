@@ -1,12 +1,15 @@
 """Proxies: networks that imitate guides without parameters, for methods that train their guides.
 
 A proxy is the policy of an imitation run. The configuration of that run follows from the guide, the
-env and the key `proxy`; its hash is part of the folder name, so that a proxy is trained once. A run
-copies its proxies into its own folder.
+env and the key `proxy`; its hash is part of the folder name, so that a proxy is trained once. For
+objects and code of a user, which the configuration only names, there is a second hash. A run copies
+its proxies into its own folder.
 """
 
+import hashlib
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +19,15 @@ from torch import nn
 
 from coil_rl.config import load
 from coil_rl.config.build import build_guides, build_learner, env_maker
+from coil_rl.config.fingerprint import fingerprint_with_code
+from coil_rl.config.given import kept_objects
+from coil_rl.config.nodes import find_target
 from coil_rl.config.schema import TrainConfig, fingerprint
 from coil_rl.config.start import run_configured
 from coil_rl.errors import UserError
 from coil_rl.files import temporary, whole_file
+from coil_rl.guides import ControllerGuide
+from coil_rl.guides.controllers import load as load_controller
 from coil_rl.transforms.normalised_action import in_unit_of
 
 FILES = ("config.yaml", "policy_last.pt")  # files of a run that are needed to load its policy
@@ -51,8 +59,32 @@ def proxy_config(config: DictConfig, name: str) -> DictConfig:
     }
     merged: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), values)
     OmegaConf.update(merged, "method.transforms.advice.guides", guide, merge=False, force_add=True)
-    merged.run_dir = f"{proxy['folder']}/{name}_{fingerprint(merged)}"
+    parts = [name, fingerprint(merged), *_hash_of_user(merged, name)]
+    merged.run_dir = f"{proxy['folder']}/{'_'.join(parts)}"
     return merged
+
+
+def _hash_of_user(config: DictConfig, name: str) -> list[str]:
+    """Return a hash of what is a user's in a guide and an env; none if there is nothing.
+
+    Args:
+        config: of the proxy.
+        name: of the guide.
+    """
+    guide = config.guide[name]
+    target = find_target(guide.get("_target_"), f"guide.{name}")
+    things = kept_objects(config, "env")
+    if not target.__module__.startswith("coil_rl."):
+        things.append(target)
+    if target is ControllerGuide:
+        things += kept_objects(config, "guide")
+        if isinstance(guide.get("of"), str):
+            with suppress(ValueError):  # the guide is refused where it is built
+                things.append(load_controller(guide.of))
+    if not things:
+        return []
+    text = " ".join(map(fingerprint_with_code, things))
+    return [hashlib.sha256(text.encode()).hexdigest()[:10]]
 
 
 def distil(config: DictConfig, folder: Path) -> int:

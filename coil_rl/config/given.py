@@ -53,15 +53,33 @@ def give(config: DictConfig, objects: Mapping[str, Any]) -> None:
     for part, thing in objects.items():
         if thing is None:
             continue
-        nodes = [OmegaConf.select(config, place) for place in PLACES[part]]
-        names = [
-            node["name"]
-            for node in nodes
-            if isinstance(node, DictConfig) and node.get("_target_") == TARGET
-        ]
+        names = _names(config, part)
         if not names:
             raise UserError(f"{part}: the run names its own {part}; leave {part}= out")
         keep(names[0], thing)
+
+
+def kept_objects(config: DictConfig, part: str) -> list[Any]:
+    """Return the objects of a configuration that were kept.
+
+    Args:
+        config: of a run.
+        part: "guide" or "env".
+
+    Raises:
+        UserError: if one was not handed over in this process.
+    """
+    return [kept(name) for name in _names(config, part)]
+
+
+def _names(config: DictConfig, part: str) -> list[str]:
+    """Return the names under which objects of a configuration are kept."""
+    nodes = [OmegaConf.select(config, place) for place in PLACES[part]]
+    return [
+        node["name"]
+        for node in nodes
+        if isinstance(node, DictConfig) and node.get("_target_") == TARGET
+    ]
 
 
 def import_path(thing: Any) -> str | None:

@@ -27,7 +27,7 @@ from coil_rl.guides import PerRow
 from coil_rl.run.parts import TRAIN
 from coil_rl.run.policy_batch import memory_keys
 from coil_rl.run.run import Run
-from coil_rl.transforms.action_space import ActionSpace, first_choices
+from coil_rl.transforms.action_space import ActionSpace, first_choices, space_of
 from coil_rl.transforms.normalised_action import normalising
 
 LONGEST_CHAIN = 4  # learned guides of learned guides
@@ -83,16 +83,14 @@ class LearnedGuide(TensorDictModuleBase):
             space: of the actions of the env.
 
         Raises:
-            UserError: if the policy acts between other bounds, which may be in another unit.
+            UserError: if the policy has another number of choices or other bounds, which may be in
+                another unit.
         """
-        own, given = self.space.bounds, space.bounds
-        if own is None or given is None or self.space.event != space.event:
-            return  # another number of them is refused at the first action
-        if not all(torch.allclose(*pair) for pair in zip(own, given, strict=True)):
-            shown = [f"{low.tolist()} to {high.tolist()}" for low, high in (own, given)]
+        if not self.space.range.same_as(space.range):
             raise UserError(
-                f"run={self.folder} acts from {shown[0]}, but the action of this env goes from "
-                f"{shown[1]}: give a run in an env with the same action, or convert it by a wrapper"
+                f"run={self.folder} acts {self.space.range}, but the action of this env goes "
+                f"{space.range}: give a run in an env with the same action, or convert it by a "
+                "wrapper"
             )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -124,12 +122,11 @@ class _AllRows(TensorDictModuleBase):
         self.in_keys, self.out_keys = list(self.policy.in_keys), ["action", *memory]
         specs = env.base_env.observation_spec
         self.plant_keys = observed(env.base_env)
-        base = env.base_env
-        self.space = ActionSpace(base.full_action_spec[base.action_key], len(base.batch_size))
+        self.space = space_of(env.base_env, env.base_env.action_key)
         lowest = first_choices(env.base_env)
         self.first = None if lowest is None else lowest.squeeze()
         self.transforms, self.needs_past = None, False
-        if first or config.method.needs_guide or config.action:
+        if first or config.method.transforms or config.action:
             self.transforms = env.transform
             parts = env.transform.modules()
             self.needs_past = bool(memory) or any(getattr(p, "needs_past", False) for p in parts)

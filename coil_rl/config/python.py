@@ -72,6 +72,7 @@ def train(
         >>> table = run.evaluate(cases=50)  # doctest: +SKIP
     """
     if isinstance(env, Run):
+        _refuse_others(guide, method, seed, folder, tune, overrides)
         return env.train(frames)
     folder = Path(folder).expanduser() if folder is not None else _new_folder()
     run = prepare(
@@ -85,6 +86,21 @@ def train(
         overrides=overrides,
     )
     return run.train()
+
+
+def _refuse_others(
+    guide: Any, method: Any, seed: int, folder: Any, tune: Any, overrides: Sequence[str]
+) -> None:
+    """Refuse arguments of `train` that say what a `Run` consists of, which it knows itself."""
+    objects = {"guide": guide, "method": method, "folder": folder, "tune": tune}
+    names = [name for name, value in objects.items() if value is not None]
+    names += ["seed"] if seed != 0 else []
+    names += ["overrides"] if overrides else []
+    if names:
+        raise UserError(
+            f"{', '.join(names)}: a Run is trained as it is, with other frames at most; leave out "
+            "what it has already, or give the env instead of the run"
+        )
 
 
 def prepare(
@@ -279,7 +295,8 @@ def _guide(guide: Any, name: str) -> Words:
     if isinstance(guide, Controller):
         if guide.folder is None:
             raise UserError("guide: this controller has no run; give one of coil_rl.open_run")
-        return ["guide=learned", f"guide.learned.run={quoted(str(guide.folder))}"], {}
+        words = [f"run={quoted(str(guide.folder))}", f"which={guide.which}"]
+        return ["guide=learned", *(f"guide.learned.{word}" for word in words)], {}
     path = guide if isinstance(guide, str) else import_path(guide)
     words = ["guide=controller", f"guide.controller.of={quoted(path or 'given')}"]
     return words, {} if path is not None else {"guide.controller.of": keep(name, guide)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from torchrl.envs import TensorDictPrimer
 
 from coil_rl.errors import UserError
 from coil_rl.export.policy import ADVICE, ExportedPolicy
-from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.transforms.action_space import ActionRange, ActionSpace
 
 
 class ExportedGuide(TensorDictModuleBase):
@@ -60,17 +61,9 @@ class ExportedGuide(TensorDictModuleBase):
         Raises:
             UserError: if the policy acts in another one.
         """
-        action = self.exported.contract["outputs"][0]
-        choices = action.get("choices")
-        same = choices == space.choices if choices else list(space.event) == action["shape"]
-        if same and not choices and space.bounds is not None:
-            bounds = action["bounds"] or {}
-            same = all(
-                _equal(bounds.get(side), bound)
-                for side, bound in zip(("low", "high"), space.bounds, strict=True)
-            )
-        if not same:
-            raise self._unfit("its action has other numbers or bounds")
+        own = _range(self.exported.contract["outputs"][0])
+        if not own.same_as(space.range):
+            raise self._unfit(f"its action goes {space.range}, not {own}")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action, and what is remembered."""
@@ -127,10 +120,14 @@ def _array(tensor: Tensor, dtype: str) -> NDArray[Any]:
     return tensor.cpu().numpy().astype(dtype)
 
 
-def _equal(numbers: Any, bound: Tensor) -> bool:
-    """Return whether bounds of a contract are those of a space; None stands for infinite ones."""
-    if numbers is None:
-        return not bool(bound.isfinite().any())
-    given = np.array(numbers, dtype=float)  # None becomes NaN
-    found = torch.where(bound.isfinite(), bound, torch.nan).cpu().double().numpy()
-    return given.shape == found.shape and bool(np.allclose(given, found, equal_nan=True))
+def _range(action: Mapping[str, Any]) -> ActionRange:
+    """Return the numbers that an action may have; None in its bounds stands for infinite ones."""
+    if action.get("choices"):
+        low = np.array(action["lowest"])
+        return ActionRange(low, low + np.array(action["choices"]) - 1, whole=True)
+    infinite, bounds = np.full(action["shape"], np.inf), action.get("bounds") or {}
+    sides = []
+    for side, otherwise in (("low", -infinite), ("high", infinite)):
+        given = np.array(bounds.get(side, otherwise), dtype=float)  # None becomes NaN
+        sides.append(np.where(np.isnan(given), otherwise, given))
+    return ActionRange(*sides, whole=False)

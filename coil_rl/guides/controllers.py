@@ -193,6 +193,7 @@ class ControllerGuide(TensorDictModuleBase):
     | --- | --- |
     | a TensorDictModule, or a class of such | the guide itself, with its own `in_keys` |
     | another `nn.Module`, or a class of such | a network: entries [B, N] to actions [B, A] |
+    | one of these two as an object with weights | a copy of it, which alone a method may train |
     | a class with a method `act` | `PerRow`: one object for each row of the env |
     | an object with a method `act` | `PerRow`: one copy for each row of the env |
     | a trained model with `predict`, as of Stable-Baselines3 | `PerRow`: one state for each row |
@@ -273,7 +274,7 @@ def _of_object(
     if predicts(thing) and not isinstance(thing, TensorDictModuleBase):
         return _of_model(lambda: thing, title, keys)
     if is_module:
-        return _of_module(thing, title, keys)
+        return _of_module(_copy_of(thing, title), title, keys)
     read = keys or ["observation"]
     if acts:
         _check_call(thing.act, f"{title}.act", read, {})
@@ -370,6 +371,17 @@ def _in_space(entry: NDArray[Any], space: Any) -> Any:
     if isinstance(space, spaces.Box) and entry.size == math.prod(space.shape):
         return entry.reshape(space.shape)
     return entry
+
+
+def _copy_of(module: nn.Module, title: str) -> nn.Module:
+    """Return a copy of a network, because some methods train their guides.
+
+    A module without parameters is returned itself: nothing of it is trained.
+    """
+    if not any(True for _ in module.parameters()):
+        return module
+    with foreign(f"the controller {title}", "its copy"):
+        return copy.deepcopy(module)
 
 
 def _of_module(module: nn.Module, title: str, keys: list[NestedKey] | None) -> TensorDictModuleBase:

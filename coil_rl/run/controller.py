@@ -36,6 +36,7 @@ class Controller:
             has its own delays and noise.
         policy: of the run, for this env.
         folder: of the run, if it has one.
+        which: name of the policy in the folder, "handed_over", "last" or "best".
 
     Example:
         >>> import coil_rl
@@ -45,12 +46,16 @@ class Controller:
     """
 
     def __init__(
-        self, env: EnvBase, policy: TensorDictModuleBase, folder: Path | None = None
+        self,
+        env: EnvBase,
+        policy: TensorDictModuleBase,
+        folder: Path | None = None,
+        which: str = "handed_over",
     ) -> None:
         if not isinstance(env, TransformedEnv) or env.batch_size.numel() != 1:
             raise ValueError(f"a controller needs an env of one row, not {list(env.batch_size)}")
         self.env, self.policy = undisturbed(env.eval()), policy
-        self.plant, self.folder = env.base_env, folder
+        self.plant, self.folder, self.which = env.base_env, folder, which
         guides = [part for part in self.env.transform.modules() if isinstance(part, GuideActions)]
         self.read = {unravel_key(key) for part in (policy, *guides) for key in part.in_keys}
         self._check_read()

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property, partial
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.errors import NO_SPACE, UserError, file_of_a_run, is_outside
+from coil_rl.errors import NO_SPACE, UserError, did_you_mean, file_of_a_run, is_outside
 from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.measures import Measure
@@ -169,7 +170,15 @@ class Run:
         return self.file_of(self.which)
 
     def file_of(self, which: str) -> str:
-        """Return "last" or "best" for the name of a policy, which may be "handed_over"."""
+        """Return "last" or "best" for the name of a policy, which may be "handed_over".
+
+        Raises:
+            UserError: for another name.
+        """
+        names = [HANDED_OVER, "last", "best"]
+        if which not in names:
+            hint = did_you_mean(str(which), names)
+            raise UserError(f"which={which!r} must be one of {', '.join(names)}{hint}")
         if which != HANDED_OVER:
             return which
         return "best" if self.delivery == "tested" else "last"
@@ -189,7 +198,7 @@ class Run:
         """
         with locked(self.folder):
             if frames is not None:
-                self.lengthen(frames)
+                self.lengthen(whole("frames", frames))
             if is_begun(self.folder):
                 self.finish_begun()
             else:
@@ -202,7 +211,7 @@ class Run:
         with locked(self.folder):
             return self.finish_begun()
 
-    def evaluate(self, cases: int | None = None, folder: Path | None = None) -> pd.DataFrame:
+    def evaluate(self, cases: int | None = None, folder: str | Path | None = None) -> pd.DataFrame:
         """Evaluate the policy and the guides, and return the rows of `evaluation.csv`.
 
         Args:
@@ -211,15 +220,19 @@ class Run:
             folder: for tables and pictures; by default they are not kept.
 
         Raises:
-            UserError: if the cases of the env have names, so that there is no other number of them.
+            UserError: if the cases of the env have names, so that there is no other number of them,
+                or for a number below 1.
         """
         import pandas as pd  # a training does without it
 
-        trial = self.trial if cases is None else trial_with_cases(self.trial, cases)
+        trial = self.trial
+        if cases is not None:
+            trial = trial_with_cases(trial, whole("cases", cases))
         policy = self.policy()
         fallback = self.make_fallback(policy) if self.fallback else None
         with tempfile.TemporaryDirectory() as temporary:
-            judgement = judge(trial, policy, folder or Path(temporary), self.seed, fallback)
+            place = Path(temporary) if folder is None else Path(folder).expanduser()
+            judgement = judge(trial, policy, place, self.seed, fallback)
         return pd.DataFrame(judgement.table)
 
     def controller(self, which: str | None = None) -> Controller:
@@ -227,12 +240,17 @@ class Run:
 
         Args:
             which: policy, "handed_over", "last" or "best"; by default the one that is evaluated.
+
+        Raises:
+            UserError: if the policy is missing, or for another name.
         """
+        which = self.which if which is None else which
+        self.file_of(which)
         env = self.make_env(1, TRAIN)
         if not self.has_agent:
             env, policy = self.make_env.guided(1, TRAIN)
             return Controller(env, policy, self.folder)
-        return Controller(env, self.load_policy(env, which or self.which), self.folder)
+        return Controller(env, self.load_policy(env, which), self.folder, which)
 
     def policy(self, env: EnvBase | None = None, which: str | None = None) -> Any:
         """Return the policy of a finished run for an env; None without an agent.
@@ -504,6 +522,21 @@ class Run:
             "budget": {"frames": self.budget.frames, "steps": self.budget.steps},
             "evaluation": {"measures": measured},
         }
+
+
+def whole(name: str, number: Any) -> int:
+    """Return a number of things that somebody gave.
+
+    Args:
+        name: of the argument.
+        number: what was given.
+
+    Raises:
+        UserError: if it is no whole number, or below 1.
+    """
+    if isinstance(number, bool) or not isinstance(number, Integral) or number < 1:
+        raise UserError(f"{name}={number!r} must be a whole number of at least 1")
+    return int(number)
 
 
 def trial_with_cases(trial: Trial, cases: int) -> Trial:

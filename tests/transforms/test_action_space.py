@@ -224,3 +224,34 @@ def test_removed_advice_is_the_last_action_of_several_choices():
     action = torch.tensor([[2, 1], [0, 0], [1, 1], [0, 1]])
     after = env.step(env.reset().set("action", action))["next"]
     assert after["guide_action"][0, 0].tolist() == [0, 0, 1, 0, 1]
+
+
+RANGES = {
+    "unit": (Bounded(-1, 1, (2, 1)), None, "from [-1.0] to [1.0]"),
+    "wide": (Bounded(20, 80, (2, 1)), None, "from [20.0] to [80.0]"),
+    "two": (Bounded(-1, 1, (2, 2)), None, "from [-1.0, -1.0] to [1.0, 1.0]"),
+    "no upper bound": (
+        Bounded(torch.full((2, 1), -1.0), torch.full((2, 1), torch.inf)),
+        None,
+        "from [-1.0] to [inf]",
+    ),
+    "free": (Unbounded((2, 1)), None, "from [-inf] to [inf]"),
+    "choices": (Categorical(3, (2,)), None, "from [0.0] to [2.0] in whole numbers"),
+    "more choices": (Categorical(4, (2,)), None, "from [0.0] to [3.0] in whole numbers"),
+    "later choices": (Categorical(3, (2,)), [5], "from [5.0] to [7.0] in whole numbers"),
+}
+
+
+@pytest.mark.parametrize("name", RANGES)
+def test_actions_with_other_numbers_have_other_ranges(name):
+    ranges = {}
+    for each, (spec, first, _) in RANGES.items():
+        ranges[each] = ActionSpace(spec, 1, None if first is None else torch.tensor(first)).range
+    assert str(ranges[name]) == RANGES[name][-1]
+    assert [each for each in ranges if ranges[name].same_as(ranges[each])] == [name]
+
+
+def test_one_hot_choices_are_those_of_an_index():
+    assert ActionSpace(OneHot(3, (2, 3)), 1).range.same_as(
+        ActionSpace(Categorical(3, (2,)), 1).range
+    )

@@ -1,5 +1,6 @@
 import csv
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,8 @@ from hydra import compose, initialize_config_module
 
 from coil_rl.config import distillation, load
 from coil_rl.config.check import check
+from coil_rl.config.python import Named, named
+from coil_rl.config.python import composed as composed_in_python
 from coil_rl.errors import UserError
 from coil_rl.programs.distill import distill
 from coil_rl.programs.train import train
@@ -38,6 +41,16 @@ def composed(*overrides, name="train"):
         return compose(name, [*tiny, *overrides])
 
 
+class Gain:
+    """A controller with a state of its own."""
+
+    def __init__(self, gain):
+        self.gain = gain
+
+    def act(self, observation):
+        return [self.gain * observation[0]]
+
+
 @pytest.fixture(scope="module")
 def proxies(tmp_path_factory):
     folder = tmp_path_factory.mktemp("distill")
@@ -63,6 +76,32 @@ def test_folder_of_a_proxy_follows_from_guide_env_and_settings():
         for other in ("guide.spline.gain=0.9", "env.rate=20", "proxy.seed=1", "track.train.seed=5")
     ]
     assert len({folder(), folder(guide="constant"), *others}) == 6
+
+
+def folder_of_proxy(guide):
+    given = named("Pendulum-v1", guide, "place")
+    words = [*given.words, "method=dynamic_coil_sequential"]
+    config = composed_in_python(Named(words, given.nodes), "unused")
+    return distillation.proxy_config(config, "controller").run_dir
+
+
+def test_proxies_of_other_objects_are_other_ones():
+    one, other = (Gain(gain) for gain in (1.0, 2.0))
+    assert folder_of_proxy(one) == folder_of_proxy(Gain(1.0)) != folder_of_proxy(other)
+
+
+@pytest.mark.parametrize("code", ["class Mine:\n    def act(self, o):\n", "def Mine(o):\n"])
+def test_proxy_of_a_controller_is_another_one_after_a_change_of_its_code(
+    code, tmp_path, monkeypatch
+):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    folders = []
+    for gain in (1.0, 1.0, 2.0):
+        (tmp_path / "changing.py").write_text(f"{code}        return [{gain} * o[0]]\n")
+        monkeypatch.delitem(sys.modules, "changing", raising=False)
+        folders.append(folder_of_proxy("changing:Mine"))
+    assert folders[0] == folders[1] != folders[2]
 
 
 def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, capsys):

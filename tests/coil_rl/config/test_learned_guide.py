@@ -5,6 +5,7 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from run_folders import make_untrained_run
+from torchrl.data import Bounded, Categorical, Unbounded
 
 from coil_rl.config.build import build_guides, env_maker
 from coil_rl.config.learned_guide import LONGEST_CHAIN, LearnedGuide
@@ -12,6 +13,7 @@ from coil_rl.config.load import open_run
 from coil_rl.errors import UserError
 from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.testing import check_guide
+from coil_rl.transforms.action_space import ActionSpace
 
 TINY = [
     "track=generated",
@@ -119,3 +121,28 @@ def test_run_that_is_its_own_guide_is_refused(length, tmp_path):
     for _ in range(2):  # the first refusal leaves nothing behind
         with pytest.raises(UserError, match=message):
             LearnedGuide(str(tmp_path / "0"))
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "MountainCarContinuous-v0"])
+def test_policy_that_observes_its_last_actions_acts_as_in_its_own_env(env_id, tmp_path):
+    words = ["env=gym", f"env.id={env_id}", "env.max_steps=6"]
+    own = ["method=ppo", "+transform=last_action", "method.observes=[last_action]"]
+    own.append("method.transforms.last_action.steps=2")
+    run = make_untrained_run(tmp_path / "run", *words, *own, "learner.action_gain=3")
+    opened = open_run(run)
+    env = opened.make_env(2, "evaluation", count=2)
+    policy = evaluate_policy(env, opened.policy(env))
+    learned = ["method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"]
+    guided = env_maker(composed(*words, *learned)).guided(2, "evaluation", count=2)
+    assert [row["reward"] for row in evaluate_policy(*guided).episodes] == pytest.approx(
+        [row["reward"] for row in policy.episodes], rel=1e-5
+    )
+
+
+def test_env_with_another_action_is_refused(tmp_path):
+    run = make_untrained_run(tmp_path / "run", "env=gym", "env.id=Pendulum-v1", "method=ppo")
+    guide = LearnedGuide(str(run))
+    guide.in_space(ActionSpace(Bounded(-2, 2, (1, 1)), 1))
+    for spec in (Unbounded((1, 1)), Bounded(-1, 1, (1, 1)), Categorical(3, (1,))):
+        with pytest.raises(UserError, match=r"acts from \[-2.0\] to \[2.0\], but the action of"):
+            guide.in_space(ActionSpace(spec, 1))

@@ -126,6 +126,87 @@ def test_folder_made_with_an_object_is_opened_with_the_object(tmp_path, monkeypa
         coil_rl.open_run(folder, env=Held, trust=["thermostat"])
 
 
+def rewards_of_guide(table):
+    return list(table[(table["driver"] == "guide") & (table["case"] != "mean")]["reward"])
+
+
+def test_guide_alone_drives_in_as_many_cases_as_are_asked_for(tmp_path):
+    words = ["evaluation.cases=2", "evaluation.gif=false", "env.max_steps=5"]
+    run = coil_rl.prepare(
+        ENV,
+        guide="thermostat.control:PI",
+        method="guide",
+        folder=tmp_path / "run",
+        overrides=words,
+    )
+    few, more = (rewards_of_guide(run.evaluate(cases=cases)) for cases in (2, 4))
+    assert few == more[:2]
+    assert len(set(more)) == 4
+
+
+def test_rows_of_a_guide_are_those_of_the_object_that_was_handed_over(tmp_path):
+    words = ["evaluation.cases=2", "evaluation.gif=false", "env.max_steps=5"]
+    folder = tmp_path / "run"
+    run = coil_rl.prepare(ENV, guide=Held(0.7), method="guide", folder=folder, overrides=words)
+    run.begin()
+    first = rewards_of_guide(run.evaluate())
+    other = coil_rl.open_run(folder, guide=Held(0.1), trust=["thermostat"])
+    assert rewards_of_guide(other.evaluate()) != first
+    again = coil_rl.open_run(folder, guide=Held(0.7), trust=["thermostat"])
+    assert rewards_of_guide(again.evaluate()) == first
+
+
+def test_controller_as_a_guide_is_the_policy_that_was_asked_for(tmp_path):
+    words = [*SHORT, "delivery=tested", "learner.action_gain=1"]
+    run = coil_rl.prepare(ENV, method="ppo", frames=32, folder=tmp_path / "run", overrides=words)
+    for seed, which in enumerate(("last", "best")):
+        torch.manual_seed(seed)
+        policy = run.make_learner(run.make_env()).policy
+        checkpoint.save(policy.state_dict(), run.folder / f"policy_{which}.pt")
+    run.begin()
+    observation, actions = np.array([-6.0, 3.0], np.float32), []
+    for which in (None, "last", "best"):
+        controller = run.controller(which)
+        guided = coil_rl.prepare(ENV, guide=controller, method="guide", folder=tmp_path / "guided")
+        actions.append(float(controller.act(observation)[0]))
+        assert guided.controller().act(observation)[0] == pytest.approx(actions[-1])
+    assert actions[0] == actions[2] != actions[1]
+
+
+@pytest.mark.parametrize("number", [0, -1, 2.5, True, "3"])
+def test_number_that_is_none_is_refused_by_its_name(number, tmp_path):
+    run = coil_rl.prepare(ENV, guide=proportional, method="guide", folder=tmp_path / "run")
+    for argument, use in {"cases": run.evaluate, "frames": run.train}.items():
+        with pytest.raises(UserError, match=rf"^{argument}={number!r} must be a whole number of"):
+            use(**{argument: number})
+    assert not (run.folder / "config.yaml").exists()
+
+
+def test_other_name_of_a_policy_is_refused(tmp_path):
+    run = coil_rl.prepare(ENV, guide=proportional, method="guide", folder=tmp_path / "run")
+    with pytest.raises(UserError, match="which='bset' must be one of handed_over, last, best"):
+        run.controller("bset")
+
+
+def test_tables_are_written_to_a_folder_that_is_a_text(tmp_path):
+    words = ["evaluation.cases=1", "evaluation.gif=false", "env.max_steps=2"]
+    run = coil_rl.prepare(
+        ENV, guide=proportional, method="guide", folder=tmp_path / "run", overrides=words
+    )
+    run.evaluate(folder=str(tmp_path / "tables"))
+    assert (tmp_path / "tables" / "evaluation.csv").exists()
+
+
+@pytest.mark.parametrize(
+    "others", [{"seed": 5}, {"method": "ppo"}, {"folder": "x"}, {"overrides": ["learner.gamma=1"]}]
+)
+def test_run_is_trained_as_it_is(others, tmp_path):
+    run = coil_rl.prepare(ENV, guide=proportional, method="guide", folder=tmp_path / "run")
+    with pytest.raises(UserError, match=f"^{next(iter(others))}: a Run is trained as it is"):
+        coil_rl.train(run, frames=32, **others)
+    assert not (run.folder / "config.yaml").exists()
+
+
 def make_room():
     """Return an env of Gymnasium, as a maker that no folder can name."""
     from thermostat.room import Room

@@ -5,11 +5,16 @@ import json
 import numpy as np
 import onnx
 import pytest
+import torch
 from exported_sums import model, write
+from torchrl.data import Bounded, Categorical, Unbounded
 
 import coil_rl
+from coil_rl.errors import UserError
 from coil_rl.export.contract import CONTRACT, ONNX, VERSION, checksum
+from coil_rl.export.guide import ExportedGuide
 from coil_rl.export.policy import ExportedPolicy
+from coil_rl.transforms.action_space import ActionSpace
 
 
 def test_file_of_the_test_is_valid():
@@ -172,3 +177,38 @@ def test_missing_package_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setattr("coil_rl.export.session.find_spec", lambda name: None)
     with pytest.raises(coil_rl.UserError, match=r"onnxruntime: .*pip install 'coil-rl\[export\]'"):
         ExportedPolicy(write(tmp_path))
+
+
+def acts_in(**action):
+    """Return a change of the contract: other numbers of the action, and no guide outside."""
+
+    def change(contract):
+        contract["guide"] = {"place": "inside", "names": ["sum"]}
+        del contract["inputs"][1]
+        contract["outputs"][0] |= action
+
+    return change
+
+
+OWN = {"bounds": {"low": [-1.0], "high": [1.0]}}
+UPWARDS = {"bounds": {"low": [-1.0], "high": [None]}}
+CHOICES = {"choices": [3], "lowest": [1], "shape": [1]}
+SPACES = {
+    "own": (Bounded(-1, 1, (1, 1)), None, OWN),
+    "free": (Unbounded((1, 1)), None, {"bounds": None}),
+    "upwards": (Bounded(torch.full((1, 1), -1.0), torch.full((1, 1), torch.inf)), None, UPWARDS),
+    "from 1": (Categorical(3, (1,)), torch.tensor([1]), CHOICES),
+    "from 0": (Categorical(3, (1,)), None, CHOICES | {"lowest": [0]}),
+}
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_exported_guide_acts_in_its_own_action_only(name, tmp_path):
+    guide = ExportedGuide(write(tmp_path, acts_in(**SPACES[name][2])))
+    for other, (spec, first, _) in SPACES.items():
+        space = ActionSpace(spec, 1, first)
+        if other == name:
+            guide.in_space(space)
+            continue
+        with pytest.raises(UserError, match=r"is a policy for Sum, .*its action goes from"):
+            guide.in_space(space)

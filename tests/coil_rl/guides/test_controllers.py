@@ -123,6 +123,20 @@ def test_network_and_function_act_on_the_batch():
     assert torch.equal(advice, rollout["steering"] / 4)
 
 
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_network_that_is_an_object_is_copied(wrapped):
+    network = torch.nn.Linear(2, 1)
+    module = TensorDictModule(network, ["observation"], ["action"]) if wrapped else network
+    guide, ones = ControllerGuide(module), torch.ones(1, 2)
+    action = guide(TensorDict({"observation": ones}, [1]))["action"]
+    torch.testing.assert_close(action, network(ones))
+    before = network.weight.clone()
+    with torch.no_grad():
+        for parameter in guide.parameters():
+            parameter.add_(1.0)
+    assert torch.equal(network.weight, before)
+
+
 def test_python_objects_are_one_a_row_and_reset_with_their_episodes():
     rollout, advice = driven(cones(ControllerGuide("my_control:Counter", options={"step": 0.001})))
     torch.testing.assert_close(advice.squeeze(-1), 0.001 * steps_of_episode(rollout))
