@@ -209,6 +209,23 @@ def test_seeds_that_reach_the_guide_are_counted(made, tmp_path):
     assert ladder.count(" seeds)") == 1
 
 
+def test_page_names_the_returns_of_ppo_that_its_rows_are_compared_with(made, tmp_path):
+    runs = read_runs([made])
+    rows = benchmark_rows("pendulum", runs)
+    row = next(row for row in rows if row["arm"] == "intact")
+
+    def page(*others):
+        write_task(tmp_path, "pendulum", [*rows, *others], runs, 0)
+        return (tmp_path / "pendulum.md").read_text()
+
+    alike, sac = row | {"ppo": row["ppo"] + 0.01}, row | {"method": "ibrl", "ppo": -936.39}
+    assert "compared with PPO" not in page(alike)
+    said = "is compared with PPO of its own sweep and seeds: rows of"
+    assert f"{said} ibrl with -936.4; the others with 201.0.\n" in page(sac)
+    half = row | {"arm": "half", "ppo": 5.0}
+    assert f"{said} coil half with 5.0; rows of ibrl with -936.4; the others" in page(half, sac)
+
+
 def test_failures_are_those_with_the_advice_as_it_is(made):
     assert {row["failures"] for row in benchmark_rows("pendulum", read_runs([made]))} == {0.0}
 
