@@ -30,6 +30,7 @@ import pandas as pd
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
 from coil_rl.report import markdown_table, write_csv
+from coil_rl.report.configurations import differing
 from coil_rl.report.curves import points
 from coil_rl.report.runs import GUIDE, RETURN, Run, read_runs
 from coil_rl.report.statistics import mean_interval
@@ -75,8 +76,18 @@ class Arm:
 
     @property
     def guide(self) -> float:
-        """Mean reward of the guide alone, which is the same for all seeds; NaN without one."""
-        return float(np.mean([mean_reward(run, GUIDE) for run in self.runs.values()]))
+        """Mean reward of the guide alone, of the best one of several; NaN without one."""
+        runs = list(self.runs.values())
+        names = {name for run in runs for name in run.evaluation["driver"] if _is_guide(name)}
+        return max(
+            (float(np.mean([mean_reward(run, name) for run in runs])) for name in names),
+            default=math.nan,
+        )
+
+
+def _is_guide(driver: str) -> bool:
+    """Return whether a driver of an evaluation is the guide, or one of several."""
+    return driver == GUIDE or driver.startswith(f"{GUIDE} ")
 
 
 def plain_episodes(run: Run, driver: str) -> pd.DataFrame:
@@ -115,13 +126,61 @@ def arms_of(runs: Sequence[Run]) -> dict[Key, Arm]:
 
     Args:
         runs: of one task.
+
+    Raises:
+        UserError: if the runs cannot be compared: for two of one arm and seed, for different
+            configurations in one arm, and for different cases.
     """
     arms: dict[Key, Arm] = {}
-    for run in runs:
-        method, _, arm = run.label.rpartition("_")
-        if run.finished:
-            arms.setdefault((method, arm), Arm({})).runs[run.seed] = run
+    finished = [run for run in runs if run.finished]
+    for run in finished:
+        method, _, name = run.label.rpartition("_")
+        arm = arms.setdefault((method, name), Arm({}))
+        if run.seed in arm.runs:
+            raise UserError(
+                f"{run.folder} and {arm.runs[run.seed].folder} are both {run.label} with seed "
+                f"{run.seed}; remove one of them from the folder"
+            )
+        arm.runs[run.seed] = run
+    for run in finished:
+        if _cases(run) != _cases(finished[0]):
+            raise UserError(
+                f"{run.folder} has other cases than {finished[0].folder}; train the runs of a task "
+                "with the same cases, or remove those with others from the folder"
+            )
+    for arm in arms.values():
+        own = list(arm.runs.values())
+        if keys := differing(own):
+            raise UserError(
+                f"the runs of {own[0].label} in {own[0].folder.parent} differ in "
+                f"{', '.join(keys[:3])}; keep those of one configuration in the folder"
+            )
     return arms
+
+
+def _cases(run: Run) -> set[str]:
+    """Return the cases in which the policy of a run was evaluated."""
+    return set(plain_episodes(run, run.label)["case"])
+
+
+def paired(arm: Arm, alone: Arm) -> tuple[Arm, Arm]:
+    """Return the runs of a method and those of PPO with the seeds that both have.
+
+    Args:
+        arm: of the method.
+        alone: the runs of PPO.
+
+    Raises:
+        UserError: if they have no seed in common.
+    """
+    seeds = sorted(set(arm.runs) & set(alone.runs))
+    if not seeds:
+        (one, other) = (next(iter(each.runs.values())) for each in (arm, alone))
+        raise UserError(
+            f"{one.folder.parent}: {one.label} has no seed of {other.label}; train both with the "
+            "same seeds"
+        )
+    return Arm({s: arm.runs[s] for s in seeds}), Arm({s: alone.runs[s] for s in seeds})
 
 
 def rows_of_task(name: str, runs: Sequence[Run]) -> list[dict[str, object]]:
@@ -198,8 +257,9 @@ def guide_of(arms: dict[Key, Arm], name: str) -> float:
 
 
 def _row(arm: Arm, alone: Arm, scale: float) -> dict[str, object]:
-    """Return the row of a method with one guide."""
-    seeds = sorted(set(arm.runs) & set(alone.runs))
+    """Return the row of a method with one guide, of the seeds that PPO has too."""
+    arm, alone = paired(arm, alone)
+    seeds = list(arm.runs)
     ends = np.array([arm.reward(seed) for seed in seeds])
     of_ppo = np.array([alone.reward(seed) for seed in seeds])
     guide = arm.guide

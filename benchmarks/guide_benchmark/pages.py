@@ -112,10 +112,36 @@ def write_task(
         *(f"![learning curves]({name})" for name in _pictures(folder, task)),
         "## Ladder",
         markdown_table([{**row, "frames_to_guide": _frames_to_guide(row)} for row in rows], LADDER),
+        *_several_ppo(rows),
         f"Runs in the table: {sum(row['seeds'] for row in rows)}. Of the last sweep "
         f"{len(runs) + jobs} were started, {finished} finished, {jobs} were refused or failed.",
     ]
     write_text(folder / f"{task}.md", "\n\n".join(lines) + "\n")
+
+
+def _several_ppo(rows: Sequence[Row]) -> list[str]:
+    """Return a sentence with the returns of PPO that rows are compared with, if there are several.
+
+    Rows of another sweep, or of fewer seeds, are compared with the PPO of these.
+
+    Args:
+        rows: of one task.
+    """
+    known = [row for row in rows if row["arm"] != ALONE and not math.isnan(row["ppo"])]
+    returns = Counter(f"{row['ppo']:.1f}" for row in known)
+    if len(returns) < 2:
+        return []
+    (most, _), *others = returns.most_common()
+    parts = []
+    for ppo, _ in others:
+        own = [row for row in known if f"{row['ppo']:.1f}" == ppo]
+        rest = {row["method"] for row in known if row not in own}
+        names = {f"{r['method']} {r['arm']}" if r["method"] in rest else r["method"] for r in own}
+        parts.append(f"rows of {', '.join(sorted(names))} with {ppo}")
+    return [
+        "Each row is compared with PPO of its own sweep and seeds: "
+        f"{'; '.join(parts)}; the others with {most}."
+    ]
 
 
 def _frames_to_guide(row: Row) -> float | str:

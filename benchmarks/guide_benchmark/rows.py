@@ -1,8 +1,9 @@
 """Rows of the guide benchmark: what a method gave with one guide in one task.
 
-A row stands for all seeds of a method and an arm. Its scores are (return - random) / (reference -
-random): `random` is the return of the task's random guide, and the reference is in references.csv,
-with its source. Rows of others are checked by `check_row` before they join the table.
+A row stands for all seeds of a method and an arm that plain PPO has too. Its scores are (return -
+random) / (reference - random): `random` is the return of the task's random guide, and the reference
+is in references.csv, with its source. Rows of others are checked by `check_row` before they join
+the table.
 """
 
 import csv
@@ -26,11 +27,14 @@ from benchmarks.promise import (
     Key,
     arms_of,
     guide_of,
+    paired,
     plain_episodes,
     rows_of_task,
     scale_of,
     verdict,
 )
+from coil_rl.errors import file_of_a_run
+from coil_rl.files import LARGEST_NUMBERS, read_text
 from coil_rl.report.curves import frames_until, points
 from coil_rl.report.runs import RETURN, Run
 
@@ -144,7 +148,7 @@ def _row(
     task: str, key: Key, arms: dict[Key, Arm], compared: Mapping[str, Any], reference: Reference
 ) -> dict[str, Any]:
     """Return one row; what a method without a guide does not have is NaN."""
-    arm, alone = arms[key], arms[PPO, ALONE]
+    arm, alone = paired(arms[key], arms[PPO, ALONE])
     runs = list(arm.runs.values())
     row: dict[str, Any] = dict.fromkeys(COLUMNS, math.nan)
     row |= {name: compared[name] for name in COLUMNS if name in compared}
@@ -156,13 +160,27 @@ def _row(
     row["random"] = guide_of(arms, RANDOM)
     row["reference"] = reference.value(guide_of(arms, INTACT))
     row |= _learning(runs)
-    scale = scale_of(arms, alone)
+    scale = scale_of(arms, arms[PPO, ALONE])
     row |= {name: 100 * row[name] / scale for name in ("first", "lowest")}
     row["effort"] = effort(row["seeds"], row["frames"], reference)
     row |= {name: score(row[of], row) for name, of in SCORES.items()}
     row["fingerprint"] = fingerprint(runs[0].settings)
-    versions = json.loads((runs[0].folder / "versions.json").read_text())
-    return row | {name: versions[name] for name in VERSIONS}
+    return row | _versions(runs)
+
+
+def _versions(runs: Sequence[Run]) -> dict[str, str]:
+    """Return the versions of what runs were trained with; several ones side by side."""
+    found = []
+    for run in runs:
+        file = run.folder / "versions.json"
+        with file_of_a_run(file, "remove the run from the folder, or train it again"):
+            own = json.loads(read_text(file, LARGEST_NUMBERS))
+            found.append([str(own.get(name) or "") for name in VERSIONS])
+    columns = zip(*found, strict=True)
+    return {
+        name: " / ".join(dict.fromkeys(filter(None, column)))
+        for name, column in zip(VERSIONS, columns, strict=True)
+    }
 
 
 def score(value: float, row: Mapping[str, Any]) -> float:

@@ -2,14 +2,17 @@
 
 A configuration holds only a name for such an object, so that two of them look the same there. A
 fingerprint is the class of an object with a hash of its state: numbers, texts, arrays, and the code
-of functions. For an object whose state Python does not show it is the class alone.
+of functions and of classes, but for those of libraries. For an object whose state Python does not
+show it is the class alone.
 """
 
 import hashlib
 import inspect
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from functools import partial
+from functools import cached_property, partial
+from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -19,6 +22,7 @@ from torch import nn
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 NAMED = (type, ModuleType, BuiltinFunctionType)
+INSTALLED = {"site-packages", "dist-packages"}  # folders of libraries
 
 
 def fingerprint(thing: Any) -> str:
@@ -27,7 +31,7 @@ def fingerprint(thing: Any) -> str:
     Args:
         thing: it may be anything.
     """
-    title = _name(thing if isinstance(thing, FunctionType) else type(thing))
+    title = _name(thing if isinstance(thing, (FunctionType, type)) else type(thing))
     with suppress(Exception):  # code of somebody else, such as a property that raises
         digest = hashlib.sha256()
         for part in _parts(thing, {}):
@@ -77,12 +81,14 @@ def _parts(thing: Any, seen: dict[int, tuple[int, Any]]) -> Iterator[bytes]:
     if id(thing) in seen:
         yield f"number {seen[id(thing)][0]}".encode()
         return
-    # Whether two equal tuples are one object depends on how they came to be.
-    if not isinstance(thing, tuple):
+    # Whether two equal constants are one object depends on how they came to be.
+    if not isinstance(thing, (tuple, frozenset)):
         seen[id(thing)] = len(seen), thing
     yield _name(type(thing)).encode()
     if isinstance(thing, NAMED):
         yield _name(thing).encode()
+        for each in _of_class(thing) if isinstance(thing, type) else ():
+            yield from _parts(each, seen)
     elif isinstance(thing, torch.Tensor):
         flat = thing.detach().cpu().contiguous().flatten()
         yield f"{thing.dtype} {list(thing.shape)}".encode()
@@ -110,15 +116,69 @@ def _inside(thing: Any) -> list[Any]:
     if isinstance(thing, MethodType):
         return [thing.__self__, thing.__func__]
     if isinstance(thing, FunctionType):
-        outer = inspect.getclosurevars(thing)
-        named = (*PLAIN, FunctionType)  # other globals may be anything, such as a whole experiment
-        used = {name: each for name, each in outer.globals.items() if isinstance(each, named)}
-        return [thing.__code__, thing.__defaults__, thing.__kwdefaults__, outer.nonlocals, used]
+        outer = inspect.getclosurevars(thing).nonlocals
+        return [thing.__code__, thing.__defaults__, thing.__kwdefaults__, outer, _globals(thing)]
     if isinstance(thing, CodeType):
         return [thing.co_code, thing.co_consts, thing.co_names]
     if isinstance(thing, nn.Module):
         return [thing.state_dict(), *map(_settings, thing.modules())]
-    return [vars(thing)] if hasattr(thing, "__dict__") else []
+    return [type(thing), vars(thing)] if hasattr(thing, "__dict__") else [type(thing)]
+
+
+def _globals(function: FunctionType) -> dict[str, Any]:
+    """Return the globals of a user's function that it uses: data, functions, and user's classes.
+
+    Others may be anything, such as a whole experiment.
+    """
+    known = function.__globals__ if _is_of_user(function) else {}
+    used = {name: known[name] for name in sorted(_names(function.__code__)) if name in known}
+    return {
+        name: each
+        for name, each in used.items()
+        if isinstance(each, (FunctionType, type)) or _is_data(each)
+    }
+
+
+def _names(code: CodeType) -> set[str]:
+    """Return the names of globals and attributes in a code, and in the functions within."""
+    inner = [_names(each) for each in code.co_consts if isinstance(each, CodeType)]
+    return set(code.co_names).union(*inner)
+
+
+def _is_data(thing: Any) -> bool:
+    """Return whether something is a number, a text, an array, or a container of such."""
+    if isinstance(thing, Mapping):
+        return all(_is_data(each) for item in thing.items() for each in item)
+    if isinstance(thing, (list, tuple, set, frozenset)):
+        return all(map(_is_data, thing))
+    if isinstance(thing, np.ndarray):
+        return not thing.dtype.hasobject
+    return isinstance(thing, (*PLAIN, torch.Tensor))
+
+
+def _of_class(thing: type) -> Iterator[Any]:
+    """Yield the bases of a user's class, and its code and data with their names."""
+    if not _is_of_user(thing):
+        return
+    yield thing.__bases__
+    for name, each in vars(thing).items():
+        if isinstance(each, (staticmethod, classmethod)):
+            yield name, each.__func__
+        elif isinstance(each, property):
+            yield name, each.fget, each.fset
+        elif isinstance(each, cached_property):
+            yield name, each.func
+        elif isinstance(each, (FunctionType, type)) or (name[:2] != "__" and _is_data(each)):
+            yield name, each
+
+
+def _is_of_user(thing: FunctionType | type) -> bool:
+    """Return whether a function or class is neither of Python, of a library nor of this package."""
+    name = str(getattr(thing, "__module__", ""))
+    if name.partition(".")[0] in (*sys.stdlib_module_names, "coil_rl"):
+        return False
+    file = getattr(sys.modules.get(name), "__file__", None)
+    return file is None or not INSTALLED & set(Path(file).parts)
 
 
 def _settings(module: nn.Module) -> tuple[type, dict[str, Any]]:

@@ -26,20 +26,28 @@ class Policy:
         state = self.contract["state"]
         self.state = {s["input"]: np.full((1, *s["shape"]), s["first"], s["dtype"]) for s in state}
 
+    @np.errstate(all="ignore")  # what a type does not hold is refused
     def act(self, inputs: Any) -> Any:
         """Return the action for the inputs of the contract, by name."""
         feeds = dict(self.state)
         for entry in self.contract["inputs"]:
             given = np.asarray(inputs.get(entry["name"], ()))
-            if [*given.shape] != entry["shape"] or not np.isfinite(given).all():
-                raise ValueError(f"{entry['name']} must be {entry['shape']} finite numbers")
+            value = feeds[entry["name"]] = given.real[None].astype(entry["dtype"])
+            if (
+                [*given.shape] != entry["shape"]
+                or given.dtype.kind not in "fiub"
+                or not np.isfinite(value).all()
+                or (value.dtype.kind != "f" and (value != given).any())
+            ):
+                raise ValueError(
+                    f"{entry['name']} must be {entry['shape']} finite numbers of {entry['dtype']}"
+                )
             places = given - np.array(entry.get("lowest", given))
             if not ((places >= 0) & (places % 1 == 0) & (places < entry.get("choices", 1))).all():
                 raise ValueError(
                     f"{entry['name']} must be numbers of choices, {entry['choices']} from "
                     f"{entry['lowest']} on"
                 )
-            feeds[entry["name"]] = given[None].astype(entry["dtype"])
         names = ["action", *(each["output"] for each in self.contract["state"])]
         action, *state = self.session.run(names, {name: feeds[name] for name in self.read})
         self.state = dict(zip(self.state, state, strict=True))

@@ -220,7 +220,15 @@ def _row(value: Any, entry: Mapping[str, Any]) -> NDArray[Any]:
         raise ValueError(f"{entry['name']} holds a number that is not finite")
     if "choices" in entry:
         _chosen(entry["name"], given.reshape(shape), entry["choices"], entry["lowest"])
-    return given.astype(entry["dtype"]).reshape(1, *shape)
+    with np.errstate(all="ignore"):
+        converted = given.astype(entry["dtype"])
+    fits = np.isfinite(converted) if converted.dtype.kind == "f" else converted == given
+    if not fits.all():
+        raise ValueError(
+            f"{entry['name']} holds {given[~fits].tolist()[0]}, which is no number of "
+            f"{entry['dtype']}; give numbers as the env does"
+        )
+    return converted.reshape(1, *shape)
 
 
 def _chosen(

@@ -167,6 +167,7 @@ class _Combined(_Part):
 
     def __init__(self, transform: CombinedAction) -> None:
         self.transform = transform
+        self.reads = [transform.advice_key]
         if isinstance(transform, AdaptiveMixedAction):
             first = torch.full((1,), transform.low, dtype=transform.action_space.dtype)
             self.state = [Entry("agent_weight", (1,), first.dtype, first)]
@@ -183,6 +184,7 @@ class _Dropout(_Part):
 
     def __init__(self, transform: AdviceDropout) -> None:
         self.transform = transform
+        self.reads = [transform.advice_key]
 
     def observe(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
         shape, device = (*data.batch_size, 1), data[self.transform.advice_key].device
@@ -236,7 +238,8 @@ class PolicyStep(nn.Module):
     Args:
         controller: of a run; it must have acted before.
         inside: whether its guides are inside. Otherwise their actions are the input `guide_action`,
-            [B, n_guides, A] in the unit of the env, for choices the numbers of the choices.
+            [B, n_guides, A] in the unit of the env, for choices the numbers of the choices; guides
+            that nothing reads are left out.
 
     Attributes:
         inputs: entries of the env that the step reads, and perhaps the advice.
@@ -254,9 +257,13 @@ class PolicyStep(nn.Module):
         self.transforms = nn.ModuleList(_transforms(env.transform))
         self.parts = [_part(each, inside) for each in self.transforms]
         self.parts.append(_Memory(controller.policy, env))
+        advice = next((part for part in self.parts if isinstance(part, _Advice)), None)
+        if advice is not None and not inside:
+            others = [part for part in self.parts if part is not advice]
+            if ADVICE not in {*controller.policy.in_keys, *(k for p in others for k in p.reads)}:
+                self.parts, advice = others, None
         self.state = [entry for part in self.parts for entry in part.state]
         self.inputs = _inputs(plant, self.parts, controller.policy)
-        advice = next((part for part in self.parts if isinstance(part, _Advice)), None)
         self.guides = [] if advice is None else advice.transform.names
         if advice is not None and not inside:
             self.inputs.append(advice.outside)

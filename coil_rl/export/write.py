@@ -72,11 +72,12 @@ def export_policy(
             _check_possible(run, controller, outside)
     if step is None or parity is None:
         _check_possible(run, controller, str(outside))
-        say(f"export: the guide stays outside, its action is an input: {outside}")
         try:
             step, contents, parity = _written(controller, recording, inside=False)
         except NotExportableError as error:
             raise UserError(_impossible(run, str(error))) from error
+        if step.guides:
+            say(f"export: the guide stays outside, its action is an input: {outside}")
     contract = describe(
         run,
         controller,

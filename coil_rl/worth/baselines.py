@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from coil_rl.config.build import assemble, build_evaluation, env_maker
 from coil_rl.config.nodes import build_all
 from coil_rl.config.saved import read_config
+from coil_rl.errors import file_of_a_run
 from coil_rl.report import write_csv
 from coil_rl.run import checkpoint
 from coil_rl.run.curve import POLICIES
@@ -29,11 +30,14 @@ from coil_rl.worth.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, ZERO
 FILE = "baselines.csv"
 NAME = "baseline"  # column with the name
 REVERSED = {"_target_": "coil_rl.transforms.ScaledAdvice", "gain": -1.0}
+# Beside the delays of the env, which are kept: so names and memories are of their own.
 LATE = {
-    "observation_delay": {"_target_": "coil_rl.transforms.ObservationDelay"},
-    "action_delay": {"_target_": "coil_rl.transforms.ActionDelay"},
+    f"one_more_{name}": {"_target_": target, "min_lag": 1, "max_lag": 1, "memory_key": memory}
+    for name, target, memory in (
+        ("observation", "coil_rl.transforms.ObservationDelay", "one_more_late_observations"),
+        ("action", "coil_rl.transforms.ActionDelay", "one_more_late_actions"),
+    )
 }
-LAG = {"min_lag": 1, "max_lag": 1}  # steps
 
 
 class Acting(TensorDictModuleBase):
@@ -135,7 +139,7 @@ def measure_network(folder: Path, run: Path) -> None:
 
 
 def measure_delayed(name: str, run: Path | None, config: DictConfig) -> pd.DataFrame:
-    """Return the episodes of a policy with a step of delay on observation and action.
+    """Return the episodes of a policy with one more step of delay on observation and action.
 
     Args:
         name: of the policy.
@@ -143,9 +147,8 @@ def measure_delayed(name: str, run: Path | None, config: DictConfig) -> pd.DataF
         config: of a training with a guide, for these.
     """
     late = copy.deepcopy(config) if run is None else read_config(run, "run")
-    nodes = {key: node | LAG for key, node in LATE.items()}
     with open_dict(late):
-        late.disturb = OmegaConf.merge(late.disturb, nodes)
+        late.disturb = OmegaConf.merge(late.disturb, LATE)
         if name == OPPOSITE:
             late.degrade = OmegaConf.merge(late.degrade, {"opposite": REVERSED})
     evaluation = build_evaluation(late)
@@ -164,9 +167,17 @@ def read_baselines(folder: Path) -> pd.DataFrame:
 
     Args:
         folder: of the comparison.
+
+    Raises:
+        UserError: if a file is empty or damaged.
     """
-    files = [folder / FILE, folder / "first_network.csv"]
-    return pd.concat([pd.read_csv(file) for file in files if file.exists()], ignore_index=True)
+    tables = []
+    for file in (folder / FILE, folder / "first_network.csv"):
+        if file.exists():
+            with file_of_a_run(file, "remove it and compare again, which writes it anew"):
+                table = pd.read_csv(file)
+                tables.append(table.astype({NAME: str, "reward": float, "steps": int}))
+    return pd.concat(tables, ignore_index=True)
 
 
 def _rows(name: str, result: EvaluationResult) -> list[dict[str, Any]]:

@@ -29,6 +29,7 @@ from benchmarks.guide_benchmark.rows import (
     references,
 )
 from coil_rl.config.check import check_parts
+from coil_rl.errors import UserError
 from coil_rl.report.runs import read_runs
 
 pytest.importorskip("gymnasium.envs.classic_control")
@@ -208,8 +209,47 @@ def test_seeds_that_reach_the_guide_are_counted(made, tmp_path):
     assert ladder.count(" seeds)") == 1
 
 
+def test_page_names_the_returns_of_ppo_that_its_rows_are_compared_with(made, tmp_path):
+    runs = read_runs([made])
+    rows = benchmark_rows("pendulum", runs)
+    row = next(row for row in rows if row["arm"] == "intact")
+
+    def page(*others):
+        write_task(tmp_path, "pendulum", [*rows, *others], runs, 0)
+        return (tmp_path / "pendulum.md").read_text()
+
+    alike, sac = row | {"ppo": row["ppo"] + 0.01}, row | {"method": "ibrl", "ppo": -936.39}
+    assert "compared with PPO" not in page(alike)
+    said = "is compared with PPO of its own sweep and seeds: rows of"
+    assert f"{said} ibrl with -936.4; the others with 201.0.\n" in page(sac)
+    half = row | {"arm": "half", "ppo": 5.0}
+    assert f"{said} coil half with 5.0; rows of ibrl with -936.4; the others" in page(half, sac)
+
+
 def test_failures_are_those_with_the_advice_as_it_is(made):
     assert {row["failures"] for row in benchmark_rows("pendulum", read_runs([made]))} == {0.0}
+
+
+def test_row_is_of_the_seeds_that_ppo_has_too(made):
+    shutil.rmtree(made / "ppo_alone" / "2")
+    rows = benchmark_rows("pendulum", read_runs([made]))
+    assert {row["seeds"] for row in rows} == {2}
+    assert {row["end"] for row in rows} == {200.5, 250.5, 150.5}
+    assert {row["ppo"] for row in rows} == {200.5}
+
+
+def test_versions_are_those_of_all_runs_of_a_row(made):
+    versions = dict.fromkeys(VERSIONS, "1") | {"commit": "2"}
+    (made / "coil_intact" / "1" / "versions.json").write_text(json.dumps(versions))
+    rows = {row["arm"]: row for row in benchmark_rows("pendulum", read_runs([made]))}
+    assert (rows["intact"]["commit"], rows["intact"]["torch"]) == ("1 / 2", "1")
+    assert rows["random"]["commit"] == "1"
+
+
+def test_run_without_its_versions_is_one_sentence(made):
+    (made / "coil_intact" / "1" / "versions.json").unlink()
+    with pytest.raises(UserError, match=r"versions.json is damaged .*; remove the run"):
+        benchmark_rows("pendulum", read_runs([made]))
 
 
 def test_unknown_verdicts_have_a_column_only_if_there_are_any(tmp_path):

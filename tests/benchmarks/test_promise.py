@@ -8,6 +8,7 @@ from programs import TINY_ARM, called
 from run_folders import driven, make_run
 
 from benchmarks import promise
+from coil_rl.errors import UserError
 from coil_rl.report.runs import read_runs
 
 pytest.importorskip("gymnasium.envs.classic_control")
@@ -80,6 +81,55 @@ def test_reward_that_is_nan_is_no_part_of_a_mean(tmp_path, monkeypatch, capsys):
         printed(monkeypatch, capsys, tmp_path)
     assert refused.value.code == 2
     assert "the reward of ppo_alone is nan in 1 of 2 cases" in capsys.readouterr().err
+
+
+def changed(path, **settings):
+    """Change the configuration of a run."""
+    file = path / "config.yaml"
+    file.write_text(json.dumps(json.loads(file.read_text()) | settings))
+
+
+@pytest.mark.parametrize(
+    ("cases", "settings", "seed", "message"),
+    [
+        ("ab", {}, 0, "are both coil_intact with seed 0; remove one of them"),
+        ("cd", {}, 2, "has other cases than .*; train the runs of a task with the same cases"),
+        ("ab", {"budget": {"frames": 9}}, 2, "differ in budget.frames; keep those of one"),
+    ],
+    ids=["seed twice", "cases", "configuration"],
+)
+def test_runs_that_cannot_be_compared_are_refused(cases, settings, seed, message, tmp_path):
+    small(tmp_path, {"ppo_alone": 10.0, "coil_intact": 5.0}, seeds=2)
+    rows = [row for who in ("guide", "coil_intact") for row in driven(who, dict.fromkeys(cases, 9))]
+    changed(make_run(tmp_path / "further", "coil_intact", seed, rows), **settings)
+    with pytest.raises(UserError, match=message):
+        promise.rows_of_task("task", read_runs([tmp_path]))
+
+
+def test_all_columns_are_of_the_seeds_that_ppo_has_too(tmp_path):
+    small(tmp_path, {"ppo_alone": 10.0}, seeds=2)
+    for seed in range(5):
+        rows = driven("guide", {"a": 100.0 + seed, "b": 100.0})
+        rows += driven("coil_intact", {"a": 5.0 + seed, "b": 5.0})
+        make_run(tmp_path / str(seed), "coil_intact", seed, rows)
+    (row,) = promise.rows_of_task("task", read_runs([tmp_path]))
+    assert (row["seeds"], row["guide"], row["ppo"], row["end"]) == (2, 100.25, 15.0, 5.25)
+
+
+def test_arm_and_ppo_without_a_common_seed_are_refused(tmp_path):
+    small(tmp_path, {"ppo_alone": 10.0})
+    make_run(tmp_path / "1", "coil_intact", 1, driven("coil_intact", {"a": 1.0, "b": 1.0}))
+    with pytest.raises(UserError, match="coil_intact has no seed of ppo_alone; train both"):
+        promise.rows_of_task("task", read_runs([tmp_path]))
+
+
+def test_of_several_guides_the_best_one_is_compared(tmp_path):
+    small(tmp_path, {"ppo_alone": 10.0})
+    rows = driven("guide x", {"a": 500.0, "b": 500.0}) + driven("guide y", {"a": 5.0, "b": 5.0})
+    rows += driven("coil_intact", {"a": 90.0, "b": 90.0})
+    make_run(tmp_path / "two", "coil_intact", 0, rows)
+    (row,) = promise.rows_of_task("task", read_runs([tmp_path]))
+    assert row["guide"] == 500
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,22 @@ def test_advice_that_is_no_choice_is_refused(wrong, tmp_path):
         policy.act([2.0, 3.0], wrong)
 
 
+@pytest.mark.parametrize(
+    ("dtype", "wrong"),
+    [("float32", 1e300), ("float32", 1j), ("uint8", 300), ("uint8", -5), ("uint8", 0.5)],
+)
+def test_number_that_the_dtype_does_not_hold_is_refused(dtype, wrong, tmp_path):
+    def typed(contract):
+        contract["inputs"][0]["dtype"] = dtype
+
+    shutil.copy(SOURCE, write(tmp_path, typed) / SOURCE.name)
+    driver, policy = copied(tmp_path).Policy(), ExportedPolicy(tmp_path)
+    with pytest.raises(ValueError, match=rf"observation must be \[2\] finite numbers of {dtype}"):
+        driver.act({"observation": np.array([1, wrong]), "guide_action": [4.0]})
+    with pytest.raises(ValueError, match=rf"observation holds .*(no number of {dtype}|complex)"):
+        policy.act(np.array([1, wrong]), [4.0])
+
+
 def driven(env, act, most):
     """Return the sum of the rewards of one row, and its number of steps."""
     carrier, total = env.reset(), 0.0

@@ -83,6 +83,14 @@ def test_python_guide_is_an_input_in_the_unit_of_the_env(tmp_path, capsys):
     same_actions(run, policy, rooms(), heard)
 
 
+def test_python_guide_that_the_policy_does_not_read_is_absent(tmp_path, capsys):
+    run, policy = exported(tmp_path, "kickstart")
+    assert policy.contract["guide"] == {"place": "absent"}
+    assert [entry["name"] for entry in policy.contract["inputs"]] == ["observation"]
+    assert "stays outside" not in capsys.readouterr().out
+    same_actions(run, policy, rooms())
+
+
 @pytest.mark.parametrize("guide", [pytest.param("PI", marks=pytest.mark.slow), "proportional"])
 def test_guide_that_was_handed_over_is_said_to_be_no_policy(guide, tmp_path, capsys):
     folder = learned(
