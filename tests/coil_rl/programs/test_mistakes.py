@@ -443,6 +443,22 @@ def test_evaluation_of_guides_alone_refuses_what_an_agent_needs(started, change)
 
 
 @pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ("method=ppo", "its agent has no guide in its env"),
+        ("method=guide", "there is no agent"),
+        ("method=residual", "its env adds the actions of agent and guide"),
+        ("method=oil", "its learner has no value function"),
+    ],
+)
+def test_fallback_that_cannot_be_is_refused_before_the_training(started, change, reason):
+    sentence = refusal("train", *TINY, "evaluation.fallback=true", change)
+    assert sentence.startswith("evaluation.fallback=true has no effect on ")
+    assert reason in sentence
+    assert started == []
+
+
+@pytest.mark.parametrize(
     "words",
     [
         ["compare", "env=pendulum", "folder=LONG"],
