@@ -8,8 +8,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
-# Another kind of file than expected, or one that may not be used.
-IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP)
+# Another kind of file than expected, one that may not be used, or a name that no file can have.
+IN_THE_WAY = (
+    errno.EISDIR,
+    errno.ENOTDIR,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ELOOP,
+    errno.ENAMETOOLONG,
+)
 
 
 class UserError(Exception):

@@ -57,7 +57,8 @@ MEMORY, FILE = 4 * 2**30, 64 * 2**20  # bytes
 FAILURES = ("traceback", "hang", "crash", "sentences", "exit code", "outside", "half-written")
 
 TRACKS = "track=generated track.train.count=1 track.test.count=1"
-SHORT = "env.laps=1 env.time_limit=1 evaluation.repeats=1"
+LAP = "env.laps=1 env.time_limit=1"
+SHORT = f"{LAP} evaluation.repeats=1"
 CURVE = "evaluation.curve.num_envs=2 evaluation.curve.env.time_limit=1"
 TRAIN = (
     f"{SHORT} {CURVE} evaluation.gif=false "
@@ -116,7 +117,7 @@ READ = {  # files by use; others are damaged now and then
 }
 ON_TRACKS = [
     f"train {TRAIN} {ONCE}",
-    f"evaluate {SHORT}",
+    f"evaluate {LAP}",
     "evaluate evaluation.repeats=1 run=runs/coil",
 ]
 OF_RECORDINGS = [
@@ -131,13 +132,13 @@ CLASSIFIER = (
     " +env.perception.classifier.path=cones.json"
 )
 OF_CLASSIFIER = [
-    f"evaluate {SHORT} env=simulated_robot {CLASSIFIER}",
+    f"evaluate {LAP} env=simulated_robot {CLASSIFIER}",
     f"replay recording=drive.mcap {CLASSIFIER}",
 ]
 COMMANDS = {  # whose arguments are changed; several under a name are drawn from
     "train": [f"train {TRACKS} {TRAIN} {ONCE} method=coil"],
     "distill": [f"distill {TRACKS} {SHORT} {CURVE} {PROXY}"],
-    "evaluate": [USES["evaluate"], f"evaluate {TRACKS} {SHORT}"],
+    "evaluate": [USES["evaluate"], f"evaluate {TRACKS} {LAP}"],
     "listen": [USES["listen"]],
     "replay": [USES["replay"]],
     "report": [USES["report"], USES["reports"]],

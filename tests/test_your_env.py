@@ -27,7 +27,7 @@ SHELL = "".join(block for language, block in BLOCKS if not language)
 COMMANDS = [shlex.split(line, comments=True) for line in SHELL.splitlines()]
 TOY = {
     "coil-train": TINY,
-    "coil-evaluate": ["evaluation.cases=2", "evaluation.repeats=1"],
+    "coil-evaluate": ["evaluation.cases=2"],
     "coil-listen": ["evaluation.repeats=1", "donors=2"],
     "coil-report": [],
     "coil-distill": PROXY,

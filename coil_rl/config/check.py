@@ -38,6 +38,7 @@ from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
+from coil_rl.run.fallback import check_cases_of_guide, critic_beside_guide, no_effect
 from coil_rl.run.folder import weights_file
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
 from coil_rl.run.run import HANDED_OVER
@@ -133,7 +134,12 @@ def _check_tuning(config: DictConfig) -> None:
 
 
 def _check_delivery(config: DictConfig, *, has_agent: bool) -> None:
-    """Raise a `UserError` if a run would evaluate another policy than it hands over."""
+    """Raise a `UserError` if a run would evaluate another policy than it hands over.
+
+    One without an agent hands over none that could fall back to its guide.
+    """
+    if config.evaluation.fallback and (not has_agent or config.method.search):
+        raise UserError(no_effect(Path(config.run_dir), "there is no agent"))
     if config.delivery == "tested" and not has_agent:
         raise UserError(
             f"delivery=tested has no effect: method={config.method.name} trains no policy; leave "
@@ -298,6 +304,9 @@ def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
     check_proxies(config, guides_without_parameters(guides))
     untrained = guides_with_untrained_proxies(config) if guides else None
     learner = build.build_learner(config, env, untrained)
+    if config.evaluation.fallback:
+        check_cases_of_guide(make_env, Path(config.run_dir))
+        critic_beside_guide(env, learner, Path(config.run_dir))
     _check_init(config, learner)
     _check_batch(config, learner)
     _check_validation(config, learner)

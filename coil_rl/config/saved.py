@@ -55,7 +55,7 @@ def read_config(
             made from parts.
     """
     path = folder / CONFIG
-    if not path.is_file():
+    if not (is_begun(folder) and path.is_file()):
         raise UserError(f"{key}={folder} is not the folder of a run: it has no config.yaml")
     try:
         values = read_yaml(path)

@@ -159,7 +159,8 @@ def _unusable_file(error: OSError) -> str:
     """Return the message for a file that cannot be read or written."""
     name = error.filename or "the output"
     if error.errno == errno.ENAMETOOLONG:
-        return f"{Path(name).name[:60]}... cannot be used ({error.strerror}); choose a shorter name"
+        longest = max(Path(name).parts, key=len)  # the last one may be that of a file in it
+        return f"{longest[:60]}... cannot be used ({error.strerror}); choose a shorter name"
     if error.errno in IN_THE_WAY:
         return (
             f"{name} cannot be used ({error.strerror}); "

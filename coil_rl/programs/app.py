@@ -144,6 +144,19 @@ def check_used(used: Iterable[str], reason: str) -> None:
             )
 
 
+def check_evaluated(unused: Iterable[str], reason: str) -> None:
+    """Raise a `UserError` for an override of `evaluation` that has no effect.
+
+    Args:
+        unused: keys of `evaluation` that have none.
+        reason: why they have none.
+    """
+    for key, text in overrides():
+        first, *rest = key.split(".")
+        if first == "evaluation" and rest and rest[0] in unused:
+            raise UserError(f"{text} has no effect: {reason}; leave it out")
+
+
 def check_folder(key: str) -> None:
     """Raise a `UserError` for hydra.run.dir in a program whose files go elsewhere.
 

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from coil_rl.errors import UserError, file_of_a_run
+from coil_rl.programs import app
 from coil_rl.run.folder import COMMAND, is_begun, versions
 
 HELP = """coil-info: the versions that a bug report needs, or the command that made a run.
@@ -42,19 +43,16 @@ def main() -> None:
     if arguments in (["--help"], ["-h"]):
         print(HELP)
         return
-    try:
+    with app.program("info"):
         if not arguments:
             result = versions()
         elif len(arguments) == 1 and arguments[0].startswith("run="):
             result = describe(Path(arguments[0].removeprefix("run=")).expanduser())
         else:
             raise UserError(f"{' '.join(arguments)}: coil-info takes nothing, or run=FOLDER")
-    except UserError as error:
-        print(f"info: {error}", file=sys.stderr)
-        sys.exit(2)
-    width = max(map(len, result))
-    for name, value in result.items():
-        print(f"{name:{width}}  {value}")
+        width = max(map(len, result))
+        for name, value in result.items():
+            print(f"{name:{width}}  {value}")
 
 
 if __name__ == "__main__":

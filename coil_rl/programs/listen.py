@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 
 from coil_rl.errors import UserError
 from coil_rl.programs import app
+from coil_rl.programs.evaluate import OF_TRAINING, configured
 
 if TYPE_CHECKING:
     from tensordict.nn import TensorDictModuleBase
@@ -34,7 +35,6 @@ def listen(config: DictConfig) -> None:
     from coil_rl.files import write_text
     from coil_rl.listening import WholeEpisode
     from coil_rl.listening.survey import table_by_section
-    from coil_rl.programs.evaluate import configured
     from coil_rl.report import write_csv
 
     torch.set_num_threads(config.threads)
@@ -164,6 +164,7 @@ def check(config: DictConfig) -> None:
     app.check_used(
         ("run", "track", "evaluation", "donors"), f"run={config.run} has its own configuration"
     )
+    app.check_evaluated(OF_TRAINING, "only a training reads it")
     app.check_run(config)
 
 

@@ -107,30 +107,14 @@ def make_fallback(
         device: of the critic.
 
     Raises:
-        UserError: for a run without advice, critic or cases, or whose env does not execute the
-            advice as it is.
+        UserError: for a run without agent, cases, advice or critic, or whose env does not execute
+            the advice as it is.
     """
     if policy is None or make_learner is None:
-        raise UserError(_no_effect(folder, "there is no agent"))
-    if SELECTION not in make_env.sizes:
-        raise UserError(_no_effect(folder, f"it has no evaluation.curve.cases.{SELECTION}"))
+        raise UserError(no_effect(folder, "there is no agent"))
+    check_cases_of_guide(make_env, folder)
     env = make_env(make_env.sizes[SELECTION], SELECTION)
-    learner = make_learner(env)
-    if "guide_action" not in env.observation_spec:
-        raise UserError(
-            _no_effect(folder, "its agent has no guide in its env; train it with method=coil")
-        )
-    if any(isinstance(part, (MixedAction, ResidualAction)) for part in env.modules()):
-        raise UserError(
-            _no_effect(
-                folder, "its env adds the actions of agent and guide, so the guide cannot act alone"
-            )
-        )
-    critic = learner.critic
-    if critic is None:
-        raise UserError(
-            _no_effect(folder, "its learner has no value function; train it with learner=ppo")
-        )
+    critic = critic_beside_guide(env, make_learner(env), folder)
     newest = folder / checkpoint.NEWEST
     with file_of_a_run(newest, "train again"):
         critic.load_state_dict(checkpoint.load(newest, device)["learner"]["critic"])
@@ -143,5 +127,47 @@ def make_fallback(
     return Fallback(policy, critic, guide, leave, back)
 
 
-def _no_effect(folder: Path, problem: str) -> str:
+def check_cases_of_guide(make_env: EnvMaker, folder: Path) -> None:
+    """Raise a `UserError` if there are no cases in which the values of the guide's states are seen.
+
+    Args:
+        make_env: makes the envs of the run.
+        folder: of the run, for the message.
+    """
+    if SELECTION not in make_env.sizes:
+        raise UserError(no_effect(folder, f"it has no evaluation.curve.cases.{SELECTION}"))
+
+
+def critic_beside_guide(env: EnvBase, learner: Learner, folder: Path) -> TensorDictModuleBase:
+    """Return the critic that decides where the guide acts.
+
+    Args:
+        env: of the run.
+        learner: of the run, trained or not.
+        folder: of the run, for the message.
+
+    Raises:
+        UserError: for a run without advice or critic, or whose env does not execute the advice as
+            it is.
+    """
+    if "guide_action" not in env.observation_spec:
+        raise UserError(
+            no_effect(folder, "its agent has no guide in its env; train it with method=coil")
+        )
+    if any(isinstance(part, (MixedAction, ResidualAction)) for part in env.modules()):
+        raise UserError(
+            no_effect(
+                folder, "its env adds the actions of agent and guide, so the guide cannot act alone"
+            )
+        )
+    critic: TensorDictModuleBase | None = learner.critic
+    if critic is None:
+        raise UserError(
+            no_effect(folder, "its learner has no value function; train it with learner=ppo")
+        )
+    return critic
+
+
+def no_effect(folder: Path, problem: str) -> str:
+    """Return the sentence for a run that cannot fall back; `problem` is why."""
     return f"evaluation.fallback=true has no effect on {folder}: {problem}; leave it out"

@@ -1,5 +1,6 @@
 """The folder of a run: its lock, configuration and software versions."""
 
+import errno
 import json
 import os
 import platform
@@ -103,7 +104,12 @@ def check_same(
 
 def is_begun(folder: Path) -> bool:
     """Return whether a folder holds a run, finished or not."""
-    return (folder / CONFIG).exists()
+    try:
+        return (folder / CONFIG).exists()
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:  # no folder can have this name
+            raise
+        return False
 
 
 def is_evaluated(folder: Path) -> bool:

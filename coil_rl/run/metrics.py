@@ -80,11 +80,28 @@ class Metrics:
         self.logger = None
 
     def append(self, row: dict[str, float]) -> None:
-        """Log a row; `frames` is the step of the logger."""
+        """Log a row; `frames` is the step of the logger.
+
+        The first row has all columns. What a later one lacks is NaN in it.
+
+        Args:
+            row: numbers by the names of their columns, in any order.
+
+        Raises:
+            UserError: for a name that the first row does not have.
+        """
+        columns = list(self.rows[0] if self.rows else row)
+        new = [name for name in row if name not in columns]
+        if new:
+            raise UserError(
+                f"{self.path} has no column {new[0]}: the first update did not return it; return "
+                "the same names in each update, NaN where there is no number"
+            )
+        row = dict.fromkeys(columns, math.nan) | row
         self.rows.append(row)
         first = not self.path.exists()
         with self.path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, list(row))
+            writer = csv.DictWriter(file, columns)
             if first:
                 writer.writeheader()
             writer.writerow(row)

@@ -53,7 +53,7 @@ def test_contract_says_what_the_numbers_mean(exported):
 
 def test_evaluation_of_the_file_is_that_of_the_policy(exported, tmp_path):
     folder, _ = exported
-    words = ["evaluation.cases=3", "evaluation.repeats=1"]
+    words = ["evaluation.cases=3"]
     of_file = called(
         "evaluate", RUN, f"exported={folder}", *words, f"hydra.run.dir={tmp_path / 'file'}"
     ).stdout
@@ -67,7 +67,7 @@ def test_evaluation_of_the_file_is_that_of_the_policy(exported, tmp_path):
 
 def test_file_is_a_guide_of_its_env_only(exported, tmp_path):
     folder, _ = exported
-    words = ["guide=exported", f"guide.exported.file={folder}", "evaluation.repeats=1"]
+    words = ["guide=exported", f"guide.exported.file={folder}"]
     words.append(f"hydra.run.dir={tmp_path / 'results'}")
     done = called("evaluate", "env=pendulum", "evaluation.cases=2", *words)
     assert "mean test reward" in done.stdout

@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from programs import called, command, environment
 
+import coil_rl
 import coil_rl.run.run  # noqa: F401  before `started` replaces functions that it imports
 from coil_rl.config.build import build_learner, env_maker
 from coil_rl.config.check import check
@@ -411,6 +412,73 @@ def test_override_of_what_a_run_provides_is_refused(started, run, name, change):
         f"{change} has no effect: run={run} has its own configuration; "
         "what can be changed is run, " in sentence
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "reason"),
+    [
+        ("evaluate", "evaluation.curve.num_envs=3", "only a training reads it"),
+        ("evaluate", "evaluation.guides=ends", "only a training reads it"),
+        ("evaluate", "evaluation.sections=null", "only coil-listen reads it"),
+        ("listen", "evaluation.curve.num_envs=3", "only a training reads it"),
+    ],
+)
+def test_evaluation_of_a_run_refuses_what_it_does_not_read(started, run, name, change, reason):
+    sentence = refusal(name, *TINY[2:], f"run={run}", change)
+    assert sentence == f"{change} has no effect: {reason}; leave it out"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "evaluation.policy=best",
+        "evaluation.fallback=true",
+        "evaluation.repeats=9",
+        "+evaluation.advice.x=1",
+        "evaluation.curve.points=2",
+    ],
+)
+def test_evaluation_of_guides_alone_refuses_what_an_agent_needs(started, change):
+    assert f"{change} has no effect: " in refusal("evaluate", *TINY[2:], change)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ("method=ppo", "its agent has no guide in its env"),
+        ("method=guide", "there is no agent"),
+        ("method=residual", "its env adds the actions of agent and guide"),
+        ("method=oil", "its learner has no value function"),
+    ],
+)
+def test_fallback_that_cannot_be_is_refused_before_the_training(started, change, reason):
+    sentence = refusal("train", *TINY, "evaluation.fallback=true", change)
+    assert sentence.startswith("evaluation.fallback=true has no effect on ")
+    assert reason in sentence
+    assert started == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["compare", "env=pendulum", "folder=LONG"],
+        ["compare", "env=pendulum", "guide=LONG"],
+        ["report", "folder=LONG"],
+        ["train", "resume=LONG"],
+        ["train", *TINY, "init=LONG"],
+        *([name, "run=LONG"] for name in ("evaluate", "listen", "drive", "export", "info")),
+    ],
+    ids=lambda words: f"{words[0]} {words[-1]}",
+)
+def test_name_that_no_file_can_have_is_refused(words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name, *arguments = (word.replace("LONG", 300 * "x") for word in words)
+    assert 60 * "x" in refusal(name, *arguments)
+
+
+def test_run_with_a_name_that_no_file_can_have_is_refused():
+    with pytest.raises(UserError, match="is not the folder of a run"):
+        coil_rl.open_run(300 * "x")
 
 
 @pytest.mark.parametrize(

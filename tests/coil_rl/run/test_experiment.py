@@ -308,6 +308,22 @@ def test_truncated_metrics_end_like_uninterrupted_ones(tmp_path, count, torn):
     assert stopped.read_bytes() == whole.read_bytes()
 
 
+def test_columns_of_the_first_row_decide(tmp_path):
+    path = tmp_path / "metrics.csv"
+    metrics = write_metrics(path, [{"frames": 0, "loss": 1.0, "kl": 2.0}])
+    metrics.append({"kl": 3.0, "loss": 4.0, "frames": 1})
+    metrics.append({"frames": 2, "kl": 5.0})
+    assert path.read_text().splitlines() == [
+        "frames,loss,kl",
+        "0,1.0,2.0",
+        "1,4.0,3.0",
+        "2,nan,5.0",
+    ]
+    with pytest.raises(UserError, match="has no column entropy: the first update did not return"):
+        metrics.append({"frames": 3, "entropy": 1.0})
+    assert len(path.read_text().splitlines()) == 4
+
+
 def test_missing_rows_are_refused(tmp_path):
     write_metrics(tmp_path / "metrics.csv", ROWS[:2])
     with pytest.raises(UserError, match="has 2 of the 3 rows that belong to the checkpoint"):
