@@ -19,7 +19,7 @@ from torch import nn
 
 from coil_rl.config import load
 from coil_rl.config.build import build_guides, build_learner, env_maker
-from coil_rl.config.fingerprint import fingerprint_with_code
+from coil_rl.config.fingerprint import fingerprint as fingerprint_of_object
 from coil_rl.config.given import kept_objects
 from coil_rl.config.nodes import find_target
 from coil_rl.config.schema import TrainConfig, fingerprint
@@ -83,7 +83,7 @@ def _hash_of_user(config: DictConfig, name: str) -> list[str]:
                 things.append(load_controller(guide.of))
     if not things:
         return []
-    text = " ".join(map(fingerprint_with_code, things))
+    text = " ".join(map(fingerprint_of_object, things))
     return [hashlib.sha256(text.encode()).hexdigest()[:10]]
 
 

@@ -40,28 +40,6 @@ def fingerprint(thing: Any) -> str:
     return title
 
 
-def fingerprint_with_code(thing: Any) -> str:
-    """Return a fingerprint that differs after a change in the code of the class, too.
-
-    Args:
-        thing: a class, a function or an object.
-    """
-    kind = thing if isinstance(thing, type) else type(thing)
-    code = {}
-    for each in kind.__mro__:
-        if each.__module__ == kind.__module__:  # other modules are libraries, as a rule
-            code[each.__name__] = [*map(_behind, vars(each).items())]
-    return fingerprint([thing, code])
-
-
-def _behind(item: tuple[str, Any]) -> tuple[str, Any]:
-    """Return the name and the function or plain value of an attribute of a class."""
-    name, value = item
-    value = getattr(value, "__func__", getattr(value, "fget", value))
-    own = isinstance(value, (*PLAIN, FunctionType)) and name != "__firstlineno__"
-    return name, value if own else None
-
-
 def _name(thing: Any) -> str:
     """Return the qualified name of a class, function or module."""
     name = getattr(thing, "__qualname__", thing.__name__)

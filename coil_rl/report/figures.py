@@ -10,13 +10,14 @@ from typing import Any
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import read_file
 from coil_rl.report import style
-from coil_rl.report.comparison import SAME_RETURN, Comparison
+from coil_rl.report.comparison import Comparison
 from coil_rl.report.curves import draw_curve_grid, draw_learning_curves
 from coil_rl.report.guide_use import draw_guide_use, guide_use
 from coil_rl.report.html import Figure, moving, svg
 from coil_rl.report.intervals import draw_intervals, driver_intervals
 from coil_rl.report.runs import RESTORE, Run
 
+SAME_LINE = 1e-6  # relative difference of the returns of one guide; the rest is rounding
 MAX_CURVES = 8  # in one plot
 FILMS = ("episode.webp", "lines.gif")
 LARGEST_FILM = 2_000_000  # bytes
@@ -92,7 +93,7 @@ def _learning_curves(runs: Sequence[Run], strokes: Mapping[str, style.Stroke]) -
         if returns:
             guides[label] = sum(returns) / len(returns)
     lines = list(guides.values())
-    several_guides = not all(math.isclose(line, lines[0], rel_tol=SAME_RETURN) for line in lines)
+    several_guides = not all(math.isclose(line, lines[0], rel_tol=SAME_LINE) for line in lines)
     if several_guides or len(curves) > MAX_CURVES:
         return partial(draw_curve_grid, curves, strokes=strokes, guides=guides)
     guide = {"guide": next(iter(guides.values()))} if guides else {}
