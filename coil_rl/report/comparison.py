@@ -519,9 +519,9 @@ def _same_returns(one: Array, other: Array) -> bool:
 
     The allowed difference is small beside the range of these returns, so that it fits any unit and
     any centre, and large beside what the rounding of a batch of another size makes of one guide:
-    2e-6 of the range in the cone world.
+    2e-6 of the range in the cone world. A single case has no range but its own return.
     """
-    both = np.concatenate([one, other])
+    both = np.concatenate([one, other, [0.0]]) if len(one) == 1 else np.concatenate([one, other])
     both = both[np.isfinite(both)]
     tolerance = SAME_RETURN * float(np.ptp(both)) if both.size else 0.0
     return np.allclose(one, other, rtol=1e-7, atol=tolerance, equal_nan=True)

@@ -169,6 +169,14 @@ def test_guides_are_told_apart_beside_a_policy_that_diverged(driver, tmp_path):
     assert sorted(guides) == ["guide (a)", "guide (b)", "guide (c)"]
 
 
+def test_guide_of_a_single_case_is_one_guide_too(tmp_path):
+    for label, reward in {"a": 600.0, "b": 601.0, "c": 600.001}.items():
+        rows = driven("guide", {"x": reward}) + driven(label, {"x": 700.0})
+        make_run(tmp_path / label, label, 0, rows)
+    guides = [name for name, _ in table(tmp_path) if name.startswith("guide")]
+    assert sorted(guides) == ["guide (a, c)", "guide (b)"]
+
+
 def test_guide_without_a_number_in_a_case_is_one_guide(tmp_path):
     for index, label in enumerate("ab"):
         guide = driven("guide", {"a": 500.0, "b": math.nan})
