@@ -49,7 +49,8 @@ def train(
     Args:
         env: the id of a Gymnasium env, such as "CartPole-v1" or "PACKAGE:ID"; the name of a file in
             conf/env, such as "cone_track"; a class or function that makes a Gymnasium env, or a
-            TorchRL env without batch; or a `Run`, which is trained as it is.
+            TorchRL env without batch; or a `Run`, which is trained as it is: of the other arguments
+            it takes `frames` alone.
         guide: a class, an object with `act(observation)`, a function, a network; the import path
             "PACKAGE.MODULE:NAME" of one; the name of a file in conf/guide, such as "spline"; a
             `Controller` of another run; or None.

@@ -193,8 +193,8 @@ class Run:
                 refer to the new length.
 
         Raises:
-            UserError: if another process uses the folder, if it holds another run, or if the run is
-                longer than `frames`.
+            UserError: if another process uses the folder, if it holds another run, if the run is
+                longer than `frames`, or if that is no whole number.
         """
         with locked(self.folder):
             if frames is not None:
