@@ -452,6 +452,7 @@ class Fuzzer:
             _limit(case, place)
             os.environ |= {
                 "HOME": str(place / "here"),
+                "XDG_CACHE_HOME": str(place.parent / "cache"),
                 "MPLCONFIGDIR": str(place / "here" / "outputs"),
                 "TMPDIR": str(place / "here" / "outputs"),
             }

@@ -381,7 +381,10 @@ class Jobs:
         say(f"{self.name}: {line}; the other jobs go on", error=True)
         with contextlib.suppress(OSError):  # it is empty
             Path(hydra_config.runtime.output_dir).rmdir()
-        with Path(hydra_config.sweep.dir, FAILED_JOBS).open("a", encoding="utf-8") as file:
+        path = Path(hydra_config.sweep.dir, FAILED_JOBS)
+        # Another program of the same sweep, all of whose jobs failed, may have removed the folder.
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:
             file.write(f"{line}\n")
         return math.nan
 
@@ -390,7 +393,8 @@ class Jobs:
         path = Path(_sweep[0], FAILED_JOBS) if _sweep else None
         if path is None or not path.is_file():
             return
-        lines = path.read_text(encoding="utf-8").splitlines()
+        # Several programs may do the same sweep, and a job fails in each of them.
+        lines = list(dict.fromkeys(path.read_text(encoding="utf-8").splitlines()))
         count = "1 job" if len(lines) == 1 else f"{len(lines)} jobs"
         refuse(
             self.name,

@@ -3,6 +3,7 @@
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import time
@@ -10,6 +11,7 @@ import time
 import pytest
 from programs import TINY, called, command, environment, program
 
+from coil_rl.programs.app import Jobs
 from coil_rl.run import checkpoint, stopping
 from coil_rl.run.folder import is_evaluated, locked
 
@@ -118,6 +120,22 @@ def test_sweep_whose_jobs_are_all_refused_leaves_no_folder(tmp_path):
     error = called("train", *sweep, cwd=tmp_path, code=2).stderr
     assert "2 jobs of this sweep failed" in error
     assert not (tmp_path / "sweep").exists()
+
+
+@pytest.mark.parametrize("removed", [False, True])
+def test_jobs_that_fail_in_two_programs_of_a_sweep_count_once(tmp_path, monkeypatch, removed):
+    fail, folder = Jobs.fail, tmp_path / "sweep"
+
+    def fail_after_another_program(jobs, error):
+        fail(jobs, error)
+        if removed:
+            shutil.rmtree(folder)
+        return fail(jobs, error)
+
+    monkeypatch.setattr(Jobs, "fail", fail_after_another_program)
+    sweep = ["-m", *SMALL, "learner.gamma=7", "hydra.sweep.dir=sweep"]
+    error = called("train", *sweep, cwd=tmp_path, code=2).stderr
+    assert "train: 1 job of this sweep failed: job 0" in error
 
 
 def test_job_that_another_process_works_on_is_left_to_it(tmp_path):
