@@ -10,6 +10,7 @@ from typing import Any
 from coil_rl.measures import Measure
 from coil_rl.report.runs import FALLBACK, Run
 
+CALLED_SEED = ("seed", "random_state")  # ends of keys; the second is of scikit-learn
 # Keys, or parents of keys, on which the numbers of a run do not depend, or only by rounding.
 IRRELEVANT = (
     "seed",
@@ -197,7 +198,7 @@ def _follows_seed(key: str, values: Sequence[Any], runs: Sequence[Run]) -> bool:
 
     Other values may equal the seed by chance, as a flag and the seeds 0 and 1.
     """
-    return key.endswith("seed") and all(
+    return key.endswith(CALLED_SEED) and all(
         value == run.seed and not isinstance(value, bool)
         for value, run in zip(values, runs, strict=True)
     )

@@ -65,6 +65,7 @@ def test_runs_that_differ_are_divided_and_the_key_is_named(runs, one, two, names
     [
         ({}, {}),
         ({"learner": {"seed": 0}}, {"learner": {"seed": 1}}),
+        ({"learner": {"random_state": 0}}, {"learner": {"random_state": 1}}),
         ({"run_dir": "a", "existing": "refuse"}, {"run_dir": "b", "existing": "resume"}),
         ({"device": "cpu", "threads": 1}, {"device": "cuda", "threads": 4}),
         ({"logger": {"a": 1}}, {"logger": None}),
