@@ -57,7 +57,7 @@ HYDRA_FILES = (
     "hydra.yaml",
     "overrides.yaml",
 )  # in the subfolder hydra.output_subdir of a job
-_new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
+_new_folders: list[Path] = []  # made for this run or sweep, the innermost first
 _interrupts: list[int] = []  # signals of this program
 _sweep: list[str] = []  # folder of the sweep of this program, if it is one
 MOST_PROCESSES = 64  # of joblib, or four for each processor if those are more
@@ -99,7 +99,12 @@ def _record(config: DictConfig, key: str) -> None:
         folder /= str(OmegaConf.select(config, "hydra.output_subdir") or "")
     except OmegaConfBaseException:
         return  # Hydra raises the same error next
-    _new_folders[:] = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
+    _new_folders[:] = _missing(folder)
+
+
+def _missing(folder: Path) -> list[Path]:
+    """Return what does not exist of a folder and those that it is in, the innermost first."""
+    return [place for place in (folder, *folder.parents) if not os.path.exists(place)]
 
 
 def overrides() -> list[tuple[str, str]]:
@@ -260,6 +265,8 @@ def _do(
         config.existing = "resume"  # so that a sweep goes on by the same command
     keep_written(config, str(HydraConfig.get().job.config_name), *typed())
     trust_packages(config.get("trust", []), config)
+    if config.get("run_dir"):  # which the check makes, if it is not Hydra's own
+        _new_folders[:0] = _missing(Path(config.run_dir).absolute())
     check(config)
     programs.imported()
     if _interrupts:

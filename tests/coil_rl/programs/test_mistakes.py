@@ -442,6 +442,13 @@ def test_evaluation_of_guides_alone_refuses_what_an_agent_needs(started, change)
     assert f"{change} has no effect: " in refusal("evaluate", *TINY[2:], change)
 
 
+def test_refused_program_leaves_no_folder_of_its_own_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drive.mcap").touch()
+    words = ["recording=drive.mcap", "run_dir=new/er"]  # it is opened after the check
+    assert "drive.mcap" in refusal("replay", *words)
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
