@@ -75,7 +75,12 @@ class ActionRange:
         """
         if self.whole != other.whole or self.low.shape != other.low.shape:
             return False
-        return torch.allclose(self.low, other.low) and torch.allclose(self.high, other.high)
+        # Of the distance between the bounds, which may be in any unit.
+        rounding = 1e-6 * (self.high - self.low).nan_to_num(posinf=0)
+        sides = ((self.low, other.low), (self.high, other.high))
+        return all(
+            bool(((own == their) | ((own - their).abs() <= rounding)).all()) for own, their in sides
+        )
 
 
 class ActionSpace:

@@ -251,6 +251,12 @@ def test_actions_with_other_numbers_have_other_ranges(name):
     assert [each for each in ranges if ranges[name].same_as(ranges[each])] == [name]
 
 
+def test_ranges_are_told_apart_in_any_unit_and_equal_up_to_rounding():
+    unit = ActionSpace(Bounded(-1e-9, 1e-9, (2, 1)), 1).range
+    assert not unit.same_as(ActionSpace(Bounded(0.0, 1e-9, (2, 1)), 1).range)
+    assert unit.same_as(ActionSpace(Bounded(-1e-9, 1e-9 * (1 + 1e-7), (2, 1)), 1).range)
+
+
 def test_one_hot_choices_are_those_of_an_index():
     assert ActionSpace(OneHot(3, (2, 3)), 1).range.same_as(
         ActionSpace(Categorical(3, (2,)), 1).range
