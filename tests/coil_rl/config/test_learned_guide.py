@@ -80,7 +80,14 @@ def test_run_without_an_agent_is_refused(tmp_path):
         LearnedGuide(str(run))
 
 
-@pytest.mark.parametrize("options", [["guide=recorded", "method=coil"], ["network=gru"]])
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["guide=recorded", "method=coil"],
+        ["guide=spline_memory", "method=coil"],
+        ["network=gru"],
+    ],
+)
 def test_policy_with_a_past_acts_as_in_its_own_env(options, tmp_path):
     (tmp_path / "actions.csv").write_text("0.1\n0.2\n-0.3\n")
     if "guide=recorded" in options:
