@@ -28,7 +28,8 @@ class Measure:
         entry: key of one number a row, after a step; those of several agents are summed.
         reduction: of the numbers of the steps: their `mean`, `sum`, `min`, `max`, the `last` one;
             whether `any` is not 0, their `count`, or the mean of those that are not 0
-            (`mean_nonzero`). Without a number, a mean is NaN.
+            (`mean_nonzero`). Without a number, a mean is NaN. A NaN in a step makes means and sums
+            NaN; for the others it is no number.
         where: key of a flag; only the steps with it count.
         at_least: makes the measure a flag: whether the number is at least this.
         at_most: makes the measure a flag: whether the number is at most this.

@@ -137,7 +137,9 @@ class Totals:
                 mask = mask & torch.stack(
                     [running if m.where is None else after[m.where].reshape(-1) for m in group]
                 )
-            if reduction in ("any", "count", "mean_nonzero"):
+            if reduction in ("any", "count"):
+                mask = mask & (values.nan_to_num() != 0)  # nothing happens where no number is
+            elif reduction == "mean_nonzero":
                 mask = mask & (values != 0)
             extreme = reduction in ("min", "max", "last")
             empty = torch.full_like(values, torch.nan if extreme else 0.0), torch.zeros_like(values)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from any_env import AnyEnv
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Unbounded
 from torchrl.modules import RandomPolicy
@@ -156,6 +157,16 @@ REDUCE = {
     "mean_nonzero": lambda x: x[x != 0].mean() if x.any() else math.nan,
 }
 OF_NOTHING = dict.fromkeys(REDUCTIONS, math.nan) | {"sum": 0, "any": False, "count": 0}
+
+
+def test_nan_is_no_event_and_shows_in_means():
+    totals = Totals({reduction: Measure("number", reduction) for reduction in REDUCTIONS})
+    for number in (0.0, math.nan, 0.0):
+        after = TensorDict({"number": torch.tensor([[number]])}, [1])
+        totals.add(after, torch.ones(1, 1, dtype=torch.bool))
+    found = {name: value.item() for name, value in totals.results().items()}
+    assert (found["any"], found["count"], found["min"], found["max"]) == (False, 0, 0, 0)
+    assert all(math.isnan(found[name]) for name in ("mean", "sum", "mean_nonzero"))
 
 
 @pytest.mark.parametrize("batch", [(), (7,), (2, 3)])
