@@ -31,12 +31,18 @@ FILE = "baselines.csv"
 NAME = "baseline"  # column with the name
 REVERSED = {"_target_": "coil_rl.transforms.ScaledAdvice", "gain": -1.0}
 # Beside the delays of the env, which are kept: so names and memories are of their own.
+ONE = {"min_lag": 1, "max_lag": 1}  # steps
 LATE = {
-    f"one_more_{name}": {"_target_": target, "min_lag": 1, "max_lag": 1, "memory_key": memory}
-    for name, target, memory in (
-        ("observation", "coil_rl.transforms.ObservationDelay", "one_more_late_observations"),
-        ("action", "coil_rl.transforms.ActionDelay", "one_more_late_actions"),
-    )
+    "one_more_observation": {
+        "_target_": "coil_rl.transforms.ObservationDelay",
+        "memory_key": "one_more_late_observations",
+        **ONE,
+    },
+    "one_more_action": {
+        "_target_": "coil_rl.transforms.ActionDelay",
+        "memory_key": "one_more_late_actions",
+        **ONE,
+    },
 }
 
 
