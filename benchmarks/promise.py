@@ -164,7 +164,7 @@ def _cases(run: Run) -> set[str]:
 
 
 def paired(arm: Arm, alone: Arm) -> tuple[Arm, Arm]:
-    """Return the runs of a method and those of PPO with the seeds that both have.
+    """Return the runs of a method and of PPO, limited to the seeds that both have.
 
     Args:
         arm: of the method.

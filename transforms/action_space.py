@@ -63,7 +63,7 @@ class ActionRange:
         self.whole = whole
 
     def __str__(self) -> str:
-        """Return the range as a part of a sentence."""
+        """Return the range as text, such as "from [-1.0] to [1.0]"."""
         shown = f"from {self.low.tolist()} to {self.high.tolist()}"
         return f"{shown} in whole numbers" if self.whole else shown
 

@@ -169,7 +169,7 @@ def _row(
 
 
 def _versions(runs: Sequence[Run]) -> dict[str, str]:
-    """Return the versions of what runs were trained with; several ones side by side."""
+    """Return the versions of the libraries of runs; different ones are joined by a slash."""
     found = []
     for run in runs:
         file = run.folder / "versions.json"

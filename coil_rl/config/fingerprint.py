@@ -1,4 +1,4 @@
-"""Fingerprints of the objects of a user, which are the same in every process.
+"""Fingerprints of a user's objects, equal in every process.
 
 A configuration holds only a name for such an object, so that two of them look the same there. A
 fingerprint is the class of an object with a hash of its state: numbers, texts, arrays, and the code
@@ -47,7 +47,7 @@ def _name(thing: Any) -> str:
 
 
 def _parts(thing: Any, seen: dict[int, tuple[int, Any]]) -> Iterator[bytes]:
-    """Yield the state of an object.
+    """Yield bytes that describe the state of an object.
 
     Args:
         thing: the object.
@@ -160,7 +160,7 @@ def _is_of_user(thing: FunctionType | type) -> bool:
 
 
 def _settings(module: nn.Module) -> tuple[type, dict[str, Any]]:
-    """Return the class of a module, and what it holds besides weights and what a call leaves."""
+    """Return the class of a module, and its plain attributes, such as a gain."""
     plain = {name: each for name, each in vars(module).items() if isinstance(each, PLAIN)}
     plain.pop("training", None)
     return type(module), plain

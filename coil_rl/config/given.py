@@ -60,7 +60,7 @@ def give(config: DictConfig, objects: Mapping[str, Any]) -> None:
 
 
 def kept_objects(config: DictConfig, part: str) -> list[Any]:
-    """Return the objects of a configuration that were kept.
+    """Return the Python objects that a configuration names, as they were handed over.
 
     Args:
         config: of a run.

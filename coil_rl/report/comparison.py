@@ -497,7 +497,7 @@ def _shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[_Guide]:
 
 
 def _different(results: Iterable[pd.DataFrame]) -> list[pd.DataFrame]:
-    """Return the first of each of several evaluations that are the same."""
+    """Return evaluations without duplicates."""
     different: list[pd.DataFrame] = []
     for result in results:
         if not _contains(different, result):

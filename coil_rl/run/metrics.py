@@ -80,7 +80,7 @@ class Metrics:
         self.logger = None
 
     def append(self, row: dict[str, float]) -> None:
-        """Log a row; `frames` is the step of the logger.
+        """Add a row to the log; its `frames` is the step of the logger.
 
         The first row has all columns. What a later one lacks is NaN in it.
 
