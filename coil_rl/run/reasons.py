@@ -85,9 +85,29 @@ def _delivery(folder: Path) -> dict[str, Any] | None:
             "policy": str(report["policy"]),
             "returns": {str(name): float(value) for name, value in report["returns"].items()},
             "cases": int(report["cases"]),
+            "steps": int(report.get("steps", 0)),
             "frames": None if report["frames"] is None else int(report["frames"]),
             "ahead": [float(value) for value in report.get("ahead") or ()],
         }
+
+
+def beyond_budget(folder: Path, frames: int) -> str | None:
+    """Return the sentence for a search that took more frames than its budget; None for another.
+
+    Args:
+        folder: of the run.
+        frames: the budget.
+
+    Raises:
+        UserError: if the file is damaged.
+    """
+    report = _delivery(folder)
+    if report is None or report["steps"] <= frames:
+        return None
+    return (
+        f"The search took {report['steps']:,} frames, more than budget.frames={frames:,}: that is "
+        "too little for a generation and a test of its result."
+    )
 
 
 def handed_over(folder: Path) -> str | None:

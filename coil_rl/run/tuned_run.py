@@ -32,6 +32,7 @@ from coil_rl.run.experiment import PUT_BACK, check_identity
 from coil_rl.run.folder import weights_file
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.parts import TESTS
+from coil_rl.run.reasons import beyond_budget
 from coil_rl.run.run import HANDED_OVER, Run
 from coil_rl.run.stopping import STOP, resume_command
 from coil_rl.run.tuning import BEST, MEAN, OWN, MakeGuide, Number, Search, Tuner, Values, chosen
@@ -108,19 +109,13 @@ class TunedRun(Run):
         return self.load_policy(self.make_env())
 
     def reasons(self) -> list[str]:
-        """Return the sentence on the test, and the one with the numbers of the guide."""
+        """Return the sentences on the test, the numbers of the guide, and a budget too small."""
         found = super().reasons()
         values = read_tuned(self.folder, self.numbers)
         if values is not None:
             found.append(numbers_sentence(values, {each.name: each.own for each in self.numbers}))
-        taken = json.loads(read_file(self.folder / DELIVERY, LARGEST_NUMBERS))["steps"]
-        if taken > self.budget.frames:
-            found.append(
-                f"The search took {taken:,} frames, more than "
-                f"budget.frames={self.budget.frames:,}: that is too little for a generation and a "
-                "test of its result."
-            )
-        return found
+        beyond = beyond_budget(self.folder, self.budget.frames)
+        return found if beyond is None else [*found, beyond]
 
     def _env_of(self, candidates: Candidates) -> Any:
         """Return what makes the env in which candidates act."""
