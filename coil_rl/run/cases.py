@@ -14,8 +14,9 @@ from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, episodes
+from coil_rl.run.exploration import CorrelatedNoise, Exploring
 from coil_rl.run.parts import SOME_ROWS
-from coil_rl.run.policy_batch import PoliciesBeside, memory_keys
+from coil_rl.run.policy_batch import PoliciesBeside, memory_keys, traced
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_transform import SeededGenerator
 
@@ -35,6 +36,8 @@ class TrainingCases:
         build: makes an env of a number of rows.
         frames: of the whole run.
         seed: of the cases.
+        noise_correlation: of the noise of sampled actions in consecutive steps, as in the
+            `Rollout` of the training.
 
     Attributes:
         steps: that all comparisons have taken so far.
@@ -47,6 +50,7 @@ class TrainingCases:
     build: Callable[[int], EnvBase]
     frames: int
     seed: int = 0
+    noise_correlation: float = 0.0
     steps: int = field(default=0, init=False)
     episodes: int = field(default=0, init=False)
     calls: int = field(default=0, init=False)
@@ -117,16 +121,35 @@ class TrainingCases:
         sampled = [False] * len(policies) if sampled is None else sampled
         if len(policies) > 1 and self._can_act_beside(policies):
             env = self._copy(len(policies))
-            totals = self._acted(env, PoliciesBeside(policies, sampled), sampled=False)
+            beside = [
+                self._exploring(env, traced(policy), samples, len(policies))
+                for policy, samples in zip(policies, sampled, strict=True)
+            ]
+            totals = self._acted(env, PoliciesBeside(beside, sampled), sampled=False)
             self.taken = [int(part.sum()) for part in totals.steps.split(self.count)]
             return list(totals.results()["return"].split(self.count))
         env = self._copy(1)
         self.taken, returns = [], []
         for policy, samples in zip(policies, sampled, strict=True):
-            totals = self._acted(env, policy, sampled=samples)
+            totals = self._acted(env, self._exploring(env, policy, samples), sampled=samples)
             self.taken.append(int(totals.steps.sum()))
             returns.append(totals.results()["return"])
         return returns
+
+    def _exploring(
+        self, env: EnvBase, policy: TensorDictModuleBase, samples: bool, parts: int = 1
+    ) -> TensorDictModuleBase:
+        """Return a policy with the exploration noise of the training, if it samples its actions.
+
+        Args:
+            env: in which it acts.
+            policy: writes the action.
+            samples: whether it samples its actions.
+            parts: number of equal parts of the rows, on one of which it acts.
+        """
+        if not samples or not CorrelatedNoise.covers(env, self.noise_correlation):
+            return policy
+        return Exploring(policy, CorrelatedNoise(env, self.noise_correlation, parts))
 
     def _can_act_beside(self, policies: Sequence[TensorDictModuleBase]) -> bool:
         """Return whether policies can act side by side in one env."""

@@ -5,6 +5,7 @@ Several act in one batch, and their operations are traced once and repeated.
 
 import copy
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from coil_rl.compiled import record
+from coil_rl.learners.sampling import NOISE
 
 
 def policy_batch(
@@ -84,7 +86,8 @@ class TracedPolicy(TensorDictModuleBase):
     """A policy with fixed weights and no other state, see `is_tensors`.
 
     Its operations are traced at the first call for a number of rows, once for each type of
-    exploration, and repeated afterwards, which takes half of the time or less.
+    exploration, and repeated afterwards, which takes half of the time or less. Exploration noise
+    that somebody has written is read.
     """
 
     def __init__(self, policy: TensorDictModuleBase) -> None:
@@ -95,15 +98,16 @@ class TracedPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the `action`."""
+        keys = [*self.in_keys, NOISE] if NOISE in tensordict else self.in_keys
         # The traced operations are those for one layout in memory.
-        entries = [tensordict[key].contiguous() for key in self.in_keys]
-        kind = exploration_type(), len(entries[0])
+        entries = [tensordict[key].contiguous() for key in keys]
+        kind = exploration_type(), len(entries[0]), len(keys)
         if kind not in self.traced:
-            self.traced[kind] = record(self._actions, entries)
+            self.traced[kind] = record(partial(self._actions, keys), entries)
         return tensordict.set("action", self.traced[kind](*entries)[0])
 
-    def _actions(self, *entries: Tensor) -> list[Tensor]:
-        rows = TensorDict(dict(zip(self.in_keys, entries, strict=True)), [len(entries[0])])
+    def _actions(self, keys: Sequence[NestedKey], *entries: Tensor) -> list[Tensor]:
+        rows = TensorDict(dict(zip(keys, entries, strict=True)), [len(entries[0])])
         return [self._act(rows)]
 
     def _act(self, rows: TensorDictBase) -> Tensor:
@@ -160,7 +164,8 @@ class PoliciesBeside(TensorDictModuleBase):
     Each acts on its own part of the rows.
 
     Args:
-        policies: each acts on an equal part of the rows, in their order. Their weights stay.
+        policies: each acts on an equal part of the rows, in their order, as it is: what is to be
+            traced is.
         sampled: whether each samples its actions.
     """
 
@@ -169,7 +174,7 @@ class PoliciesBeside(TensorDictModuleBase):
         keys = [key for policy in policies for key in policy.in_keys]
         self.in_keys, self.out_keys = list(dict.fromkeys(keys)), ["action"]
         # A list, so that they are no submodules.
-        self.policies = [traced(each) for each in policies]
+        self.policies = list(policies)
         kinds = {True: ExplorationType.RANDOM, False: ExplorationType.DETERMINISTIC}
         self.kinds = [kinds[each] for each in sampled]
 

@@ -12,9 +12,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
-from coil_rl.learners.sampling import NOISE
+from coil_rl.run.exploration import CorrelatedNoise
 from coil_rl.run.lean_steps import LeanSteps
 from coil_rl.transforms.guide_transform import set_progress
 
@@ -28,8 +27,7 @@ class Rollout:
         steps: T, length of a batch.
         keys: entries to keep, those after a step as `("next", ...)`; all by default.
         noise_correlation: of the noise of continuous actions in consecutive steps, at most 1. Each
-            action alone has the distribution that the policy gives. Korenkevych et al. 2019;
-            Hollenstein et al. 2024 (for PPO).
+            action alone has the distribution that the policy gives, see `CorrelatedNoise`.
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -47,17 +45,15 @@ class Rollout:
         keys: Sequence[NestedKey] | None = None,
         noise_correlation: float = 0.0,
     ) -> None:
-        check_range(0, 1, noise_correlation=noise_correlation)
         self.env, self.policy, self.steps = env.train(), policy, steps
         self.base_env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
         self.keys = None if keys is None else list(dict.fromkeys(keys))
         self.lean: LeanSteps | None = None
         if self.keys is not None and LeanSteps.covers(env, policy, self.keys):
             self.lean = LeanSteps(env, policy, self.keys)
-        spec = env.full_action_spec[env.action_key] if noise_correlation else None
-        self.noise_spec = spec if spec is not None and spec.dtype.is_floating_point else None
-        self.noise_correlation = noise_correlation
-        self.noise: Tensor | None = None  # of the last actions
+        self.noise: CorrelatedNoise | None = None
+        if CorrelatedNoise.covers(env, noise_correlation):
+            self.noise = CorrelatedNoise(env, noise_correlation)
         self.carrier: TensorDictBase | None = None
         self.taken = 0  # steps of each row
 
@@ -123,20 +119,8 @@ class Rollout:
         return lean.data(entries)
 
     def _with_noise(self, carrier: Any) -> Any:
-        """Write the exploration noise of the next step.
-
-        It is correlated with that of the step before.
-        """
-        if (spec := self.noise_spec) is None:
-            return carrier
-        share, fresh = (
-            self.noise_correlation,
-            torch.randn(spec.shape, dtype=spec.dtype, device=spec.device),
-        )
-        self.noise = (
-            fresh if self.noise is None else share * self.noise + (1 - share**2) ** 0.5 * fresh
-        )
-        return carrier.set(NOISE, self.noise)
+        """Write the exploration noise of the next step, where it is correlated."""
+        return carrier if self.noise is None else self.noise.write(carrier)
 
     def _stacked(self, columns: Mapping[NestedKey, list[Tensor]]) -> TensorDictBase:
         time = len(self.env.batch_size)
@@ -152,7 +136,7 @@ class Rollout:
             "env": self.base_env.state_dict(),
             "transforms": self.env.state_dict() if self.base_env is not self.env else {},
             "carrier": None if self.carrier is None else self.carrier.to_dict(),
-            "noise": self.noise,
+            "noise": None if self.noise is None else self.noise.last,
             "taken": self.taken,
         }
 
@@ -178,7 +162,8 @@ class Rollout:
             self.carrier = TensorDict.from_dict(
                 carrier, batch_size=self.env.batch_size, device=self.env.device
             )
-        self.noise = None if state["noise"] is None else state["noise"].to(self.env.device)
+        if self.noise is not None and state["noise"] is not None:
+            self.noise.last = state["noise"].to(self.env.device)
         self.taken = state["taken"]
 
 

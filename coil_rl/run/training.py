@@ -45,7 +45,8 @@ def training_of(run: Run, before: int) -> Experiment:
         load_weights(learner.policy, _copy_of_init(run.folder, run.init), run.device)
     keys = [*learner.keys, *watched_keys(env, run.watch)]
     rollout = Rollout(env, learner.policy, run.budget.steps, keys, run.noise_correlation)
-    cases = TrainingCases(partial(run.make_env, cases=TESTS), run.budget.frames, run.seed)
+    make_env = partial(run.make_env, cases=TESTS)
+    cases = TrainingCases(make_env, run.budget.frames, run.seed, run.noise_correlation)
     curve = _curve_of(run, learner.policy)
     callbacks = [*learner.callbacks(cases), *run.callbacks(learner)]
     reserve = None

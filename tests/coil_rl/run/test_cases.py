@@ -4,12 +4,14 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from programs import LAP
+from tensordict.nn import TensorDictModuleBase
 
 from coil_rl.config.build import assemble, build_learner, env_maker
 from coil_rl.learners.anchor import hold_of
 from coil_rl.run.cases import TrainingCases, further_cases, guide_calls
 from coil_rl.run.delivery import GuideActs
 from coil_rl.run.parts import TESTS, TRAIN
+from coil_rl.run.training import training_of
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 pytest.importorskip("gymnasium.envs.classic_control")
@@ -155,6 +157,50 @@ def test_policies_side_by_side_have_the_returns_of_each_alone():
         assert cases.taken == [expected]
     assert cases.steps == 2 * steps
     assert not torch.equal(*cases.compared([learner.policy] * 2, [True, False]))
+
+
+class Noted(TensorDictModuleBase):
+    """A policy that keeps the exploration noise that it reads."""
+
+    def __init__(self, policy):
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+        super().__init__()
+        self.policy, self.noise = policy, []
+        self.register_buffer("kept", torch.zeros(0), persistent=False)  # it is not traced
+
+    def forward(self, tensordict):
+        self.noise.append(tensordict.get("exploration_noise", None))
+        return self.policy(tensordict)
+
+
+def test_sampled_actions_have_the_correlated_noise_of_the_training():
+    cases, learner = built("env=pendulum")
+    cases.noise_correlation = 0.8
+    cases.renew(8)
+    sampling, other = Noted(learner.policy), Noted(learner.policy)
+    cases.compared([sampling, other], [True, False])
+    assert set(other.noise) == {None}
+    noise = torch.stack(sampling.noise).squeeze(-1)  # [T, C]
+    assert noise.shape[1] == 8
+    assert float(noise.std()) == pytest.approx(1.0, abs=0.15)
+    assert float((noise[1:] * noise[:-1]).mean()) == pytest.approx(0.8, abs=0.15)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_traced_policy_has_the_noise_of_one_that_is_not(correlation):
+    cases, learner = built("env=pendulum")
+    cases.noise_correlation = correlation
+    cases.renew(3)
+    beside, _ = cases.compared([learner.policy, learner.policy], [True, False])
+    (alone,) = cases.compared([learner.policy], [True])
+    torch.testing.assert_close(beside, alone, rtol=1e-3, atol=0.1)  # it is chaotic
+
+
+def test_start_test_of_a_training_has_its_correlation(tmp_path):
+    folder = f"run_dir={tmp_path}/run"
+    config, _ = configured("env=pendulum", "training.noise_correlation=0.6", folder)
+    run = assemble(config)
+    assert training_of(run, 0).cases.noise_correlation == run.noise_correlation == 0.6
 
 
 def test_policies_act_in_turn_where_rows_that_begin_alike_draw_other_numbers():

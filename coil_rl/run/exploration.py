@@ -1,0 +1,81 @@
+"""Exploration noise that is similar in consecutive steps."""
+
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from coil_rl.envs.limits import check_range
+from coil_rl.learners.sampling import NOISE
+from coil_rl.run.policy_batch import memory_keys
+
+
+class CorrelatedNoise:
+    """Standard normal numbers of consecutive steps, for the actions that a policy samples.
+
+    Each number is `correlation` of the one before and a fresh part, so that each step alone is
+    standard normal. Korenkevych et al. 2019; Hollenstein et al. 2024 (for PPO).
+
+    Args:
+        env: whose actions are sampled.
+        correlation: of the numbers of consecutive steps, from 0 to 1.
+        parts: number of equal parts of the rows of the env, of which the noise is for one.
+
+    Attributes:
+        last: the numbers of the last step, [rows, *action]; None before the first.
+    """
+
+    def __init__(self, env: EnvBase, correlation: float, parts: int = 1) -> None:
+        spec = env.full_action_spec[env.action_key]
+        self.shape = (spec.shape[0] // parts, *spec.shape[1:]) if parts > 1 else spec.shape
+        self.dtype, self.device = spec.dtype, spec.device
+        self.correlation = correlation
+        self.last: Tensor | None = None
+
+    @staticmethod
+    def covers(env: EnvBase, correlation: float) -> bool:
+        """Return whether there is such noise: of numbers, not of choices, and correlated.
+
+        Args:
+            env: whose actions are sampled.
+            correlation: of consecutive steps.
+
+        Raises:
+            ValueError: if the correlation is below 0 or above 1.
+        """
+        check_range(0, 1, noise_correlation=correlation)
+        return correlation > 0 and env.full_action_spec[env.action_key].dtype.is_floating_point
+
+    def write(self, entries: Any) -> Any:
+        """Write the noise of the next step in some entries, and return them.
+
+        Args:
+            entries: a TensorDict or `Entries`, [rows], that a policy reads next.
+        """
+        fresh = torch.randn(self.shape, dtype=self.dtype, device=self.device)
+        if self.last is None:
+            self.last = fresh
+        else:
+            share = self.correlation
+            self.last = share * self.last + (1 - share**2) ** 0.5 * fresh
+        return entries.set(NOISE, self.last)
+
+
+class Exploring(TensorDictModuleBase):
+    """A policy whose sampled actions have the noise of consecutive steps, as in a `Rollout`.
+
+    Args:
+        policy: writes the action.
+        noise: of its actions.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, noise: CorrelatedNoise) -> None:
+        self.in_keys, self.out_keys = list(policy.in_keys), ["action", *memory_keys(policy)]
+        super().__init__()
+        self.policy, self.noise = policy, noise
+
+    def forward(self, tensordict: Any) -> Any:
+        """Write the action, and what the policy remembers."""
+        return self.policy(self.noise.write(tensordict))
