@@ -331,16 +331,12 @@ class StartTest:
         opposites = [tuple(-value for value in row) for row in guides]
         new = tuple(0.0 for _ in guides)
         held = self._first_held(guides, opposites, new)
+        # Before gains are compared in other cases: these are returns in the same ones.
+        means = self._best(guides), self._best(opposites), self._mean(new)
         if held != new and self.hold.space.continuous and self.anchor.gains:
             held = self._best_gain(held)
         self.hold.set(held)
-        numbers = (
-            self._best(guides),
-            self._best(opposites),
-            self._mean(new),
-            float(len(self.returns[new])),
-            sum(held),
-        )
+        numbers = (*means, float(len(self.returns[new])), sum(held))
         return dict(zip(self.names, numbers, strict=True))
 
     def _first_held(

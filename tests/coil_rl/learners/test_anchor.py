@@ -268,6 +268,14 @@ def test_guide_that_is_materially_better_is_held_after_two_or_four_cases():
     assert (-1.0,) not in cases.sampled, "the opposite is not tried if the guide passes"
 
 
+def test_numbers_are_those_of_guide_and_new_policy_in_the_same_cases():
+    """Gains are compared in other cases, whose returns differ by 50."""
+    cases = Returns(lambda weights: 1000 * weights[0], noise=50.0)
+    _, numbers, cases = decided(None, cases=cases)
+    assert (0.5,) in cases.sampled, "gains were compared"
+    assert numbers["start/guide"] - numbers["start/new"] == pytest.approx(1000, abs=1)
+
+
 def test_opposite_of_a_reversed_guide_is_held():
     assert decided(lambda weights: -100 * weights[0])[0] == [-1]
 
