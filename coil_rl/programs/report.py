@@ -66,6 +66,7 @@ def report(config: DictConfig) -> None:
     notes = [
         page.notes(against, compared),
         *page.handed_over(finished),
+        *page.begun(finished),
         *of_several_envs(finished),
         *of_several_conditions(finished),
         *of_several_definitions(finished),

@@ -13,7 +13,7 @@ from typing import Any
 
 from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning
-from coil_rl.report.runs import GUIDE, PER_STEP, TERM, UNTESTED, Run
+from coil_rl.report.runs import GUIDE, PER_STEP, TERM, UNTESTED, Run, begun_with
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
 from coil_rl.report.table import AUTO_FORMAT, TABLES, Table, fitted, return_format
 
@@ -243,6 +243,21 @@ def handed_over(runs: Sequence[Run]) -> list[str]:
                 "their last policy."
             )
     return sentences
+
+
+def begun(runs: Sequence[Run]) -> list[str]:
+    """Return a sentence for each label whose runs began with frames of other runs.
+
+    Args:
+        runs: finished runs.
+    """
+    sentences = {}
+    for run in runs:
+        if (source := begun_with(run.settings)) is not None:
+            sentences[run.label] = (
+                f"Runs of {run.label} began with {source}, whose frames are not among theirs."
+            )
+    return list(sentences.values())
 
 
 def progress(finished: int, started: int, refused: int = 0) -> str:

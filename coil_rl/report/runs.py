@@ -114,6 +114,19 @@ def read_runs(folders: Sequence[Path]) -> list[Run]:
     return list(runs.values())
 
 
+def begun_with(settings: Mapping[str, Any]) -> str | None:
+    """Return what a run began with whose frames are those of another run; None without it.
+
+    Args:
+        settings: the configuration of the run.
+    """
+    if init := settings.get("init"):
+        return f"the policy of {init}"
+    learner = settings.get("learner")
+    dataset = learner.get("dataset") if isinstance(learner, Mapping) else None
+    return f"the data of {dataset}" if dataset else None
+
+
 def failed_jobs(folders: Iterable[Path]) -> int:
     """Return the number of jobs that sweeps in some folders have refused, or that failed.
 

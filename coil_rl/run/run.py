@@ -23,7 +23,7 @@ from coil_rl.measures import Measure
 from coil_rl.output import decoration, say
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.report.pictures import Picture
-from coil_rl.report.runs import DELIVERY, EVALUATION, read_curve
+from coil_rl.report.runs import DELIVERY, EVALUATION, begun_with, read_curve
 from coil_rl.run import checkpoint
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import Watch
@@ -463,9 +463,11 @@ class Run:
         return replace(self.trial, guide_results=self._guide_results, notes=notes)
 
     def reasons(self) -> list[str]:
-        """Return the sentences on the tests of the training; none for a run without tests."""
+        """Return the sentences on the beginning and on the tests of the training."""
         rows = read_curve(self.folder / "metrics.csv") if self.has_agent else []
         found = [start_test(rows[0])] if rows else []
+        if (source := begun_with(self.settings)) is not None:
+            found.append(f"It began with {source}, whose frames are not among those of this run.")
         if self.chosen == "best":
             found.append(handed_over(self.folder))
         return [sentence for sentence in found if sentence is not None]

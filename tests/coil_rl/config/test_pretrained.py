@@ -97,6 +97,8 @@ def test_shipped_policy_is_the_first_one_of_a_run(tmp_path):
     first = torch.load(folder / "policies" / "000000000000.pt", weights_only=True)
     shipped = torch.load(folder / INIT, weights_only=True)
     assert all(torch.equal(value, shipped[name]) for name, value in first.items())
+    said = "It began with the policy of pretrained:cone_track/ppo, whose frames are not among"
+    assert said in (folder / "evaluation.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -152,6 +152,18 @@ def test_runs_without_a_test_at_their_end_are_counted_apart():
     assert sentences("last", "last", "guide", "") == [tested]
 
 
+def test_frames_of_other_runs_are_said():
+    """A policy or data to begin with cost frames, which are in no column of this run."""
+    own = Run(Path(), "own", 0, True, settings={"init": None, "learner": {"dataset": None}})
+    init = Run(Path(), "init", 0, True, settings={"init": "outputs/first"})
+    data = Run(Path(), "data", 0, True, settings={"learner": {"dataset": "dataset.pt"}})
+    assert page.begun([own]) == []
+    assert page.begun([own, init, init, data]) == [
+        "Runs of init began with the policy of outputs/first, whose frames are not among theirs.",
+        "Runs of data began with the data of dataset.pt, whose frames are not among theirs.",
+    ]
+
+
 def test_empty_columns_and_many_cases_are_omitted(tmp_path):
     cases = {f"case_{k}": 1.0 * k for k in range(9)}
     make_run(tmp_path / "run", "coil", 0, driven("guide", cases) + driven("coil", cases))
