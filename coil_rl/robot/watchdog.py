@@ -40,10 +40,13 @@ class Scan:
     range_max: float = 12.0
 
     def returns(self) -> NDArray[np.float32]:
-        """Return the ranges, infinite where there is no return [P]."""
+        """Return the ranges, infinite where there is no return [P].
+
+        A range of 0 is no return either: it is the code for it of many scanners.
+        """
         ranges = np.asarray(self.ranges, np.float32)
         inside = (ranges >= np.float32(self.range_min)) & (ranges <= np.float32(self.range_max))
-        return np.where(inside, ranges, np.float32(np.inf))
+        return np.where(inside & (ranges > 0), ranges, np.float32(np.inf))
 
 
 @dataclass(frozen=True)

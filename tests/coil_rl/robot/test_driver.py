@@ -366,3 +366,10 @@ def test_files_are_not_left_behind(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError), DriveLog(tmp_path / "drive.mcap"):
         raise RuntimeError("anything")
     assert [file.name for file in tmp_path.iterdir()] == ["drive.mcap"]
+
+
+def test_range_of_0_is_no_return():
+    """Many scanners send 0 for it, and some of them say that their smallest range is 0."""
+    ranges = np.array([0.0, 0.4, 13.0, np.inf], np.float32)
+    returns = Scan(0.0, ranges, np.zeros(4), range_min=0.0).returns()
+    assert returns.tolist() == [np.inf, pytest.approx(0.4), np.inf, np.inf]
