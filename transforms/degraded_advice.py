@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import Transform
 
-from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested_key
+from coil_rl.transforms.action_space import ActionSpace, ChosenActionTransform, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.normalised_action import ActionUnits, units_of
 
@@ -357,14 +357,17 @@ class DelayedAdvice(DegradedAdvice):
         return next_tensordict.set(self.key, memory[..., 0, :, :])
 
 
-class RemovedAdvice(DegradedAdvice, ActionTransform):
-    """Placebo: the agent's previous action in place of the advice; neutral in the first step.
+class RemovedAdvice(DegradedAdvice, ChosenActionTransform):
+    """Placebo: the agent's previous action in place of the advice; zeros in the first step.
+
+    It is the action that the agent chose, wherever actions take effect late.
 
     Args:
         key: entry of the advice, [*batch, n_guides, A].
         action_key: entry of the action; a discrete action becomes one-hot.
     """
 
+    chosen_key = "action_for_advice"
     needs_past = True
 
     def __init__(self, key: NestedKey = "guide_action", action_key: NestedKey = "action") -> None:
@@ -376,7 +379,7 @@ class RemovedAdvice(DegradedAdvice, ActionTransform):
         return torch.zeros_like(advice)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        action = self.action_space.normalise(self.given_vectors(tensordict[self.action_key]))
+        action = self.action_space.normalise(self.chosen_vectors(tensordict))
         advice = next_tensordict[self.key]
         return self._write(next_tensordict, action.to(advice.dtype).unsqueeze(-2).expand_as(advice))
 

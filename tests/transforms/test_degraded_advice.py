@@ -14,6 +14,7 @@ from coil_rl.envs import ConeTrackEnv, random_tracks
 from coil_rl.guides import SplineGuide
 from coil_rl.testing import check_env
 from coil_rl.transforms import (
+    ActionDelay,
     BiasedAdvice,
     DelayedAdvice,
     GuideActions,
@@ -228,6 +229,14 @@ def test_removed_advice_is_the_previous_action_and_zero_at_the_start():
     carrier = env.step(carrier.set("action", torch.full((CARS, 1), 0.25)))["next"]
     assert carrier["guide_action"].eq(0.25).all()
     assert hundredths(reset_rows(env, carrier, 2)).tolist() == [25, 25, 0, 25, 25, 25]
+
+
+def test_removed_advice_is_the_action_that_the_agent_chose_where_actions_are_late():
+    advised = GuideActions({"guide": SplineGuide()})
+    env = TransformedEnv(WORLD, Compose(ActionDelay(2, 2), advised, RemovedAdvice()))
+    data = env.rollout(5, lambda td: td.set("action", torch.rand(CARS, 1)))
+    assert torch.equal(data["next", "guide_action"].squeeze(2), data["action"])
+    assert not torch.equal(data["next", "steering"][:, 1:], data["action"][:, 1:])
 
 
 @pytest.mark.parametrize("categorical", [True, False])
