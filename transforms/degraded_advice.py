@@ -6,6 +6,7 @@ shuffled and removed advice are placebos.
 """
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Literal
 
@@ -36,6 +37,7 @@ class DegradedAdvice(Transform):
     """
 
     needs_past = False  # whether stored data of a single step are not enough
+    numbers_only: str | None = None  # its name in conf/degrade if it is not for choices
 
     def __init__(
         self, key: NestedKey = "guide_action", memory_key: NestedKey | None = None, slots: int = 0
@@ -91,6 +93,14 @@ class DegradedAdvice(Transform):
         space = ActionSpace(self.parent.full_action_spec[keys[0]], batch_dims)
         if space.choices:
             self._choices = space
+            if self.numbers_only is not None:
+                warnings.warn(
+                    f"degrade={self.numbers_only} ({type(self).__name__}) degrades numbers, but "
+                    "the action of this env is choices: the advice is the guide's choice all the "
+                    "same, or none at all; take degrade=adversarial, delayed, noisy, random, "
+                    "shuffled, removed or zeroed",
+                    stacklevel=2,
+                )
         else:
             self._units = units_of(spec, batch_dims)
         self._bounds_known = True
@@ -130,12 +140,14 @@ class DegradedAdvice(Transform):
 
 
 class BiasedAdvice(DegradedAdvice):
-    """Advice with a constant offset.
+    """Advice with a constant offset; of choices, with a warning, the same choice.
 
     Args:
         offset: in normalised actions, finite.
         key: entry of the advice, [*batch, n_guides, A].
     """
+
+    numbers_only = "biased"
 
     def __init__(self, offset: float = 0.2, key: NestedKey = "guide_action") -> None:
         super().__init__(key)
@@ -151,13 +163,15 @@ class ScaledAdvice(DegradedAdvice):
 
     Args:
         gain: the constant, finite: 0.5 for an undertuned guide, 0 for neutral advice, -1 for an
-            adversary. With a negative one choices are advised in the reverse order.
+            adversary. With a negative one choices are advised in the reverse order; a positive one
+            leaves them as they are, with a warning.
         key: entry of the advice, [*batch, n_guides, A].
     """
 
     def __init__(self, gain: float, key: NestedKey = "guide_action") -> None:
         super().__init__(key)
         self.gain = _finite("gain", gain)
+        self.numbers_only = "undertuned" if gain > 0 else None
 
     def degrade(self, advice: Tensor) -> Tensor:
         """Return advice * gain."""
@@ -169,10 +183,14 @@ class ScaledAdvice(DegradedAdvice):
 class PartialAdvice(DegradedAdvice):
     """Advice to one side only, 0 (the centre of a bounded action) for the other side.
 
+    Choices have no sides: they stay as they are, or become zeros, with a warning.
+
     Args:
         side: "left" keeps positive values, "right" negative values; else a `ValueError`.
         key: entry of the advice, [*batch, n_guides, A].
     """
+
+    numbers_only = "partial"
 
     def __init__(self, side: Literal["left", "right"], key: NestedKey = "guide_action") -> None:
         super().__init__(key)

@@ -17,6 +17,7 @@ from coil_rl.transforms import (
     ActionDelay,
     BiasedAdvice,
     DelayedAdvice,
+    DiscreteActions,
     GuideActions,
     NoisyAdvice,
     PartialAdvice,
@@ -112,6 +113,46 @@ def test_known_numbers_within_the_bounds_of_the_env_and_in_stored_data(transform
 def test_advice_stays_within_the_bounds_of_other_envs():
     assert worlds.pendulum(BiasedAdvice(1.75)).rollout(50)["guide_action"].max() == 2
     assert worlds.carts(BiasedAdvice(0.5)).reset()["guide_action"].le(1).all()
+
+
+@pytest.mark.parametrize(
+    ("degrader", "name"),
+    [
+        (BiasedAdvice(0.2), "biased"),
+        (PartialAdvice("left"), "partial"),
+        (ScaledAdvice(0.5), "undertuned"),
+    ],
+)
+def test_advice_of_choices_that_keeps_its_meaning_is_said(degrader, name):
+    with pytest.warns(UserWarning, match=rf"degrade={name} \(.*the action of this env is choices"):
+        degraded = worlds.carts(degrader).reset()
+    assert torch.equal(degraded["guide_action"].argmax(-1), degraded["observation"][:, 2:3] > 0)
+
+
+@pytest.mark.filterwarnings("error:degrade=")
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ScaledAdvice(-1),
+        lambda: ScaledAdvice(0),
+        lambda: DelayedAdvice(2),
+        lambda: NoisyAdvice(),
+        lambda: RandomAdvice(),
+        lambda: ShuffledAdvice(),
+        lambda: RemovedAdvice(),
+    ],
+)
+def test_nothing_is_said_where_choices_are_degraded(make):
+    worlds.carts(make()).rollout(3, break_when_any_done=False)
+
+
+@pytest.mark.filterwarnings("error:degrade=")
+def test_choices_made_of_a_number_are_degraded_as_numbers():
+    guide = TensorDictModule(
+        lambda _: torch.full((CARS, 1), 0.5), in_keys=["steering"], out_keys=["action"]
+    )
+    env = cone_env(ScaledAdvice(0.5), DiscreteActions(5), guide=guide)
+    assert env.reset()["guide_number"].eq(0.25).all()
 
 
 def test_noise_is_gaussian_and_random_advice_uniform():
