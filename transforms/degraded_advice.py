@@ -8,6 +8,7 @@ shuffled and removed advice are placebos.
 import math
 import warnings
 from collections.abc import Callable
+from functools import cache
 from typing import Literal
 
 import torch
@@ -94,13 +95,7 @@ class DegradedAdvice(Transform):
         if space.choices:
             self._choices = space
             if self.numbers_only is not None:
-                warnings.warn(
-                    f"degrade={self.numbers_only} ({type(self).__name__}) degrades numbers, but "
-                    "the action of this env is choices: the advice is the guide's choice all the "
-                    "same, or none at all; take degrade=adversarial, delayed, noisy, random, "
-                    "shuffled, removed or zeroed",
-                    stacklevel=2,
-                )
+                say_for_numbers(self.numbers_only, type(self).__name__)
         else:
             self._units = units_of(spec, batch_dims)
         self._bounds_known = True
@@ -400,6 +395,22 @@ class RemovedAdvice(DegradedAdvice, ChosenActionTransform):
         action = self.action_space.normalise(self.chosen_vectors(tensordict))
         advice = next_tensordict[self.key]
         return self._write(next_tensordict, action.to(advice.dtype).unsqueeze(-2).expand_as(advice))
+
+
+@cache
+def say_for_numbers(name: str, kind: str) -> None:
+    """Warn once, not in each env of a run, that a degradation has no meaning for choices.
+
+    Args:
+        name: in conf/degrade.
+        kind: name of its class.
+    """
+    warnings.warn(
+        f"degrade={name} ({kind}) degrades numbers, but the action of this env is choices: the "
+        "advice is the guide's choice all the same, or none at all; take degrade=adversarial, "
+        "delayed, noisy, random, shuffled, removed or zeroed",
+        stacklevel=2,
+    )
 
 
 def _finite(name: str, value: float) -> float:
