@@ -149,11 +149,13 @@ def test_advice_of_choices_that_keeps_its_meaning_is_said_once(degrader, name):
     ],
 )
 def test_nothing_is_said_where_choices_are_degraded(make):
+    say_for_numbers.cache_clear()
     worlds.carts(make()).rollout(3, break_when_any_done=False)
 
 
 @pytest.mark.filterwarnings("error:degrade=")
 def test_choices_made_of_a_number_are_degraded_as_numbers():
+    say_for_numbers.cache_clear()
     guide = TensorDictModule(
         lambda _: torch.full((CARS, 1), 0.5), in_keys=["steering"], out_keys=["action"]
     )
