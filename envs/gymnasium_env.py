@@ -66,8 +66,9 @@ class GymnasiumEnv(SeededRows):
         options: keyword arguments of `gymnasium.make`, or of the maker.
         reset_options: `options` of each `reset` of the env, such as where an episode begins.
         wrappers: callables that take an env and return one, applied in this order.
-        max_steps: steps after which an episode is truncated, instead of the registered number. An
-            env that names no number at all is truncated after 1,000, with a warning.
+        max_steps: steps after which an episode is truncated, instead of the registered number or
+            that of a `TimeLimit` of the maker. An env that names no number at all is truncated
+            after 1,000, with a warning.
         seed: of the draw of the episodes' seeds, at least 0.
         first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
             draw the seeds.

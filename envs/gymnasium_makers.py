@@ -118,7 +118,22 @@ def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:
     if not takes_any and "render_mode" not in [parameter.name for parameter in parameters]:
         options.pop("render_mode", None)
     env = maker(**options)
-    return env if steps is None else gymnasium.wrappers.TimeLimit(env, steps)
+    if steps is None:
+        return env
+    limits = time_limits_of(env)
+    for limit in limits:  # a further one could only shorten the episodes
+        limit._max_episode_steps = steps
+    return env if limits else gymnasium.wrappers.TimeLimit(env, steps)
+
+
+def time_limits_of(env: Env) -> list[gymnasium.wrappers.TimeLimit[Any, Any]]:
+    """Return the wrappers `TimeLimit` around an env."""
+    limits, layer = [], env
+    while isinstance(layer, gymnasium.Wrapper):
+        if isinstance(layer, gymnasium.wrappers.TimeLimit):
+            limits.append(layer)
+        layer = layer.env
+    return limits
 
 
 def _reason(id: str, error: BaseException) -> str:

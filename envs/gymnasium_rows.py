@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 from weakref import WeakValueDictionary
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -26,7 +25,7 @@ from coil_rl.envs.gate import (
     predicts,
     shown,
 )
-from coil_rl.envs.gymnasium_makers import Env
+from coil_rl.envs.gymnasium_makers import Env, time_limits_of
 from coil_rl.envs.gymnasium_spaces import Entry, Fineness, has_whole_numbers, leaves
 from coil_rl.envs.workers import Entries
 
@@ -340,12 +339,7 @@ def _has_limit(env: Env) -> bool:
     spec = getattr(env, "spec", None)
     if getattr(spec, "max_episode_steps", None):
         return True
-    layer: Any = env
-    while isinstance(layer, gymnasium.Wrapper):
-        if isinstance(layer, gymnasium.wrappers.TimeLimit):
-            return True
-        layer = layer.env
-    return False
+    return bool(time_limits_of(env))
 
 
 def entries_of(name: str, env: Env, floats: np.dtype[Any]) -> list[Entry]:

@@ -346,6 +346,22 @@ class ActionTransform(Transform):
         return vectors if self.given_units is None else self.given_units.normalise(vectors)
 
 
+class ChosenActionTransform(ActionTransform):
+    """Base class of transforms that use the action that the agent chose.
+
+    Transforms between it and the env may give the env another one, such as a late one.
+    """
+
+    chosen_key: str  # entry for the chosen action, within a step
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.set(self.chosen_key, tensordict[self.action_key])
+
+    def chosen_vectors(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the chosen action of a step as vectors of `action_space` [..., A]."""
+        return self.action_space.vectors(tensordict[self.chosen_key])
+
+
 def first_choices(env: EnvBase) -> Tensor | None:
     """Return the lowest number of each choice of an env, [n], if it has one and that is not 0."""
     return getattr(env, "first_choices", None)

@@ -6,7 +6,9 @@ shuffled and removed advice are placebos.
 """
 
 import math
+import warnings
 from collections.abc import Callable
+from functools import cache
 from typing import Literal
 
 import torch
@@ -15,7 +17,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import Transform
 
-from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested_key
+from coil_rl.transforms.action_space import ActionSpace, ChosenActionTransform, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.normalised_action import ActionUnits, units_of
 
@@ -36,6 +38,7 @@ class DegradedAdvice(Transform):
     """
 
     needs_past = False  # whether stored data of a single step are not enough
+    numbers_only: str | None = None  # its name in conf/degrade if it is not for choices
 
     def __init__(
         self, key: NestedKey = "guide_action", memory_key: NestedKey | None = None, slots: int = 0
@@ -91,6 +94,8 @@ class DegradedAdvice(Transform):
         space = ActionSpace(self.parent.full_action_spec[keys[0]], batch_dims)
         if space.choices:
             self._choices = space
+            if self.numbers_only is not None:
+                say_for_numbers(self.numbers_only, type(self).__name__)
         else:
             self._units = units_of(spec, batch_dims)
         self._bounds_known = True
@@ -130,12 +135,14 @@ class DegradedAdvice(Transform):
 
 
 class BiasedAdvice(DegradedAdvice):
-    """Advice with a constant offset.
+    """Advice with a constant offset; of choices, with a warning, the same choice.
 
     Args:
         offset: in normalised actions, finite.
         key: entry of the advice, [*batch, n_guides, A].
     """
+
+    numbers_only = "biased"
 
     def __init__(self, offset: float = 0.2, key: NestedKey = "guide_action") -> None:
         super().__init__(key)
@@ -151,13 +158,15 @@ class ScaledAdvice(DegradedAdvice):
 
     Args:
         gain: the constant, finite: 0.5 for an undertuned guide, 0 for neutral advice, -1 for an
-            adversary. With a negative one choices are advised in the reverse order.
+            adversary. With a negative one choices are advised in the reverse order; a positive one
+            leaves them as they are, with a warning.
         key: entry of the advice, [*batch, n_guides, A].
     """
 
     def __init__(self, gain: float, key: NestedKey = "guide_action") -> None:
         super().__init__(key)
         self.gain = _finite("gain", gain)
+        self.numbers_only = "undertuned" if gain > 0 else None
 
     def degrade(self, advice: Tensor) -> Tensor:
         """Return advice * gain."""
@@ -169,10 +178,14 @@ class ScaledAdvice(DegradedAdvice):
 class PartialAdvice(DegradedAdvice):
     """Advice to one side only, 0 (the centre of a bounded action) for the other side.
 
+    Choices have no sides: they stay as they are, or become zeros, with a warning.
+
     Args:
         side: "left" keeps positive values, "right" negative values; else a `ValueError`.
         key: entry of the advice, [*batch, n_guides, A].
     """
+
+    numbers_only = "partial"
 
     def __init__(self, side: Literal["left", "right"], key: NestedKey = "guide_action") -> None:
         super().__init__(key)
@@ -357,14 +370,17 @@ class DelayedAdvice(DegradedAdvice):
         return next_tensordict.set(self.key, memory[..., 0, :, :])
 
 
-class RemovedAdvice(DegradedAdvice, ActionTransform):
-    """Placebo: the agent's previous action in place of the advice; neutral in the first step.
+class RemovedAdvice(DegradedAdvice, ChosenActionTransform):
+    """Placebo: the agent's previous action in place of the advice; zeros in the first step.
+
+    It is the action that the agent chose, wherever actions take effect late.
 
     Args:
         key: entry of the advice, [*batch, n_guides, A].
         action_key: entry of the action; a discrete action becomes one-hot.
     """
 
+    chosen_key = "action_for_advice"
     needs_past = True
 
     def __init__(self, key: NestedKey = "guide_action", action_key: NestedKey = "action") -> None:
@@ -376,9 +392,25 @@ class RemovedAdvice(DegradedAdvice, ActionTransform):
         return torch.zeros_like(advice)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        action = self.action_space.normalise(self.given_vectors(tensordict[self.action_key]))
+        action = self.action_space.normalise(self.chosen_vectors(tensordict))
         advice = next_tensordict[self.key]
         return self._write(next_tensordict, action.to(advice.dtype).unsqueeze(-2).expand_as(advice))
+
+
+@cache
+def say_for_numbers(name: str, kind: str) -> None:
+    """Warn once, not in each env of a run, that a degradation has no meaning for choices.
+
+    Args:
+        name: in conf/degrade.
+        kind: name of its class.
+    """
+    warnings.warn(
+        f"degrade={name} ({kind}) degrades numbers, but the action of this env is choices: the "
+        "advice is the guide's choice all the same, or none at all; take degrade=adversarial, "
+        "delayed, noisy, random, shuffled, removed or zeroed",
+        stacklevel=2,
+    )
 
 
 def _finite(name: str, value: float) -> float:

@@ -9,12 +9,10 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
-from coil_rl.transforms.action_space import ActionTransform, nested_key
-
-CHOSEN = "chosen_action"  # within a step
+from coil_rl.transforms.action_space import ChosenActionTransform, nested_key
 
 
-class LastAction(ActionTransform):
+class LastAction(ChosenActionTransform):
     """Writes the actions that the agent chose in the steps before, newest first.
 
     TorchRL's transform of this name writes the action that the env was given, which may be another
@@ -39,6 +37,7 @@ class LastAction(ActionTransform):
         torch.Size([8, 2])
     """
 
+    chosen_key = "chosen_action"
     needs_past = True  # stored data of a single step are not enough
 
     def __init__(
@@ -58,11 +57,8 @@ class LastAction(ActionTransform):
         """The entry at the start of an episode."""
         return self._spec().zero()
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set(CHOSEN, tensordict[self.action_key])
-
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        newest = self.action_space.vectors(tensordict[CHOSEN])
+        newest = self.chosen_vectors(tensordict)
         before = tensordict[self.out_key][..., : -newest.shape[-1]]
         return next_tensordict.set(self.out_key, torch.cat([newest, before], -1))
 

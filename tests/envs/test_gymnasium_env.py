@@ -434,6 +434,16 @@ def test_time_limit_truncates():
     assert ends["done"].sum() == 2
 
 
+@pytest.mark.parametrize("steps", [3, 9])
+def test_own_number_of_steps_replaces_that_of_the_maker(steps):
+    def limited():
+        inner = gymnasium.wrappers.TimeLimit(gymnasium.make("Pendulum-v1"), 6)
+        return gymnasium.wrappers.OrderEnforcing(inner)
+
+    env = GymnasiumEnv(limited, max_steps=steps)
+    assert env.rollout(20)["next", "truncated"].flatten().tolist() == [False] * (steps - 1) + [True]
+
+
 @pytest.mark.parametrize("workers", [0, 2])
 def test_episodes_begin_with_the_options_of_reset(workers):
     env = GymnasiumEnv(

@@ -1,4 +1,5 @@
 import math
+import warnings
 
 import pytest
 import torch
@@ -14,8 +15,10 @@ from coil_rl.envs import ConeTrackEnv, random_tracks
 from coil_rl.guides import SplineGuide
 from coil_rl.testing import check_env
 from coil_rl.transforms import (
+    ActionDelay,
     BiasedAdvice,
     DelayedAdvice,
+    DiscreteActions,
     GuideActions,
     NoisyAdvice,
     PartialAdvice,
@@ -24,6 +27,7 @@ from coil_rl.transforms import (
     ScaledAdvice,
     ShuffledAdvice,
 )
+from coil_rl.transforms.degraded_advice import say_for_numbers
 
 NAMES = shipped("degrade")
 CARS = 6
@@ -111,6 +115,52 @@ def test_known_numbers_within_the_bounds_of_the_env_and_in_stored_data(transform
 def test_advice_stays_within_the_bounds_of_other_envs():
     assert worlds.pendulum(BiasedAdvice(1.75)).rollout(50)["guide_action"].max() == 2
     assert worlds.carts(BiasedAdvice(0.5)).reset()["guide_action"].le(1).all()
+
+
+@pytest.mark.parametrize(
+    ("degrader", "name"),
+    [
+        (lambda: BiasedAdvice(0.2), "biased"),
+        (lambda: PartialAdvice("left"), "partial"),
+        (lambda: ScaledAdvice(0.5), "undertuned"),
+    ],
+)
+def test_advice_of_choices_that_keeps_its_meaning_is_said_once(degrader, name):
+    say_for_numbers.cache_clear()
+    with pytest.warns(UserWarning, match=rf"degrade={name} \(.*the action of this env is choices"):
+        degraded = worlds.carts(degrader()).reset()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "degrade=")
+        worlds.carts(degrader()).reset()
+    assert torch.equal(degraded["guide_action"].argmax(-1), degraded["observation"][:, 2:3] > 0)
+
+
+@pytest.mark.filterwarnings("error:degrade=")
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ScaledAdvice(-1),
+        lambda: ScaledAdvice(0),
+        lambda: DelayedAdvice(2),
+        lambda: NoisyAdvice(),
+        lambda: RandomAdvice(),
+        lambda: ShuffledAdvice(),
+        lambda: RemovedAdvice(),
+    ],
+)
+def test_nothing_is_said_where_choices_are_degraded(make):
+    say_for_numbers.cache_clear()
+    worlds.carts(make()).rollout(3, break_when_any_done=False)
+
+
+@pytest.mark.filterwarnings("error:degrade=")
+def test_choices_made_of_a_number_are_degraded_as_numbers():
+    say_for_numbers.cache_clear()
+    guide = TensorDictModule(
+        lambda _: torch.full((CARS, 1), 0.5), in_keys=["steering"], out_keys=["action"]
+    )
+    env = cone_env(ScaledAdvice(0.5), DiscreteActions(5), guide=guide)
+    assert env.reset()["guide_number"].eq(0.25).all()
 
 
 def test_noise_is_gaussian_and_random_advice_uniform():
@@ -228,6 +278,14 @@ def test_removed_advice_is_the_previous_action_and_zero_at_the_start():
     carrier = env.step(carrier.set("action", torch.full((CARS, 1), 0.25)))["next"]
     assert carrier["guide_action"].eq(0.25).all()
     assert hundredths(reset_rows(env, carrier, 2)).tolist() == [25, 25, 0, 25, 25, 25]
+
+
+def test_removed_advice_is_the_action_that_the_agent_chose_where_actions_are_late():
+    advised = GuideActions({"guide": SplineGuide()})
+    env = TransformedEnv(WORLD, Compose(ActionDelay(2, 2), advised, RemovedAdvice()))
+    data = env.rollout(5, lambda td: td.set("action", torch.rand(CARS, 1)))
+    assert torch.equal(data["next", "guide_action"].squeeze(2), data["action"])
+    assert not torch.equal(data["next", "steering"][:, 1:], data["action"][:, 1:])
 
 
 @pytest.mark.parametrize("categorical", [True, False])
