@@ -10,9 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Composite
 from torchrl.envs import EnvBase, TransformedEnv
 
 from coil_rl.config import build
@@ -45,6 +47,7 @@ from coil_rl.run.run import HANDED_OVER
 from coil_rl.run.training import INIT
 from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions
+from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.guide_actions import UnfitActionError
 
 # Kind of a learner: description and example.
@@ -136,10 +139,15 @@ def _check_tuning(config: DictConfig) -> None:
 def _check_delivery(config: DictConfig, *, has_agent: bool) -> None:
     """Raise a `UserError` if a run would evaluate another policy than it hands over.
 
-    One without an agent hands over none that could fall back to its guide.
+    One without an agent hands over none that could fall back to its guide, or begin with another.
     """
     if config.evaluation.fallback and (not has_agent or config.method.search):
         raise UserError(no_effect(Path(config.run_dir), "there is no agent"))
+    if config.init and (not has_agent or config.method.search):
+        raise UserError(
+            f"init={config.init} has no effect: method={config.method.name} trains no policy; "
+            "leave it out"
+        )
     if config.delivery == "tested" and not has_agent:
         raise UserError(
             f"delivery=tested has no effect: method={config.method.name} trains no policy; leave "
@@ -214,17 +222,57 @@ def _check_repeats(env: EnvBase) -> None:
 
 
 def check_measures(config: DictConfig, env: EnvBase) -> None:
-    """Raise a `UserError` if an env does not write an entry that is measured."""
+    """Raise a `UserError` if an env does not write an entry that is measured.
+
+    So it is for an entry of several numbers a row, and for a `where` that is no flag.
+    """
     for name, measure in measures_of(config.evaluation.measures).items():
-        for key in (measure.entry, measure.where):
-            if key is not None:
-                _check_entry(env, key, f"evaluation.measures.{name}")
+        place = f"evaluation.measures.{name}"
+        _check_number(env, nested_key(measure.entry), place)
+        if measure.where is not None:
+            _check_flag(env, nested_key(measure.where), place)
+
+
+def _check_number(env: EnvBase, key: NestedKey, name: str) -> None:
+    """Raise a `UserError` if an entry of an env is not one number a row or an agent."""
+    _check_entry(env, key, name)
+    for group in _specs(env):
+        if key not in group.keys(True):
+            continue
+        spec = group[key]
+        parent = group[key[:-1]] if isinstance(key, tuple) and len(key) > 1 else group
+        shape = spec.shape[len(parent.shape) :]
+        rewards = [env.full_reward_spec[each].shape for each in env.reward_keys]
+        is_one = shape.numel() == 1 or spec.shape in rewards  # of each agent, for some envs
+        if isinstance(spec, Composite) or spec.dtype is None or not is_one:
+            numbers = f"{shape.numel()} numbers" if shape.numel() > 1 else "no number"
+            raise UserError(
+                f"{name}={_dotted(key)} has {numbers} a row, and one is needed; name an entry of "
+                "one number, or let the env write one"
+            )
+
+
+def _check_flag(env: EnvBase, key: NestedKey, name: str) -> None:
+    """Raise a `UserError` if an entry of an env is not one flag a row."""
+    _check_entry(env, key, name)
+    found = [group[key] for group in _specs(env) if key in group.keys(True)]
+    rows = env.batch_size.numel()
+    if not any(spec.dtype == torch.bool and spec.shape.numel() == rows for spec in found):
+        raise UserError(
+            f"{name}.where={_dotted(key)} must be a flag, true or false once a row; name "
+            "another entry, or leave it out"
+        )
+
+
+def _specs(env: EnvBase) -> list[Composite]:
+    """Return the specs of what an env writes after a step."""
+    return [env.observation_spec, env.full_reward_spec, env.full_done_spec]
 
 
 def _check_entry(env: EnvBase, key: NestedKey, name: str) -> None:
     """Raise a `UserError` if an env does not write an entry; `name` is the key that names it."""
     known = {EPISODE_REWARD}
-    for spec in (env.observation_spec, env.full_reward_spec, env.full_done_spec):
+    for spec in _specs(env):
         known |= {_dotted(each) for each in spec.keys(True)}
     given = _dotted(key)
     if given not in known:
@@ -377,7 +425,7 @@ def _check_watch(config: DictConfig, env: EnvBase) -> None:
         for name, key in keys.items():
             if not isinstance(key, ListConfig):
                 raise UserError(f"watch.{group}.{name}={key} must be a list, such as [info, lap]")
-            _check_entry(env, key, f"watch.{group}.{name}")
+            _check_number(env, nested_key(key), f"watch.{group}.{name}")
 
 
 def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:

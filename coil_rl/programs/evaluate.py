@@ -122,10 +122,17 @@ def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> l
     The tracks and the disturbances that it gives are set.
     """
     changed = list(OWN)
-    for key, text in app.overrides() if HydraConfig.initialized() else ():
-        if key == "track":
+    overrides = app.overrides() if HydraConfig.initialized() else []
+    chooses_tracks = any(key == "track" for key, _ in overrides)
+    for key, text in overrides:
+        if key.partition(".")[0] == "track":
             if not config.track:
                 raise UserError(f"{text} has no effect: run={folder} has no tracks; leave it out")
+            if not chooses_tracks:
+                raise UserError(
+                    f"{text} has no effect alone: run={folder} has its own tracks; choose others "
+                    "by track=NAME, or leave it out"
+                )
             config.track = resolved["track"]
             changed += OF_A_TRACK
         elif key.partition(".")[0] == "disturb":

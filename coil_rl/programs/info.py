@@ -21,14 +21,15 @@ def describe(folder: Path) -> dict[str, str]:
         folder: of the run.
 
     Raises:
-        UserError: if there is no run, or its file of versions is damaged.
+        UserError: if there is no run, or a file about it is damaged.
     """
     if not is_begun(folder):
         raise UserError(f"run={folder} is not the folder of a run: it has no config.yaml")
     command = folder / COMMAND
     made = "not known: the run was not made on a command line"
     if command.exists():
-        made = command.read_text(encoding="utf-8").strip()
+        with file_of_a_run(command, "remove it"):
+            made = command.read_text(encoding="utf-8").strip()
     file = folder / "versions.json"
     begun = {}
     if file.exists():

@@ -145,6 +145,20 @@ def refusal(name, *arguments):
         ),
         ("+watch.step.r=reward", "watch.step.r=reward must be a list"),
         ("watch.step.smoothness=[info,smoothnes]", "is no entry of the env; it has cone_count"),
+        ("watch.episode.laps=[info,pose]", "watch.episode.laps=info.pose has 3 numbers a row"),
+        (
+            "evaluation.measures.laps.entry=[info,pose]",
+            "evaluation.measures.laps=info.pose has 3 numbers a row, and one is needed",
+        ),
+        (
+            "evaluation.measures.laps.entry=[info,reward]",
+            "evaluation.measures.laps=info.reward has no number a row, and one is needed",
+        ),
+        (
+            "evaluation.measures.laps.where=[info,lap]",
+            "evaluation.measures.laps.where=info.lap must be a flag",
+        ),
+        ("method=guide init=none", "init=none has no effect: method=guide trains no policy"),
         (
             "evaluation.measures.crashed.entry=[info,crash]",
             "evaluation.measures.crashed=info.crash is no entry of the",
@@ -426,6 +440,11 @@ def test_override_of_what_a_run_provides_is_refused(started, run, name, change):
 def test_evaluation_of_a_run_refuses_what_it_does_not_read(started, run, name, change, reason):
     sentence = refusal(name, *TINY[2:], f"run={run}", change)
     assert sentence == f"{change} has no effect: {reason}; leave it out"
+
+
+def test_tracks_are_not_changed_where_none_are_chosen(started, run):
+    sentence = refusal("evaluate", f"run={run}", "track.test.split=train")
+    assert sentence.startswith(f"track.test.split=train has no effect alone: run={run} has its own")
 
 
 @pytest.mark.parametrize(
