@@ -70,6 +70,8 @@ def make_env(
             env: Env = gymnasium.make(maker, **{"disable_env_checker": True, **settings})
         else:
             env = _called(maker, settings)
+        if (steps := settings.get("max_episode_steps")) is not None:
+            env = _limited(env, steps)
         for wrapper in wrappers:
             env = wrapper(env)
         missing = [
@@ -110,16 +112,18 @@ def _check_statistics(env: Env, name: str) -> None:
 
 
 def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:
-    """Return the env of a maker, with the settings that `gymnasium.make` would handle itself."""
+    """Return the env of a maker, which gets the options that it takes."""
     options = dict(settings)
-    steps = options.pop("max_episode_steps", None)
+    options.pop("max_episode_steps", None)
     parameters = inspect.signature(maker).parameters.values()
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
     if not takes_any and "render_mode" not in [parameter.name for parameter in parameters]:
         options.pop("render_mode", None)
-    env = maker(**options)
-    if steps is None:
-        return env
+    return maker(**options)
+
+
+def _limited(env: Env, steps: int) -> Env:
+    """Return an env whose episodes end after a number of steps, also if it had another limit."""
     limits = time_limits_of(env)
     for limit in limits:  # a further one could only shorten the episodes
         limit._max_episode_steps = steps

@@ -444,6 +444,18 @@ def test_own_number_of_steps_replaces_that_of_the_maker(steps):
     assert env.rollout(20)["next", "truncated"].flatten().tolist() == [False] * (steps - 1) + [True]
 
 
+def test_own_number_of_steps_replaces_that_of_a_registered_maker():
+    def limited(**options):
+        return gymnasium.wrappers.TimeLimit(gymnasium.make("Pendulum-v1", **options), 6)
+
+    gymnasium.register("LimitedInside-v0", limited)
+    try:
+        env = GymnasiumEnv("LimitedInside-v0", max_steps=9)
+        assert env.rollout(20).shape == (1, 9)
+    finally:
+        del gymnasium.registry["LimitedInside-v0"]
+
+
 @pytest.mark.parametrize("workers", [0, 2])
 def test_episodes_begin_with_the_options_of_reset(workers):
     env = GymnasiumEnv(
