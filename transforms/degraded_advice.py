@@ -135,7 +135,9 @@ class DegradedAdvice(Transform):
 
 
 class BiasedAdvice(DegradedAdvice):
-    """Advice with a constant offset; of choices, with a warning, the same choice.
+    """Advice with a constant offset.
+
+    It is for actions that are numbers: the advice of choices stays the same, with a warning.
 
     Args:
         offset: in normalised actions, finite.
@@ -373,7 +375,7 @@ class DelayedAdvice(DegradedAdvice):
 class RemovedAdvice(DegradedAdvice, ChosenActionTransform):
     """Placebo: the agent's previous action in place of the advice; zeros in the first step.
 
-    It is the action that the agent chose, wherever actions take effect late.
+    It is the action that the agent chose, also where actions take effect later.
 
     Args:
         key: entry of the advice, [*batch, n_guides, A].
@@ -399,7 +401,7 @@ class RemovedAdvice(DegradedAdvice, ChosenActionTransform):
 
 @cache
 def say_for_numbers(name: str, kind: str) -> None:
-    """Warn once, not in each env of a run, that a degradation has no meaning for choices.
+    """Warn once in a process that a degradation of numbers has no meaning for choices.
 
     Args:
         name: in conf/degrade.

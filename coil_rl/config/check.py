@@ -139,11 +139,12 @@ def _check_tuning(config: DictConfig) -> None:
 def _check_delivery(config: DictConfig, *, has_agent: bool) -> None:
     """Raise a `UserError` if a run would evaluate another policy than it hands over.
 
-    One without an agent hands over none that could fall back to its guide, or begin with another.
+    So it is for values that need a policy, where none is trained.
     """
-    if config.evaluation.fallback and (not has_agent or config.method.search):
+    trains_policy = has_agent and not config.method.search
+    if config.evaluation.fallback and not trains_policy:
         raise UserError(no_effect(Path(config.run_dir), "there is no agent"))
-    if config.init and (not has_agent or config.method.search):
+    if config.init and not trains_policy:
         raise UserError(
             f"init={config.init} has no effect: method={config.method.name} trains no policy; "
             "leave it out"
@@ -222,9 +223,9 @@ def _check_repeats(env: EnvBase) -> None:
 
 
 def check_measures(config: DictConfig, env: EnvBase) -> None:
-    """Raise a `UserError` if an env does not write an entry that is measured.
+    """Raise a `UserError` for a measure of an entry that is missing or not one number a row.
 
-    So it is for an entry of several numbers a row, and for a `where` that is no flag.
+    So it is for a `where` that is not true or false in each row.
     """
     for name, measure in measures_of(config.evaluation.measures).items():
         place = f"evaluation.measures.{name}"
@@ -234,15 +235,13 @@ def check_measures(config: DictConfig, env: EnvBase) -> None:
 
 
 def _check_number(env: EnvBase, key: NestedKey, name: str) -> None:
-    """Raise a `UserError` if an entry of an env is not one number a row or an agent."""
+    """Raise a `UserError` if an entry does not have exactly one number per row, or per agent."""
     _check_entry(env, key, name)
-    for group in _specs(env):
-        if key not in group.keys(True):
-            continue
+    rewards = [env.full_reward_spec[each].shape for each in env.reward_keys]
+    for group in _groups(env, key):
         spec = group[key]
         parent = group[key[:-1]] if isinstance(key, tuple) and len(key) > 1 else group
         shape = spec.shape[len(parent.shape) :]
-        rewards = [env.full_reward_spec[each].shape for each in env.reward_keys]
         is_one = shape.numel() == 1 or spec.shape in rewards  # of each agent, for some envs
         if isinstance(spec, Composite) or spec.dtype is None or not is_one:
             numbers = f"{shape.numel()} numbers" if shape.numel() > 1 else "no number"
@@ -253,9 +252,9 @@ def _check_number(env: EnvBase, key: NestedKey, name: str) -> None:
 
 
 def _check_flag(env: EnvBase, key: NestedKey, name: str) -> None:
-    """Raise a `UserError` if an entry of an env is not one flag a row."""
+    """Raise a `UserError` if an entry is not a boolean with one value per row."""
     _check_entry(env, key, name)
-    found = [group[key] for group in _specs(env) if key in group.keys(True)]
+    found = [group[key] for group in _groups(env, key)]
     rows = env.batch_size.numel()
     if not any(spec.dtype == torch.bool and spec.shape.numel() == rows for spec in found):
         raise UserError(
@@ -267,6 +266,11 @@ def _check_flag(env: EnvBase, key: NestedKey, name: str) -> None:
 def _specs(env: EnvBase) -> list[Composite]:
     """Return the specs of what an env writes after a step."""
     return [env.observation_spec, env.full_reward_spec, env.full_done_spec]
+
+
+def _groups(env: EnvBase, key: NestedKey) -> list[Composite]:
+    """Return the specs of an env that have an entry; none for the sum of rewards."""
+    return [group for group in _specs(env) if key in group.keys(True)]
 
 
 def _check_entry(env: EnvBase, key: NestedKey, name: str) -> None:

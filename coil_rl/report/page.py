@@ -246,7 +246,7 @@ def handed_over(runs: Sequence[Run]) -> list[str]:
 
 
 def begun(runs: Sequence[Run]) -> list[str]:
-    """Return a sentence for each label whose runs began with frames of other runs.
+    """Return a sentence for each label whose runs began with an earlier policy or data.
 
     Args:
         runs: finished runs.

@@ -115,7 +115,7 @@ def read_runs(folders: Sequence[Path]) -> list[Run]:
 
 
 def begun_with(settings: Mapping[str, Any]) -> str | None:
-    """Return what a run began with whose frames are those of another run; None without it.
+    """Return which earlier policy or data a run began with; None if it began with neither.
 
     Args:
         settings: the configuration of the run.

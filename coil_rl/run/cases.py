@@ -14,7 +14,7 @@ from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, episodes
-from coil_rl.run.exploration import CorrelatedNoise, Exploring
+from coil_rl.run.exploration import Exploring, noise_of
 from coil_rl.run.parts import SOME_ROWS
 from coil_rl.run.policy_batch import PoliciesBeside, memory_keys, traced
 from coil_rl.transforms import GuideActions
@@ -147,9 +147,8 @@ class TrainingCases:
             samples: whether it samples its actions.
             parts: number of equal parts of the rows, on one of which it acts.
         """
-        if not samples or not CorrelatedNoise.covers(env, self.noise_correlation):
-            return policy
-        return Exploring(policy, CorrelatedNoise(env, self.noise_correlation, parts))
+        noise = noise_of(env, self.noise_correlation, parts) if samples else None
+        return policy if noise is None else Exploring(policy, noise)
 
     def _can_act_beside(self, policies: Sequence[TensorDictModuleBase]) -> bool:
         """Return whether policies can act side by side in one env."""

@@ -9,18 +9,17 @@ from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import check_range
 from coil_rl.learners.sampling import NOISE
-from coil_rl.run.policy_batch import memory_keys
 
 
 class CorrelatedNoise:
-    """Standard normal numbers of consecutive steps, for the actions that a policy samples.
+    """Exploration noise of a policy, correlated from step to step.
 
     Each number is `correlation` of the one before and a fresh part, so that each step alone is
     standard normal. Korenkevych et al. 2019; Hollenstein et al. 2024 (for PPO).
 
     Args:
-        env: whose actions are sampled.
-        correlation: of the numbers of consecutive steps, from 0 to 1.
+        env: whose actions are sampled, numbers and not choices.
+        correlation: of the numbers of consecutive steps, above 0 and at most 1.
         parts: number of equal parts of the rows of the env, of which the noise is for one.
 
     Attributes:
@@ -34,25 +33,11 @@ class CorrelatedNoise:
         self.correlation = correlation
         self.last: Tensor | None = None
 
-    @staticmethod
-    def covers(env: EnvBase, correlation: float) -> bool:
-        """Return whether there is such noise: of numbers, not of choices, and correlated.
-
-        Args:
-            env: whose actions are sampled.
-            correlation: of consecutive steps.
-
-        Raises:
-            ValueError: if the correlation is below 0 or above 1.
-        """
-        check_range(0, 1, noise_correlation=correlation)
-        return correlation > 0 and env.full_action_spec[env.action_key].dtype.is_floating_point
-
     def write(self, entries: Any) -> Any:
-        """Write the noise of the next step in some entries, and return them.
+        """Draw the noise of the next step, add it to the entries that a policy reads, return them.
 
         Args:
-            entries: a TensorDict or `Entries`, [rows], that a policy reads next.
+            entries: a TensorDict or `Entries`, [rows].
         """
         fresh = torch.randn(self.shape, dtype=self.dtype, device=self.device)
         if self.last is None:
@@ -63,8 +48,25 @@ class CorrelatedNoise:
         return entries.set(NOISE, self.last)
 
 
+def noise_of(env: EnvBase, correlation: float, parts: int = 1) -> CorrelatedNoise | None:
+    """Return the correlated noise of an env; None for choices, or without a correlation.
+
+    Args:
+        env: whose actions are sampled.
+        correlation: of consecutive steps.
+        parts: see `CorrelatedNoise`.
+
+    Raises:
+        ValueError: if the correlation is below 0 or above 1.
+    """
+    check_range(0, 1, noise_correlation=correlation)
+    if correlation == 0 or not env.full_action_spec[env.action_key].dtype.is_floating_point:
+        return None
+    return CorrelatedNoise(env, correlation, parts)
+
+
 class Exploring(TensorDictModuleBase):
-    """A policy whose sampled actions have the noise of consecutive steps, as in a `Rollout`.
+    """A policy that samples its actions with correlated noise, as in a `Rollout`.
 
     Args:
         policy: writes the action.
@@ -72,7 +74,7 @@ class Exploring(TensorDictModuleBase):
     """
 
     def __init__(self, policy: TensorDictModuleBase, noise: CorrelatedNoise) -> None:
-        self.in_keys, self.out_keys = list(policy.in_keys), ["action", *memory_keys(policy)]
+        self.in_keys, self.out_keys = list(policy.in_keys), list(policy.out_keys)
         super().__init__()
         self.policy, self.noise = policy, noise
 

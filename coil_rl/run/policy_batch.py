@@ -164,8 +164,8 @@ class PoliciesBeside(TensorDictModuleBase):
     Each acts on its own part of the rows.
 
     Args:
-        policies: each acts on an equal part of the rows, in their order, as it is: what is to be
-            traced is.
+        policies: each acts on an equal part of the rows, in their order. They are called as they
+            are, see `traced`.
         sampled: whether each samples its actions.
     """
 

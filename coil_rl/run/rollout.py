@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.errors import UserError
-from coil_rl.run.exploration import CorrelatedNoise
+from coil_rl.run.exploration import noise_of
 from coil_rl.run.lean_steps import LeanSteps
 from coil_rl.transforms.guide_transform import set_progress
 
@@ -51,9 +51,7 @@ class Rollout:
         self.lean: LeanSteps | None = None
         if self.keys is not None and LeanSteps.covers(env, policy, self.keys):
             self.lean = LeanSteps(env, policy, self.keys)
-        self.noise: CorrelatedNoise | None = None
-        if CorrelatedNoise.covers(env, noise_correlation):
-            self.noise = CorrelatedNoise(env, noise_correlation)
+        self.noise = noise_of(env, noise_correlation)
         self.carrier: TensorDictBase | None = None
         self.taken = 0  # steps of each row
 

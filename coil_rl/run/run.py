@@ -463,7 +463,7 @@ class Run:
         return replace(self.trial, guide_results=self._guide_results, notes=notes)
 
     def reasons(self) -> list[str]:
-        """Return the sentences on the beginning and on the tests of the training."""
+        """Return the sentences on how the training began, and on its tests."""
         rows = read_curve(self.folder / "metrics.csv") if self.has_agent else []
         found = [start_test(rows[0])] if rows else []
         if (source := begun_with(self.settings)) is not None:
