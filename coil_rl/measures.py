@@ -31,7 +31,8 @@ class Measure:
             (`mean_nonzero`). Without a number, a mean is NaN. A NaN in a step makes means and sums
             NaN; for the others it is no number.
         where: key of a flag; only the steps with it count.
-        at_least: makes the measure a flag: whether the number is at least this.
+        at_least: makes the measure a flag: whether the number is at least this. An episode without
+            a number is within no bound; a mean or sum of steps with a NaN is undecided, NaN.
         at_most: makes the measure a flag: whether the number is at most this.
         title: heading of its column; a measure without one is in the CSV files only.
         format: of its numbers in tables; "auto": as they need.

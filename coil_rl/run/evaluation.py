@@ -142,6 +142,8 @@ class Totals:
             elif reduction == "mean_nonzero":
                 mask = mask & (values != 0)
             extreme = reduction in ("min", "max", "last")
+            if extreme:
+                mask = mask & ~values.isnan()
             empty = torch.full_like(values, torch.nan if extreme else 0.0), torch.zeros_like(values)
             value, count = self.state.get(reduction, empty)
             if reduction == "last":
@@ -154,7 +156,10 @@ class Totals:
             self.state[reduction] = value, count + mask
 
     def results(self) -> dict[str, Tensor]:
-        """Return the measures by name, [rows] each: numbers (float64) or flags (bool)."""
+        """Return the measures by name, [rows] each: numbers (float64) or flags (bool).
+
+        Flags of which some are undecided are numbers: 0, 1, and NaN for these.
+        """
         results = {}
         for reduction, names in self.groups.items():
             values, counts = self.state[reduction]
@@ -166,12 +171,26 @@ class Totals:
                 measure = self.measures[name]
                 if measure.reduction == "any":
                     number = count > 0
-                if measure.at_least is not None:
-                    number = number >= measure.at_least
-                elif measure.at_most is not None:
-                    number = number <= measure.at_most
-                results[name] = number
+                results[name] = _within(measure, number, count)
         return results
+
+
+def _within(measure: Measure, numbers: Tensor, counts: Tensor) -> Tensor:
+    """Return whether numbers are within the bound of a measure; without one the numbers.
+
+    Args:
+        measure: the measure.
+        numbers: of the episodes, [rows].
+        counts: number of steps that each number rests on.
+    """
+    if measure.at_least is not None:
+        flags = numbers >= measure.at_least
+    elif measure.at_most is not None:
+        flags = numbers <= measure.at_most
+    else:
+        return numbers
+    undecided = numbers.isnan() & (counts > 0)
+    return torch.where(undecided, torch.nan, flags.double()) if undecided.any() else flags
 
 
 def episodes(
