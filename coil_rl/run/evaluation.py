@@ -18,6 +18,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.measures import Measure
 from coil_rl.run.lean_steps import LeanEnv
 from coil_rl.transforms.guide_transform import SeededGenerator
@@ -62,6 +63,7 @@ def evaluate_policy(
     measures: Mapping[str, Measure] | None = None,
     record: Mapping[str, NestedKey] | None = None,
     cases: Sequence[str] = (),
+    different: int | None = None,
     tick: Callable[[], Any] | None = None,
     watch: Callable[[Tensor], Any] | None = None,
 ) -> EvaluationResult:
@@ -75,13 +77,15 @@ def evaluate_policy(
         record: entries after each step to keep, by name.
         cases: names of the cases; row i is case i modulo their number. By default rows are
             numbered.
+        different: number of rows that draw random numbers; row i gets those of row `i % different`.
+            None: as many as cases.
         tick: called after every step.
         watch: called after every step with whether each row was in its episode, [rows].
     """
     measures = {"reward": Measure(unravel_key(env.reward_key), "sum"), **(measures or {})}
     totals, recorded = Totals(measures), {name: list[Tensor]() for name in record or {}}
-    some = len(cases) or None
-    for after, running in episodes(env, policy, sampled=sampled, cases=some, tick=tick):
+    drawing = different or len(cases) or None
+    for after, running in episodes(env, policy, sampled=sampled, cases=drawing, tick=tick):
         totals.add(after, running)
         if watch is not None:
             watch(running.reshape(-1))
@@ -209,7 +213,8 @@ def episodes(
         env: as for `evaluate_policy`.
         policy: as above.
         sampled: as above.
-        cases: number of different cases; row i has case `i % cases`. None: as many as rows.
+        cases: number of different cases; row i has the random numbers of row `i % cases`. None: as
+            many as rows.
         tick: as above.
     """
     with _drawn_by_case(env, cases):
@@ -236,16 +241,17 @@ def episodes(
 
 @contextmanager
 def _drawn_by_case(env: EnvBase, cases: int | None) -> Iterator[None]:
-    """Let transforms and guides draw the same random numbers for all rows of a case."""
+    """Let the env, transforms and guides draw the same random numbers for all rows of a case."""
     several = cases is not None and env.batch_dims == 1 and env.batch_size.numel() > cases
-    parts = [part for part in env.modules() if isinstance(part, SeededGenerator)]
+    parts = [part for part in env.modules() if isinstance(part, (SeededEnv, SeededGenerator))]
+    before = [part.different for part in parts]
     try:
         for part in parts:
             part.different = cases if several else None
         yield
     finally:  # a guide may be a part of another env too
-        for part in parts:
-            part.different = None
+        for part, different in zip(parts, before, strict=True):
+            part.different = different
 
 
 def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool) -> TensorDictBase:
