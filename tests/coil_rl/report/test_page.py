@@ -164,6 +164,19 @@ def test_frames_of_other_runs_are_said():
     ]
 
 
+def test_all_policies_that_the_seeds_of_a_label_began_with_are_named():
+    def begun(seeds):
+        settings = [{"init": f"outputs/first_seed{seed}"} for seed in range(seeds)]
+        runs = [Run(Path(), "own", seed, True, settings=each) for seed, each in enumerate(settings)]
+        return page.begun([*runs, *runs])
+
+    two = "the policy of outputs/first_seed0, the policy of outputs/first_seed1"
+    assert begun(2) == [f"Runs of own began with {two}, whose frames are not among theirs."]
+    (sentence,) = begun(5)
+    assert sentence.startswith(f"Runs of own began with {two}, the policy of outputs/first_seed2 ")
+    assert sentence.endswith("_seed2 and 2 more, whose frames are not among theirs.")
+
+
 def test_empty_columns_and_many_cases_are_omitted(tmp_path):
     cases = {f"case_{k}": 1.0 * k for k in range(9)}
     make_run(tmp_path / "run", "coil", 0, driven("guide", cases) + driven("coil", cases))
