@@ -213,8 +213,12 @@ def test_measure_of_some_episodes_counts_as_often_as_it_is_known(tmp_path):
     # The second run has no such columns: all of its ten episodes have a lap.
     row = comparison.table()[0]
     assert row["lap_time"] == (5 * 50 + 80 + 10 * 50) / 16
-    assert row["lap_time_episodes"] == 16
+    assert (row["lap_time_episodes"], row["episodes"]) == (16, 20)
     assert "51.88 (16 of 20)" in str(page.section(comparison, [row], None)[0])
+    by_case = {case["case"]: case for case in comparison.case_table()}
+    assert [by_case[case]["episodes"] for case in "ab"] == [10, 10]
+    assert [by_case[case]["lap_time_episodes"] for case in "ab"] == [10, 6]
+    assert by_case["b"]["lap_time"] == (80 + 5 * 50) / 6
 
 
 def test_guide_in_some_runs_of_a_label_only_is_said():
