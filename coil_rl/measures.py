@@ -31,7 +31,8 @@ class Measure:
             (`mean_nonzero`). Without a number, a mean is NaN. A NaN in a step makes means and sums
             NaN; for the others it is no number.
         where: key of a flag; only the steps with it count.
-        at_least: makes the measure a flag: whether the number is at least this.
+        at_least: makes the measure a flag: whether the number is at least this. An episode without
+            a number is within no bound; a mean or sum of steps with a NaN is undecided, NaN.
         at_most: makes the measure a flag: whether the number is at most this.
         title: heading of its column; a measure without one is in the CSV files only.
         format: of its numbers in tables; "auto": as they need.
@@ -61,14 +62,15 @@ class Measure:
         """Return a measure from values of a YAML file, in which keys are lists."""
         return cls(_key(entry), where=None if where is None else _key(where), **options)
 
-    def pool(self, values: Sequence[float], episodes: Sequence[int] | None = None) -> float:
+    def pool(self, values: Sequence[float], episodes: Sequence[float] | None = None) -> float:
         """Return the mean of the episodes that have a number, see `denominators`.
 
         Of numbers it is the minimum of minima, and the maximum of maxima.
 
         Args:
             values: of the episodes, or means of some; NaN for one without a number.
-            episodes: how many episodes each value is the mean of; None for one.
+            episodes: how many episodes each value is the mean of, or which share of as many; None
+                for one.
         """
         counts = [1] * len(values) if episodes is None else episodes
         known = [not math.isnan(value) for value in values]
@@ -109,7 +111,8 @@ def summarise(
     """Return the means of each case, then their mean as the case `MEAN_CASE`.
 
     The cases are in the order of the episodes. A measure is pooled over the episodes that have it,
-    see `denominators`. The mean of the return is NaN if that of an episode is.
+    see `denominators`, and counts in the mean of the cases by their share in each. The mean of the
+    return is NaN if that of an episode is.
 
     Args:
         episodes: `case`, `reward` and the measures of each.
@@ -119,14 +122,22 @@ def summarise(
     for episode in episodes:
         cases.setdefault(episode["case"], []).append(episode)
 
-    def pool(case: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    def pool(
+        case: str, rows: Sequence[Mapping[str, Any]], shares: Mapping[str, Sequence[float]]
+    ) -> dict[str, Any]:
         means = {"case": case, "reward": fmean(float(row["reward"]) for row in rows)}
-        return means | {
-            name: measure.pool([row[name] for row in rows]) for name, measure in measures.items()
-        }
+        for name, measure in measures.items():
+            means[name] = measure.pool([row[name] for row in rows], shares.get(name))
+        return means
 
-    rows = [pool(case, group) for case, group in cases.items()]
-    return [*rows, pool(MEAN_CASE, rows)]
+    rows = [pool(case, group, {}) for case, group in cases.items()]
+    shares = {name: [_share(group, name) for group in cases.values()] for name in measures}
+    return [*rows, pool(MEAN_CASE, rows, shares)]
+
+
+def _share(episodes: Sequence[Mapping[str, Any]], name: str) -> float:
+    """Return the share of episodes that have a measure."""
+    return fmean(not math.isnan(episode[name]) for episode in episodes)
 
 
 def denominators(

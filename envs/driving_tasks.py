@@ -94,7 +94,6 @@ class DrivingTasksEnv(ConeTrackEnv):
     """
 
     reward_terms: ClassVar[tuple[str, ...]] = (*TERMS, *PositionWeights._fields)
-    draws_in_steps: ClassVar[bool] = True  # the changes of tasks
 
     def __init__(
         self,
@@ -210,7 +209,7 @@ class DrivingTasksEnv(ConeTrackEnv):
         One draw per car decides both about the change and about the new task: its lowest values
         stand for the other tasks, all higher ones for no change.
         """
-        drawn = torch.rand(self.batch_size, generator=self.generator)
+        drawn = self._for_all_rows(torch.rand(self._drawing_rows, generator=self.generator))
         drawn = drawn.to(self.device, non_blocking=True)
         others = len(self.tasks) - 1
         shift = (drawn * (self.duration * self.rate * others)).floor_().to(self.task.dtype) + 1

@@ -13,6 +13,7 @@ from typing import Any
 
 import gymnasium
 from gymnasium import error as errors
+from gymnasium.envs.registration import load_env_creator
 
 from coil_rl.envs.gate import shortened, shown
 
@@ -51,6 +52,22 @@ def maker_of(id: str | Callable[..., Env]) -> str | Callable[..., Env]:
     except ImportError:
         return id  # Gymnasium says what is wrong
     return found if callable(found) and name not in gymnasium.registry else id
+
+
+def registered_maker(id: str) -> Any:
+    """Return what makes a registered env.
+
+    Args:
+        id: as in NAME or MODULE:NAME, of which the module registers the name.
+
+    Raises:
+        gymnasium.error.Error: for a name that is not registered.
+    """
+    module, _, name = id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    maker = gymnasium.spec(name).entry_point
+    return load_env_creator(maker) if isinstance(maker, str) else maker
 
 
 def name_of(maker: str | Callable[..., Env]) -> str:

@@ -1,6 +1,6 @@
 """An env that draws all its random numbers from a generator of its own."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,20 +12,27 @@ class SeededEnv(EnvBase):
 
     Attributes:
         generator: of all random numbers.
-        different: number of rows that draw where their episodes begin, of B; row i begins as row
-            `i % different`. None: all rows draw.
-        draws_in_steps: whether rows that begin alike and act alike draw different numbers later.
+        different: number of rows that draw, of B; row i gets what row `i % different` draws, so
+            that rows that act alike have the same episode. None: all rows draw.
     """
-
-    draws_in_steps: ClassVar[bool] = False
 
     generator: torch.Generator
     different: int | None = None
 
     def _drawn(self, high: int) -> Tensor:
-        """Draw an integer below `high` for each row, the same for rows that begin alike, [B]."""
+        """Draw an integer below `high` for each row, [B]."""
+        return self._for_all_rows(
+            torch.randint(high, (self._drawing_rows,), generator=self.generator)
+        )
+
+    @property
+    def _drawing_rows(self) -> int:
+        """Number of rows that draw."""
+        return self.different or self.batch_size.numel()
+
+    def _for_all_rows(self, drawn: Tensor) -> Tensor:
+        """Return for all rows, [B, ...], what those that draw have drawn."""
         rows = self.batch_size.numel()
-        drawn = torch.randint(high, (self.different or rows,), generator=self.generator)
         return drawn if self.different is None else drawn[torch.arange(rows) % self.different]
 
     def __setattr__(self, name: str, value: Any) -> None:

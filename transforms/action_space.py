@@ -384,14 +384,15 @@ def space_of(env: EnvBase, action_key: NestedKey) -> ActionSpace:
 
 
 def random_action(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:
-    """Write a random action of an env, which is uniform where the action is bounded.
+    """Write a random action of an env: uniform, see `ActionSpace.random`.
 
     Args:
         env: with one action.
         tensordict: of the env, [*batch].
     """
     spec = env.full_action_spec[env.action_key]
-    if not isinstance(spec, Bounded) or bool((spec.space.high - spec.space.low).isfinite().all()):
+    bounded = isinstance(spec, Bounded) and (spec.space.high - spec.space.low).isfinite().all()
+    if bounded or not spec.dtype.is_floating_point:
         return env.rand_action(tensordict)
     draws = torch.rand(spec.shape, dtype=spec.dtype, device=spec.device)
     return tensordict.set(env.action_key, ActionSpace(spec, env.batch_dims).random(draws))

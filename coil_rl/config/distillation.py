@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import hydra.utils
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
@@ -20,14 +21,15 @@ from torch import nn
 from coil_rl.config import load
 from coil_rl.config.build import build_guides, build_learner, env_maker
 from coil_rl.config.fingerprint import fingerprint as fingerprint_of_object
+from coil_rl.config.fingerprint import is_of_user
 from coil_rl.config.given import kept_objects
 from coil_rl.config.nodes import find_target
 from coil_rl.config.schema import TrainConfig, fingerprint
 from coil_rl.config.start import run_configured
+from coil_rl.config.trust import import_paths
 from coil_rl.errors import UserError
 from coil_rl.files import temporary, whole_file
 from coil_rl.guides import ControllerGuide
-from coil_rl.guides.controllers import load as load_controller
 from coil_rl.transforms.normalised_action import in_unit_of
 
 FILES = ("config.yaml", "policy_last.pt")  # files of a run that are needed to load its policy
@@ -72,19 +74,41 @@ def _hash_of_user(config: DictConfig, name: str) -> list[str]:
         name: of the guide.
     """
     guide = config.guide[name]
-    target = find_target(guide.get("_target_"), f"guide.{name}")
     things = kept_objects(config, "env")
-    if not target.__module__.startswith("coil_rl."):
-        things.append(target)
-    if target is ControllerGuide:
+    if find_target(guide.get("_target_"), f"guide.{name}") is ControllerGuide:
         things += kept_objects(config, "guide")
-        if isinstance(guide.get("of"), str):
-            with suppress(ValueError):  # the guide is refused where it is built
-                things.append(load_controller(guide.of))
+    parts = OmegaConf.create({"guide": guide, "env": config.env})
+    named = [*map(_named, sorted(import_paths(parts))), _registered(config.env.get("id"))]
+    things += [thing for thing in named if thing is not None and is_of_user(thing)]
     if not things:
         return []
     text = " ".join(map(fingerprint_of_object, things))
     return [hashlib.sha256(text.encode()).hexdigest()[:10]]
+
+
+def _named(path: str) -> Any:
+    """Return what an import path names; None for nothing, which is refused where it is built.
+
+    Args:
+        path: written with points only.
+    """
+    with suppress(Exception):
+        return hydra.utils.get_object(path)
+    return None
+
+
+def _registered(id: Any) -> Any:
+    """Return what makes an env that is registered with Gymnasium; None for another one.
+
+    Args:
+        id: of the env; it may be anything.
+    """
+    if isinstance(id, str):
+        with suppress(Exception):
+            from coil_rl.envs.gymnasium_makers import registered_maker
+
+            return registered_maker(id)
+    return None
 
 
 def distil(config: DictConfig, folder: Path) -> int:

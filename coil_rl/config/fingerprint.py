@@ -108,7 +108,7 @@ def _globals(function: FunctionType) -> dict[str, Any]:
 
     Others may be anything, such as a whole experiment.
     """
-    known = function.__globals__ if _is_of_user(function) else {}
+    known = function.__globals__ if is_of_user(function) else {}
     used = {name: known[name] for name in sorted(_names(function.__code__)) if name in known}
     return {
         name: each
@@ -136,7 +136,7 @@ def _is_data(thing: Any) -> bool:
 
 def _of_class(thing: type) -> Iterator[Any]:
     """Yield the bases of a user's class, and its code and data with their names."""
-    if not _is_of_user(thing):
+    if not is_of_user(thing):
         return
     yield thing.__bases__
     for name, each in vars(thing).items():
@@ -150,8 +150,12 @@ def _of_class(thing: type) -> Iterator[Any]:
             yield name, each
 
 
-def _is_of_user(thing: FunctionType | type) -> bool:
-    """Return whether a function or class is neither of Python, of a library nor of this package."""
+def is_of_user(thing: Any) -> bool:
+    """Return whether a function or class is neither of Python, of a library nor of this package.
+
+    Args:
+        thing: the function or class.
+    """
     name = str(getattr(thing, "__module__", ""))
     if name.partition(".")[0] in (*sys.stdlib_module_names, "coil_rl"):
         return False

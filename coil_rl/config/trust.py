@@ -88,17 +88,22 @@ def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -
                 "the part"
             )
     _packages = frozenset(names)
-    _own = frozenset() if command is None else _targets(command)
+    _own = frozenset() if command is None else import_paths(command)
     remember_trust(sorted({*names, *_foreign(command)}))
 
 
 def trust_own(config: DictConfig) -> None:
     """Let this process read folders that name what a configuration of the user names."""
     global _own
-    _own |= _targets(config)
+    _own |= import_paths(config)
 
 
-def _targets(config: DictConfig) -> frozenset[str]:
+def import_paths(config: DictConfig) -> frozenset[str]:
+    """Return what the entries of a configuration name to be imported, written with points only.
+
+    Args:
+        config: the configuration, or a part of it.
+    """
     paths = (
         _import_path(name, key, value)
         for name, key, value in _entries(OmegaConf.to_container(config))
@@ -110,7 +115,7 @@ def _foreign(command: DictConfig | None) -> frozenset[str]:
     """Return the packages that the folder of a run of this command may name only if trusted."""
     if command is None:
         return frozenset()
-    named = _targets(
+    named = import_paths(
         OmegaConf.masked_copy(command, [str(key) for key in command if key != "logger"])
     )
     packages = {target.partition(".")[0] for target in named - NAMED - _shipped_targets()}

@@ -108,7 +108,7 @@ def survey(
 
     recorder = InterceptedPolicy(policy, record)
     guides = _guide_names(env, recorder)
-    result = evaluation.run(env, recorder, tick=tick)
+    result = evaluation.run(env, recorder, different=env.batch_size.numel(), tick=tick)
     steps = torch.tensor([episode["steps"] for episode in result.episodes], device=env.device)
     running = torch.arange(len(history), device=env.device).unsqueeze(-1) < steps
     states: TensorDictBase = torch.stack(history)[running]
@@ -181,6 +181,8 @@ def drive_ablated(
 ) -> list[list[dict[str, Any]]]:
     """Evaluate the deterministic agent with each ablation, all at the same time.
 
+    The noise of env and guides is the same for each of them, and that of an env with its rows.
+
     Removed advice is replaced by a constant, such as its mean: it carries no information and is not
     misleading, as advice from other states would be.
 
@@ -216,7 +218,8 @@ def drive_ablated(
         mask = replaced[torch.arange(rows, device=env.device), section].unsqueeze(-1)
         return state.set(ADVICE, torch.where(mask, replacement, state[ADVICE]))
 
-    episodes = evaluation.run(env, InterceptedPolicy(policy, remove), tick=tick).episodes
+    acting = InterceptedPolicy(policy, remove)
+    episodes = evaluation.run(env, acting, different=share, tick=tick).episodes
     return [episodes[start : start + share] for start in range(0, rows, share)]
 
 

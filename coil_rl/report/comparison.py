@@ -100,15 +100,20 @@ class Group:
         """Mean score, with the interval over the cases: of the means over seeds in each case."""
         return estimate(self.scores.mean(axis=0))
 
-    def known(self, measure: str) -> tuple[int, int]:
+    def known(self, measure: str, case: int | None = None) -> tuple[int, int]:
         """Return in how many of the episodes a measure is known, and the number of episodes.
 
         Args:
             measure: name of the measure.
+            case: index of the only case to count; None for all of them.
         """
         if measure not in self.table:
             return 0, 0
         known, episodes = _episodes(self.table, measure)
+        if case is not None:
+            known, episodes = (
+                each.xs(self.cases[case], level="case") for each in (known, episodes)
+            )
         return int(known.sum()), int(episodes.sum())
 
     @property
@@ -261,15 +266,25 @@ class Comparison:
             row["p"] = float(p)
         return rows
 
-    def _partial(self, group: Group) -> dict[str, int]:
-        """Return in how many episodes each measure is known, unless it is in all episodes."""
+    def _partial(self, group: Group, case: int | None = None) -> dict[str, int]:
+        """Return in how many episodes each measure is known, unless it is in all episodes.
+
+        With such a measure the number of all episodes is among them.
+
+        Args:
+            group: the policy.
+            case: index of the only case to count; None for all of them.
+        """
         names: dict[str, None] = {}
         for each in self.groups:
             for name in each.measures:
                 known, episodes = each.known(name)
                 if 0 < known < episodes:
                     names[name] = None
-        return {f"{name}{EPISODES}": group.known(name)[0] for name in names}
+        if not names:
+            return {}
+        counts = {"episodes": group.known("reward", case)[1]}
+        return counts | {f"{name}{EPISODES}": group.known(name, case)[0] for name in names}
 
     def case_table(self) -> list[dict[str, Any]]:
         """Return one row per policy and case."""
@@ -277,7 +292,8 @@ class Comparison:
         for group in self.groups:
             about = {"driver": group.name, "advice": group.advice, "seeds": group.seeds}
             for index, case in enumerate(group.cases):
-                rows.append(about | {"case": case} | group.means(index))
+                means, counts = group.means(index), self._partial(group, index)
+                rows.append(about | {"case": case} | means | counts)
         return rows
 
     def _pairs(self, group: Group, against: str | None) -> Paired | None:

@@ -20,6 +20,7 @@ from coil_rl.report.table import AUTO_FORMAT, TABLES, Table, fitted, return_form
 Block = Table | str  # a table or a paragraph
 
 MAX_CASES = 8  # in a table
+MOST_SOURCES = 3  # of earlier policies in a sentence
 IN_CASE = "in "  # prefix of columns, since a case may have the name of another column
 GUIDE_RETURN = "guide/"  # prefix of columns of metrics.csv
 GUIDE_CALLS = "guide/calls"  # is no return
@@ -251,13 +252,18 @@ def begun(runs: Sequence[Run]) -> list[str]:
     Args:
         runs: finished runs.
     """
-    sentences = {}
+    sources: dict[str, dict[str, None]] = {}
     for run in runs:
         if (source := begun_with(run.settings)) is not None:
-            sentences[run.label] = (
-                f"Runs of {run.label} began with {source}, whose frames are not among theirs."
-            )
-    return list(sentences.values())
+            sources.setdefault(run.label, {})[source] = None
+    sentences = []
+    for label, named in sources.items():
+        listed = ", ".join(list(named)[:MOST_SOURCES])
+        more = f" and {len(named) - MOST_SOURCES} more" if len(named) > MOST_SOURCES else ""
+        sentences.append(
+            f"Runs of {label} began with {listed}{more}, whose frames are not among theirs."
+        )
+    return sentences
 
 
 def progress(finished: int, started: int, refused: int = 0) -> str:

@@ -82,7 +82,7 @@ class DrivenLines(Picture):
         for policy, result in results.items():
             first = result[: self.most]
             lines[policy] = [pose[:, :2] for pose in first.histories["pose"]]
-            crashed[policy] = [bool(row.get("crashed")) for row in first.episodes]
+            crashed[policy] = [row.get("crashed", False) > 0 for row in first.episodes]
         draw_lines(tracks, lines, folder / "lines.png", crashed=crashed)
         rate = next(iter(results.values())).rate
         if self.gif and not math.isnan(rate):

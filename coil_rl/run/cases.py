@@ -82,12 +82,9 @@ class TrainingCases:
             self._copy(copies)
 
     def can_copy(self) -> bool:
-        """Return whether several rows of the env can have the same case.
-
-        They cannot where rows that begin alike draw different numbers later.
-        """
-        seeded = seeded_env(self._build(SOME_ROWS) if self.env is None else self.env)
-        return seeded is not None and not seeded.draws_in_steps
+        """Return whether several rows of the env can have the same case."""
+        env = self._build(SOME_ROWS) if self.env is None else self.env
+        return seeded_env(env) is not None
 
     def _copy(self, copies: int) -> EnvBase:
         """Return an env that has each of the present cases in that many rows."""
@@ -217,7 +214,7 @@ def further_cases(done: int, taken: int, frames: int) -> int:
 
 
 def seeded_env(env: EnvBase | None) -> SeededEnv | None:
-    """Return the env below all transforms, if its rows can begin alike; None for another env."""
+    """Return the env below all transforms, if its rows can have one case; None for another env."""
     base = env.base_env if isinstance(env, TransformedEnv) else env
     return base if isinstance(base, SeededEnv) else None
 

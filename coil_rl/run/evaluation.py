@@ -18,6 +18,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.measures import Measure
 from coil_rl.run.lean_steps import LeanEnv
 from coil_rl.transforms.guide_transform import SeededGenerator
@@ -62,6 +63,7 @@ def evaluate_policy(
     measures: Mapping[str, Measure] | None = None,
     record: Mapping[str, NestedKey] | None = None,
     cases: Sequence[str] = (),
+    different: int | None = None,
     tick: Callable[[], Any] | None = None,
     watch: Callable[[Tensor], Any] | None = None,
 ) -> EvaluationResult:
@@ -75,13 +77,15 @@ def evaluate_policy(
         record: entries after each step to keep, by name.
         cases: names of the cases; row i is case i modulo their number. By default rows are
             numbered.
+        different: number of rows that draw random numbers; row i gets those of row `i % different`.
+            None: as many as cases.
         tick: called after every step.
         watch: called after every step with whether each row was in its episode, [rows].
     """
     measures = {"reward": Measure(unravel_key(env.reward_key), "sum"), **(measures or {})}
     totals, recorded = Totals(measures), {name: list[Tensor]() for name in record or {}}
-    some = len(cases) or None
-    for after, running in episodes(env, policy, sampled=sampled, cases=some, tick=tick):
+    drawing = different or len(cases) or None
+    for after, running in episodes(env, policy, sampled=sampled, cases=drawing, tick=tick):
         totals.add(after, running)
         if watch is not None:
             watch(running.reshape(-1))
@@ -142,6 +146,8 @@ class Totals:
             elif reduction == "mean_nonzero":
                 mask = mask & (values != 0)
             extreme = reduction in ("min", "max", "last")
+            if extreme:
+                mask = mask & ~values.isnan()
             empty = torch.full_like(values, torch.nan if extreme else 0.0), torch.zeros_like(values)
             value, count = self.state.get(reduction, empty)
             if reduction == "last":
@@ -154,7 +160,10 @@ class Totals:
             self.state[reduction] = value, count + mask
 
     def results(self) -> dict[str, Tensor]:
-        """Return the measures by name, [rows] each: numbers (float64) or flags (bool)."""
+        """Return the measures by name, [rows] each: numbers (float64) or flags (bool).
+
+        Flags of which some are undecided are numbers: 0, 1, and NaN for these.
+        """
         results = {}
         for reduction, names in self.groups.items():
             values, counts = self.state[reduction]
@@ -166,12 +175,26 @@ class Totals:
                 measure = self.measures[name]
                 if measure.reduction == "any":
                     number = count > 0
-                if measure.at_least is not None:
-                    number = number >= measure.at_least
-                elif measure.at_most is not None:
-                    number = number <= measure.at_most
-                results[name] = number
+                results[name] = _within(measure, number, count)
         return results
+
+
+def _within(measure: Measure, numbers: Tensor, counts: Tensor) -> Tensor:
+    """Return whether numbers are within the bound of a measure; without one the numbers.
+
+    Args:
+        measure: the measure.
+        numbers: of the episodes, [rows].
+        counts: number of steps that each number rests on.
+    """
+    if measure.at_least is not None:
+        flags = numbers >= measure.at_least
+    elif measure.at_most is not None:
+        flags = numbers <= measure.at_most
+    else:
+        return numbers
+    undecided = numbers.isnan() & (counts > 0)
+    return torch.where(undecided, torch.nan, flags.double()) if undecided.any() else flags
 
 
 def episodes(
@@ -190,7 +213,8 @@ def episodes(
         env: as for `evaluate_policy`.
         policy: as above.
         sampled: as above.
-        cases: number of different cases; row i has case `i % cases`. None: as many as rows.
+        cases: number of different cases; row i has the random numbers of row `i % cases`. None: as
+            many as rows.
         tick: as above.
     """
     with _drawn_by_case(env, cases):
@@ -217,16 +241,17 @@ def episodes(
 
 @contextmanager
 def _drawn_by_case(env: EnvBase, cases: int | None) -> Iterator[None]:
-    """Let transforms and guides draw the same random numbers for all rows of a case."""
+    """Let the env, transforms and guides draw the same random numbers for all rows of a case."""
     several = cases is not None and env.batch_dims == 1 and env.batch_size.numel() > cases
-    parts = [part for part in env.modules() if isinstance(part, SeededGenerator)]
+    parts = [part for part in env.modules() if isinstance(part, (SeededEnv, SeededGenerator))]
+    before = [part.different for part in parts]
     try:
         for part in parts:
             part.different = cases if several else None
         yield
     finally:  # a guide may be a part of another env too
-        for part in parts:
-            part.different = None
+        for part, different in zip(parts, before, strict=True):
+            part.different = different
 
 
 def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool) -> TensorDictBase:

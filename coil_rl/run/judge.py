@@ -370,7 +370,8 @@ def _watch(env: EnvBase, pictures: list[Picture], rows: Mapping[str, int], runni
 def report_outcome(folder: Path) -> float:
     """Print the evaluation of a run, and return the mean reward of its deterministic policy.
 
-    Without a policy it is that of the guide. A damaged file is a `UserError`.
+    Without a policy it is that of the guide; that of a fallback is on the page only. A damaged file
+    is a `UserError`.
     """
     path = folder / "evaluation.csv"
     with file_of_a_run(path, "remove the file, and evaluate again"):
@@ -378,7 +379,9 @@ def report_outcome(folder: Path) -> float:
         means = [
             row for row in rows if (row["case"], row["actions"]) == (MEAN_CASE, "deterministic")
         ]
-        last = [row for row in means if not row["advice"]][-1]
+        with_fallback = {f"{row['driver']}{FALLBACK}" for row in means}
+        own = [row for row in means if not row["advice"] and row["driver"] not in with_fallback]
+        last = own[-1]
         reward, completed = float(last["reward"]), float(last.get("completed", "nan"))
         page = read_text(folder / "evaluation.md", LARGEST_NUMBERS).rstrip()
     say(page)

@@ -9,7 +9,7 @@ not from a real robot.
 import math
 from collections.abc import Sequence
 from functools import reduce
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -86,8 +86,6 @@ class SimulatedRobotEnv(SeededEnv):
         >>> env.rollout(3, break_when_any_done=False)["next", "observation"].shape
         torch.Size([2, 3, 20])
     """
-
-    draws_in_steps: ClassVar[bool] = True  # the noise of the scans
 
     def __init__(
         self,
@@ -269,7 +267,7 @@ class SimulatedRobotEnv(SeededEnv):
         cones, radius = self.course.cones[:, track], self.course.radius[track]
         distance, _ = cast_beams(poses[:, rows], self.lidar.angles, cones, radius)
         true = torch.full_like(self.scan, torch.inf).index_copy(0, rows, distance)
-        return self.lidar.measure(true, self.generator)[0]
+        return self.lidar.measure(true, self.generator, self.different)[0]
 
     def stand(self) -> None:
         """Measure another scan while all robots stand, which is no step of their episodes."""

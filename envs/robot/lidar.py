@@ -63,7 +63,9 @@ class SimulatedLidar:
         self.angles = (steps * (2 * math.pi / beams) - math.pi).float()
         self.phase = torch.arange(beams - 1, -1, -1) / beams
 
-    def measure(self, true: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def measure(
+        self, true: Tensor, generator: torch.Generator, different: int | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Measure distances with noise.
 
         The number of random draws does not depend on the distances.
@@ -71,13 +73,19 @@ class SimulatedLidar:
         Args:
             true: the true distances, [B, P] m, infinite for no cone.
             generator: of the noise.
+            different: number of rows that draw; row i has the noise of row `i % different`. None:
+                all rows draw.
 
         Returns:
             The measured ranges [B, P] m, infinite without a return, and which of them are outliers
             [B, P].
         """
-        noise = torch.randn(true.shape, generator=generator)
-        chance, uniform = torch.rand(2, *true.shape, generator=generator)
+        shape = true.shape if different is None else (different, *true.shape[1:])
+        noise = torch.randn(shape, generator=generator)
+        chance, uniform = torch.rand(2, *shape, generator=generator)
+        if different is not None:
+            rows = torch.arange(len(true)) % different
+            noise, chance, uniform = noise[rows], chance[rows], uniform[rows]
         deviation = self.noise + self.noise_growth * true.clamp(max=RANGE_MAX).square()
         ranges = true + noise * deviation
         outlier = chance < self.outliers

@@ -116,6 +116,17 @@ def test_mean_over_fewer_episodes_says_so():
     assert with_denominators(rows, counts) == rows == with_shares(rows, counts, columns)
 
 
+def test_mean_over_cases_counts_a_measure_by_the_episodes_that_have_it():
+    lap_times = {"a": [5.0, math.nan, math.nan], "b": [7.0, 7.0, 7.0]}
+    episodes = [
+        {"case": case, "reward": 1.0, "lap_time": lap_time}
+        for case, numbers in lap_times.items()
+        for lap_time in numbers
+    ]
+    *_, mean = summarise(episodes, {"lap_time": Measure("lap")})
+    assert mean["lap_time"] == pytest.approx((5 + 7 + 7 + 7) / 4)
+
+
 def test_mean_of_returns_is_not_a_number_if_one_is_not():
     episodes = [{"case": "a", "reward": 1.0}, {"case": "b", "reward": math.nan}]
     rows, counts = summarise(episodes, {}), denominators(episodes, {})

@@ -18,7 +18,7 @@ from torchrl.data import (
 )
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from coil_rl.guides import FollowAdvice
+from coil_rl.guides import FollowAdvice, RandomGuide
 from coil_rl.testing import check_env
 from coil_rl.transforms import (
     GuideActions,
@@ -28,7 +28,7 @@ from coil_rl.transforms import (
     RewardCoupling,
     Takeover,
 )
-from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.transforms.action_space import ActionSpace, random_action
 
 
 class Copies(EnvBase):
@@ -261,3 +261,21 @@ def test_one_hot_choices_are_those_of_an_index():
     assert ActionSpace(OneHot(3, (2, 3)), 1).range.same_as(
         ActionSpace(Categorical(3, (2,)), 1).range
     )
+
+
+@pytest.mark.parametrize(
+    ("spec", "low", "high"),
+    [
+        (Unbounded((1000, 1)), -1.0, 1.0),
+        (Bounded(torch.full((1000, 1), 3.0), torch.full((1000, 1), torch.inf)), 3.0, 5.0),
+        (Bounded(2.0, 6.0, (1000, 1)), 2.0, 6.0),
+    ],
+)
+def test_random_actions_are_those_of_the_random_guide(spec, low, high):
+    env, guide = Copies(spec), RandomGuide()
+    guide.in_space(ActionSpace(spec, 1))
+    for actions in (random_action(env, env.reset()), guide(env.reset())):
+        drawn = actions["action"]
+        assert (drawn >= low).all()
+        assert (drawn <= high).all()
+        assert drawn.std().item() == pytest.approx((high - low) / 12**0.5, rel=0.1)

@@ -3,6 +3,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import gymnasium
 import pytest
 import torch
 from hydra import compose, initialize_config_module
@@ -101,6 +102,42 @@ def test_proxy_of_a_controller_is_another_one_after_a_change_of_its_code(
         (tmp_path / "changing.py").write_text(f"{code}        return [{gain} * o[0]]\n")
         monkeypatch.delitem(sys.modules, "changing", raising=False)
         folders.append(folder_of_proxy("changing:Mine"))
+    assert folders[0] == folders[1] != folders[2]
+
+
+PLANT = """
+import gymnasium
+
+class Plant(gymnasium.Env):
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
+    gain = {gain}
+
+gymnasium.register("Changing-v0", Plant)
+"""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["env.id=changing:Plant"],
+        ["env.id=changing:Changing-v0"],
+        ["env.id=Pendulum-v1", "+env.controllers.mine=changing:Plant"],
+        ["env.id=Pendulum-v1", "env.wrappers=[{_target_: changing.Plant, _partial_: true}]"],
+    ],
+    ids=["class", "registered", "controller", "wrapper"],
+)
+def test_proxy_in_an_env_is_another_one_after_a_change_of_its_code(words, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    folders = []
+    for gain in (1.0, 1.0, 2.0):
+        (tmp_path / "changing.py").write_text(PLANT.format(gain=gain))
+        monkeypatch.delitem(sys.modules, "changing", raising=False)
+        monkeypatch.delitem(gymnasium.registry, "Changing-v0", raising=False)
+        with initialize_config_module("coil_rl.conf", version_base="1.3"):
+            given = ["env=gym", *words, "guide=constant", "method=dynamic_coil_sequential"]
+            config = compose("train", [*given, "run_dir=unused"])
+        folders.append(distillation.proxy_config(config, "constant").run_dir)
     assert folders[0] == folders[1] != folders[2]
 
 

@@ -7,9 +7,9 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 from worlds import driving_measures
 
-from coil_rl.envs import ConeTrackEnv
+from coil_rl.envs import ConeTrackEnv, SimulatedRobotEnv
 from coil_rl.guides import RandomGuide, SplineGuide
-from coil_rl.listening.sections import SECTIONS, TrackSections
+from coil_rl.listening.sections import SECTIONS, TrackSections, WholeEpisode
 from coil_rl.listening.survey import Ablation, ablations, drive_ablated, survey, table_by_section
 from coil_rl.run.judge import Evaluation
 from coil_rl.transforms import GuideActions
@@ -24,9 +24,16 @@ FOLLOW = TensorDictModule(
 )
 
 
-def make_env(cars, seconds=60):
-    env = ConeTrackEnv(TRACKS, cars, rate=6, laps=1, time_limit=seconds, assignment="cyclic")
+def cars(count, seconds=60):
+    return ConeTrackEnv(TRACKS, count, rate=6, laps=1, time_limit=seconds, assignment="cyclic")
+
+
+def guided(env):
     return TransformedEnv(env, GuideActions({"spline": SplineGuide(), "random": RandomGuide()}))
+
+
+def make_env(count, seconds=60):
+    return guided(cars(count, seconds))
 
 
 @pytest.fixture(scope="module")
@@ -137,3 +144,24 @@ def test_rows_must_be_a_multiple_of_the_ablations_and_have_advice():
         )
     with pytest.raises(ValueError, match="nothing writes guide_action"):
         survey(ConeTrackEnv(TRACKS, 2), FOLLOW, TRACK_SECTIONS, EVALUATION)
+
+
+def robots(count):
+    return SimulatedRobotEnv(num_envs=count, assignment="cyclic", laps=1, time_limit=20)
+
+
+@pytest.mark.parametrize(("bare", "slot"), [(cars, 1), (robots, 0)], ids=["cars", "robots"])
+def test_removal_of_a_guide_that_is_not_followed_loses_nothing(bare, slot):
+    """All draws, of a random guide and of a LiDAR, are the same with and without the removal."""
+    follow = TensorDictModule(
+        lambda advice: advice[:, slot], in_keys=["guide_action"], out_keys=["action"]
+    )
+    evaluation, sections = Evaluation(["the track"]), WholeEpisode()
+    intact = survey(guided(bare(3)), follow, sections, evaluation, donors=1)
+    returns = [episode["reward"] for episode in intact.result.episodes]
+    removed, zero = [Ablation(1 - slot), Ablation(slot)], torch.zeros(2, 1)
+    env = guided(bare(6))
+    unused, used = drive_ablated(env, follow, sections, evaluation, removed, zero)
+    assert len(set(returns)) == 3
+    assert [episode["reward"] for episode in unused] == pytest.approx(returns, rel=1e-6)
+    assert [episode["reward"] for episode in used] != pytest.approx(returns, rel=1e-6)

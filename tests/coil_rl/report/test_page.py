@@ -164,6 +164,19 @@ def test_frames_of_other_runs_are_said():
     ]
 
 
+def test_all_policies_that_the_seeds_of_a_label_began_with_are_named():
+    def begun(seeds):
+        settings = [{"init": f"outputs/first_seed{seed}"} for seed in range(seeds)]
+        runs = [Run(Path(), "own", seed, True, settings=each) for seed, each in enumerate(settings)]
+        return page.begun([*runs, *runs])
+
+    two = "the policy of outputs/first_seed0, the policy of outputs/first_seed1"
+    assert begun(2) == [f"Runs of own began with {two}, whose frames are not among theirs."]
+    (sentence,) = begun(5)
+    assert sentence.startswith(f"Runs of own began with {two}, the policy of outputs/first_seed2 ")
+    assert sentence.endswith("_seed2 and 2 more, whose frames are not among theirs.")
+
+
 def test_empty_columns_and_many_cases_are_omitted(tmp_path):
     cases = {f"case_{k}": 1.0 * k for k in range(9)}
     make_run(tmp_path / "run", "coil", 0, driven("guide", cases) + driven("coil", cases))
@@ -200,8 +213,12 @@ def test_measure_of_some_episodes_counts_as_often_as_it_is_known(tmp_path):
     # The second run has no such columns: all of its ten episodes have a lap.
     row = comparison.table()[0]
     assert row["lap_time"] == (5 * 50 + 80 + 10 * 50) / 16
-    assert row["lap_time_episodes"] == 16
+    assert (row["lap_time_episodes"], row["episodes"]) == (16, 20)
     assert "51.88 (16 of 20)" in str(page.section(comparison, [row], None)[0])
+    by_case = {case["case"]: case for case in comparison.case_table()}
+    assert [by_case[case]["episodes"] for case in "ab"] == [10, 10]
+    assert [by_case[case]["lap_time_episodes"] for case in "ab"] == [10, 6]
+    assert by_case["b"]["lap_time"] == (80 + 5 * 50) / 6
 
 
 def test_guide_in_some_runs_of_a_label_only_is_said():

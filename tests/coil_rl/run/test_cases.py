@@ -203,12 +203,15 @@ def test_start_test_of_a_training_has_its_correlation(tmp_path):
     assert training_of(run, 0).cases.noise_correlation == run.noise_correlation == 0.6
 
 
-def test_policies_act_in_turn_where_rows_that_begin_alike_draw_other_numbers():
-    cases, learner = built("env=simulated_robot")  # its scans are noisy
-    assert not cases.can_copy()
+def test_policies_side_by_side_have_the_same_noise_of_their_scans():
+    cases, learner = built("env=simulated_robot")
+    assert cases.can_copy()
     cases.renew(2)
     first, second = cases.compared([learner.policy, learner.policy])
+    (alone,) = cases.compared([learner.policy])
     assert torch.equal(first, second)
+    assert first[0] != first[1]
+    torch.testing.assert_close(first, alone, rtol=1e-3, atol=0.1)
 
 
 @pytest.mark.parametrize(

@@ -169,6 +169,25 @@ def test_nan_is_no_event_and_shows_in_means():
     assert all(math.isnan(found[name]) for name in ("mean", "sum", "mean_nonzero"))
 
 
+def test_last_number_is_that_of_the_last_step_that_has_one():
+    totals = Totals({"last": Measure("number", "last")})
+    for step in ([0.0, math.nan], [2.0, math.nan], [math.nan, math.nan]):
+        after = TensorDict({"number": torch.tensor(step)[:, None]}, [2])
+        totals.add(after, torch.ones(2, 1, dtype=torch.bool))
+    assert totals.results()["last"].tolist() == pytest.approx([2.0, math.nan], nan_ok=True)
+
+
+@pytest.mark.parametrize("bound", ["at_least", "at_most"])
+@pytest.mark.parametrize("reduction", ["mean", "sum", "mean_nonzero", "last", "min", "max"])
+def test_bound_of_a_mean_or_sum_that_is_nan_is_undecided(reduction, bound):
+    totals = Totals({"flag": Measure("number", reduction, **{bound: 1.0})})
+    after = TensorDict({"number": torch.tensor([[1.0], [math.nan]])}, [2])
+    totals.add(after, torch.ones(2, 1, dtype=torch.bool))
+    within, without = totals.results()["flag"].tolist()
+    assert within == 1
+    assert math.isnan(without) if reduction in ("mean", "sum", "mean_nonzero") else not without
+
+
 @pytest.mark.parametrize("batch", [(), (7,), (2, 3)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_measures_are_those_of_numpy(batch, dtype):

@@ -19,7 +19,7 @@ from coil_rl.config.build import (
 )
 from coil_rl.errors import UserError
 from coil_rl.report.pictures import Picture
-from coil_rl.run.judge import evaluate_guides, judge
+from coil_rl.run.judge import evaluate_guides, judge, report_outcome
 
 TINY = ["env.time_limit=1", "guide=[spline,random]", "run_dir=unused"]
 
@@ -190,3 +190,13 @@ def test_curve_of_an_own_env_rests_on_20_cases_that_the_table_has_not():
     firsts = [config.evaluation.env.first_seed, *(each.first_seed for each in curve.cases.values())]
     firsts.sort()
     assert all(later - first >= 20 for first, later in pairwise(firsts))
+
+
+@pytest.mark.parametrize("label", ["mine", "mine or guide"])
+def test_outcome_is_that_of_the_policy_without_its_fallback(label, tmp_path):
+    rows = [("guide", 9.0), (label, 5.0), (f"{label} or guide", 7.0)]
+    lines = [f"{driver},,deterministic,mean,{reward}" for driver, reward in rows]
+    table = ["driver,advice,actions,case,reward", *lines]
+    (tmp_path / "evaluation.csv").write_text("\n".join(table))
+    (tmp_path / "evaluation.md").write_text("The page.")
+    assert report_outcome(tmp_path) == 5.0

@@ -154,3 +154,12 @@ def test_no_sensor_and_no_cone_are_allowed():
     assert bool((cone == -1).all())
     cones = torch.ones(2, 4)
     assert cast_beams(poses[:, :0], lidar.angles, cones, torch.ones(4))[0].shape == (0, 360)
+
+
+def test_rows_of_one_case_have_the_same_noise():
+    true = torch.rand(2, 360, generator=torch.Generator().manual_seed(0)) + 0.5
+    few, _ = SimulatedLidar().measure(true, torch.Generator().manual_seed(1))
+    many, _ = SimulatedLidar().measure(
+        true.repeat(3, 1), torch.Generator().manual_seed(1), different=2
+    )
+    assert torch.equal(many, few.repeat(3, 1))
