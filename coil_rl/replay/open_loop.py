@@ -140,7 +140,8 @@ def recorded_steering(
 ) -> Steering:
     """Return the recorded commands as steering, see `Recording.steering`.
 
-    It is NaN where there is no command.
+    It is NaN where there is no command, and its smoothness compares with the last commands that
+    there are.
 
     Args:
         recording: a recording with commands.
@@ -150,9 +151,12 @@ def recorded_steering(
     """
     angle, omega, _ = recording.steering(speed, car_length)
     action = (angle / max_steering).clip(-1, 1)
-    before = np.concatenate([np.zeros(HISTORY), np.nan_to_num(action[:-1])])
+    known = ~np.isnan(action)
+    given, smoothness = action[known], np.full(len(action), np.nan)
+    before = np.concatenate([np.zeros(HISTORY), given[:-1]])
     history = np.lib.stride_tricks.sliding_window_view(before, HISTORY)[:, ::-1].T.copy()
-    return Steering(action, omega, np.abs(action - recent_mean(torch.from_numpy(history)).numpy()))
+    smoothness[known] = np.abs(given - recent_mean(torch.from_numpy(history)).numpy())
+    return Steering(action, omega, smoothness)
 
 
 def _share_beyond(

@@ -85,6 +85,18 @@ def test_scans_before_the_first_command_are_left_out_and_a_stop_is_straight():
         recorded_steering(recording(), 0.15, 2 / 7, MAX_STEERING)
 
 
+def test_smoothness_passes_over_scans_without_a_command():
+    """A robot that turns evenly steers smoothly, also where its commands are missing."""
+    scans, second = 80, 10**9
+    times = np.delete(np.arange(scans), np.s_[40:60]) * second
+    drive = recording(np.full(len(times), 0.2), times, scans=scans, period=second)
+    steering = recorded_steering(drive, 0.15, 2 / 7, MAX_STEERING)
+    unknown = np.isnan(steering.action)
+    assert unknown[44:60].all()
+    np.testing.assert_array_equal(np.isnan(steering.smoothness), unknown)
+    np.testing.assert_allclose(steering.smoothness[20:][~unknown[20:]], 0.0, atol=1e-12)
+
+
 def test_random_draws_of_a_policy_depend_on_the_seed_alone():
     def drawing():
         return TensorDictModule(
