@@ -58,6 +58,7 @@ class OpenLoop:
         valid: [N, 2], whether each side is valid in the scan.
         steering: by policy; `recorded_steering` is last, as `RECORDED`, if there are commands.
         max_steering: radians of an action of 1.
+        sight: m, range of view in the scale of the cone world.
         beyond: share of the recorded commands that ask for more than the robot can steer.
     """
 
@@ -68,6 +69,7 @@ class OpenLoop:
     valid: NDArray[np.bool_]
     steering: dict[str, Steering]
     max_steering: float
+    sight: float
     beyond: float = 0.0
 
     @property
@@ -127,12 +129,13 @@ def _result(env: McapReplayEnv, row: int, rollouts: Mapping[str, TensorDictBase]
         columns = [step[key].squeeze(-1).double().numpy() for key in STEERING_KEYS]
         steering[name] = Steering(*columns)
     if recording.commands is not None:
-        robot = env.speed, env.car_length, env.max_steering
-        steering[RECORDED] = recorded_steering(recording, *robot)
-        beyond = _share_beyond(recording, *robot)
+        car = env.speed, env.car_length, env.max_steering
+        steering[RECORDED] = recorded_steering(recording, *car)
+        beyond = _share_beyond(recording, *car)
     view = next(iter(steps.values()))  # equal for all policies
     cones, count, observation, valid = (view[key].numpy() for key in VIEW_KEYS)
-    return OpenLoop(recording, cones, count, observation, valid, steering, env.max_steering, beyond)
+    robot = env.max_steering, env.memory.sight
+    return OpenLoop(recording, cones, count, observation, valid, steering, *robot, beyond)
 
 
 def recorded_steering(

@@ -150,8 +150,7 @@ class LiveDriver:
     ) -> None:
         self.controller, self.perception, self.car = controller, perception, car or Car()
         self.watchdog, self.log = Watchdog(limits), log
-        sight = perception.range_max * perception.scale
-        self.memory = BoundaryMemory(1, spline, smoothing, sight=sight)
+        self.memory = BoundaryMemory(1, spline, smoothing, sight=perception.sight)
         self._begin()
         self._rehearse()
         self._begin()

@@ -173,6 +173,11 @@ class Perception:
         check_range(0, 180, above=True, bearing_max=self.bearing_max)
         check_range(-360, 360, laser_yaw=self.laser_yaw)
 
+    @property
+    def sight(self) -> float:
+        """Range of view in the scale of the cone world, m."""
+        return self.range_max * self.scale
+
     def __call__(
         self, ranges: NDArray[np.floating], angles: NDArray[np.floating]
     ) -> tuple[Array, Integers]:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from coil_rl.envs import McapReplayEnv, Recording
+from coil_rl.envs import SIGHT, McapReplayEnv, Recording
 from coil_rl.guides import ConstantGuide
 from coil_rl.replay.open_loop import RECORDED, OpenLoop, Steering, open_loop, recorded_steering
 from coil_rl.replay.report import describe, disagreement, extent, outcome
@@ -121,7 +121,7 @@ def result_of(remarks=(), **actions):
     one = recording(period=10**9, notes={"simulated": {}})
     vars(one)["remarks"] = remarks
     arrays = np.zeros((4, 2, 1, 2)), np.zeros((4, 2)), np.zeros((4, 20))
-    return OpenLoop(one, *arrays, valid, steering, MAX_STEERING)
+    return OpenLoop(one, *arrays, valid, steering, MAX_STEERING, SIGHT)
 
 
 @pytest.fixture
