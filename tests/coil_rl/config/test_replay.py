@@ -1,17 +1,22 @@
 """Imitation of recorded drives by one command, tested in a closed loop."""
 
 import csv
+import math
 
 import odd_recordings as odd
 import pytest
 import torch
+from hydra import compose, initialize_config_module
 from programs import called
 
 import coil_rl
+from coil_rl.config.build import env_maker
 from coil_rl.envs import McapReplayEnv, Perception, SimulatedRobotEnv, record_drives
 from coil_rl.envs import simulated_cone_classifier as classifier
+from coil_rl.envs.splines import least_squares_parabola
 from coil_rl.guides import SplineGuide
 from coil_rl.run import checkpoint
+from coil_rl.run.parts import TEST
 
 SCANS = 33
 # A second of one robot is enough to see that it drives.
@@ -65,6 +70,21 @@ def test_recorded_steering_is_learned_and_the_imitation_drives(folder):
     torch.testing.assert_close(samples["action"].squeeze(-1), env.recorded[usable])
     tracks = samples["info"]["track"].squeeze(-1)
     assert torch.bincount(tracks).tolist() == [33, 33, 12]
+
+
+def test_the_test_drives_the_car_of_the_recordings():
+    words = ["method=oil", "env=mcap_replay", "env.speed=0.3", "env.car_length=0.6"]
+    words += ["env.max_steering=40", "env.spline=quadratic", "env.perception.range_max=1.6"]
+    words += ["env.perception.scale=5", "env.perception.bearing_max=90", "run_dir=unused"]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", words)
+    env = env_maker(config).bare(1, TEST, None)
+    assert isinstance(env, SimulatedRobotEnv)
+    assert env.step_length * env.rate == pytest.approx(0.3)
+    assert (env.car_length, env.max_steering) == (0.6, math.radians(40))
+    assert env.memory.fit is least_squares_parabola
+    seen = env.perception
+    assert (seen.range_max, seen.scale, seen.bearing_max, seen.laser_yaw) == (1.6, 5, 90, 0)
 
 
 @pytest.mark.slow
