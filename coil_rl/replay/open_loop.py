@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from coil_rl.envs.recordings.recording import Recording
 from coil_rl.envs.recordings.replay_env import McapReplayEnv
 from coil_rl.envs.reward import HISTORY, recent_mean
+from coil_rl.errors import UserError
 
 RECORDED = "recorded"  # name of the recorded commands among the policies
 ROUNDING = 1.001  # of commands at the limit
@@ -100,7 +101,15 @@ def open_loop(
         policies: the policies by name, each with an env that has the transforms it needs.
         seed: of PyTorch's generator, set again for each policy.
         tick: called with the name of the policy after every scan.
+
+    Raises:
+        UserError: for an env with fewer rows than recordings.
     """
+    if env.batch_size[0] < len(env.recordings):
+        raise UserError(
+            f"env.num_envs={env.batch_size[0]} leaves out recordings, of which there are "
+            f"{len(env.recordings)}; leave it out for a row of each"
+        )
     scans = int(env.length.max())
     rollouts: dict[str, TensorDictBase] = {}
     for name, (policy_env, policy) in policies.items():

@@ -99,6 +99,16 @@ def test_data_set_is_the_first_round_of_dagger(folder):
     assert [float(row["learner/samples"]) for row in rows[1:]] == [76.0, 86.0]
 
 
+def test_a_second_pass_and_further_rows_teach_nothing_new(folder):
+    words = ["recording=[a.mcap,b.mcap]", "budget.num_envs=3", "budget.frames=198"]
+    done = trained(folder, *words, "hydra.run.dir=more")
+    assert "2 recordings: 66 of 66 scans are learned." in done.stdout
+    rows = table(folder / "more" / "metrics.csv")[-2:]
+    assert [float(row["learner/samples"]) for row in rows] == [66.0, 66.0]
+    assert [float(row["learner/left_out"]) for row in rows] == [33.0, 99.0]
+    assert (folder / "more" / "evaluation.md").exists()
+
+
 def test_run_is_evaluated_and_replayed_like_any_other(folder):
     trained(folder, "recording=[a.mcap,b.mcap]", "hydra.run.dir=again")
     called("evaluate", "run=again", "hydra.run.dir=evaluated", cwd=folder)
@@ -121,6 +131,9 @@ def test_python_gives_the_same_run_as_the_command(folder, monkeypatch):
         (["recording=null"], "recording must be an MCAP file or a rosbag2 folder, or a list"),
         (["recording=[]"], "env: recordings is empty"),
         (["recording=nothing.mcap"], "env: nothing.mcap cannot be read"),
+        (["budget.num_envs=1"], "env.num_envs=1 leaves out recordings, of which there are 2"),
+        (["env.num_envs=1"], "env.num_envs=1 leaves out recordings, of which there are 2"),
+        (["budget.frames=20", "budget.steps=10"], "longest has 33 scans, so the others would be"),
         (["recording=a.mcap"], "there is one recording, which cannot be left out to validate"),
         (["method=ppo", "learner=ppo"], "method=ppo cannot learn in env=mcap_replay"),
         (["method=dagger"], "method=dagger cannot learn in env=mcap_replay"),

@@ -9,6 +9,7 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from coil_rl.envs import SIGHT, McapReplayEnv, Recording
+from coil_rl.errors import UserError
 from coil_rl.guides import ConstantGuide
 from coil_rl.replay.open_loop import RECORDED, OpenLoop, Steering, open_loop, recorded_steering
 from coil_rl.replay.report import describe, disagreement, extent, outcome
@@ -95,6 +96,12 @@ def test_smoothness_passes_over_scans_without_a_command():
     assert unknown[44:60].all()
     np.testing.assert_array_equal(np.isnan(steering.smoothness), unknown)
     np.testing.assert_allclose(steering.smoothness[20:][~unknown[20:]], 0.0, atol=1e-12)
+
+
+def test_an_env_with_fewer_rows_than_recordings_is_refused():
+    env = McapReplayEnv([recording(), recording()], blind, num_envs=1)
+    with pytest.raises(UserError, match=r"env\.num_envs=1 leaves out recordings, .* are 2;"):
+        open_loop(env, {"straight": (env, ConstantGuide(0.0))})
 
 
 def test_random_draws_of_a_policy_depend_on_the_seed_alone():
