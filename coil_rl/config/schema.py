@@ -302,7 +302,10 @@ class DriveConfig(PolicyConfig):
     controller: dict[str, Any] = field(default_factory=dict)
     policy: WhichPolicy = "handed_over"
     where: Annotated[str, one_of("simulation", "recording", "ros")] = "simulation"
-    recording: Any = None
+    recording: str | None = None
+    scan: str = "/scan"
+    frame: str | None = None
+    strict: bool = False
     rate: Annotated[float | None, Field(gt=0)] = None
     car: dict[str, Any] = MISSING
     perception: dict[str, Any] = MISSING

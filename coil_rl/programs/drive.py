@@ -109,7 +109,14 @@ def _recording(config: DictConfig) -> Recording | None:
     if config.recording is None:
         return None
     try:
-        return read_recording(str(config.recording))
+        return read_recording(
+            config.recording,
+            scan=config.scan,
+            odometry=None,
+            command=None,
+            frame=config.frame,
+            strict=config.strict,
+        )
     except RecordingError as error:
         raise UserError(f"recording: {error}") from error
 
@@ -153,7 +160,8 @@ def described(result: Drive) -> list[str]:
     import numpy as np
 
     states = ", ".join(f"{state} {count}" for state, count in sorted(result.states.items()))
-    lines = [f"{result.scans} scans ({states}); {result.ended}; {result.laps} laps."]
+    laps = "" if result.laps is None else f"; {result.laps} laps"
+    lines = [f"{result.scans} scans ({states}); {result.ended}{laps}."]
     for reason, count in result.waits.most_common(3):
         lines.append(f"Waited after {count} scans: {reason}.")
     lines += [f"Stopped at {now:.2f} s: {reason}." for now, reason in result.stops]

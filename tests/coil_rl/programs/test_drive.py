@@ -5,9 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from drives import scan
 from programs import called
 from tensordict import TensorDict
 
+from coil_rl.envs.recordings.mcap_files import RecordingWriter, read_messages
+from coil_rl.envs.recordings.messages import SCAN, header
 from coil_rl.guides import SplineGuide
 
 
@@ -35,8 +38,23 @@ def test_an_object_with_act_and_reset_drives_and_its_log_is_driven_by_again(tmp_
     assert "CPU time of a scan: median" in (tmp_path / "first" / "drive.md").read_text()
     words = ["where=recording", "recording=first/drive.mcap", "hydra.run.dir=second"]
     second = called("drive", *OWN, *words, cwd=tmp_path)
-    assert "33 scans (driving 33); the recording ended" in second.stdout
+    assert "33 scans (driving 33); the recording ended.\n" in second.stdout
     assert {file.name for file in (tmp_path / "second").iterdir()} == {"drive.mcap", "drive.md"}
+
+
+def test_topic_and_scanner_of_a_recording_are_chosen(tmp_path):
+    called("drive", *OWN, "hydra.run.dir=first", cwd=tmp_path)
+    rows = read_messages(tmp_path / "first" / "drive.mcap", ["/scan"]).messages["/scan"]
+    with RecordingWriter(tmp_path / "two.mcap") as writer:
+        for number, row in enumerate(rows):
+            rear = scan(number, header=header(row.log_time, "rear"))
+            writer.add("/lidar", SCAN, row.log_time, rear)
+            writer.copy(row._replace(channel=row.channel._replace(topic="/lidar")))
+    words = [*OWN, "where=recording", "recording=two.mcap", "hydra.run.dir=second"]
+    done = called("drive", *words, cwd=tmp_path, code=2)
+    assert "has no topic /scan; give the topic of the LiDAR, here /lidar." in done.stderr
+    done = called("drive", *words, "scan=/lidar", "frame=laser", cwd=tmp_path)
+    assert "33 scans (driving 33)" in done.stdout
 
 
 @pytest.mark.slow
