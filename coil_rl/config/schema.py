@@ -295,6 +295,24 @@ class ExportConfig(PolicyConfig):
 
 
 @dataclass
+class SimulationConfig(NodeConfig):
+    """Length of a drive of `coil-drive` on the simulated robot, in seconds and laps."""
+
+    seconds: Annotated[float, Field(gt=0, le=10**6)] = 140.0
+    laps: Annotated[int, Field(ge=1, le=10**6)] = 3
+
+
+@dataclass
+class RosConfig(NodeConfig):
+    """Parameters of the node of ROS 2, see `coil_rl.robot.ros_node.DriveNode`."""
+
+    scan: str = "/scan"
+    odometry: str = "/odom"
+    command: str = "/cmd_vel"
+    stamped: bool = False
+
+
+@dataclass
 class DriveConfig(PolicyConfig):
     """Configuration of `coil-drive`."""
 
@@ -312,8 +330,8 @@ class DriveConfig(PolicyConfig):
     spline: Annotated[str, one_of("cubic", "quadratic")] = "cubic"
     smoothing: Annotated[float, Field(ge=0)] = 0.1
     limits: dict[str, Any] = field(default_factory=dict)
-    simulation: dict[str, Any] = field(default_factory=dict)
-    ros: dict[str, Any] = field(default_factory=dict)
+    simulation: SimulationConfig = field(default_factory=SimulationConfig)
+    ros: RosConfig = field(default_factory=RosConfig)
     lift_after: Annotated[float | None, Field(ge=0)] = None
 
 

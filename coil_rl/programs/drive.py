@@ -18,6 +18,15 @@ if TYPE_CHECKING:
     from coil_rl.robot.sources import Drive
 
 
+# Keys that have an effect everywhere, and in one of the places.
+OF_ALL = ("where", "rate", "car", "perception", "spline", "smoothing", "limits")
+OF_PLACES = {
+    "simulation": ("simulation", "lift_after"),
+    "recording": ("recording", "scan", "frame", "strict", "lift_after"),
+    "ros": ("ros",),
+}
+
+
 def drive(config: DictConfig) -> None:
     """Drive, and write `drive.mcap` and `drive.md`."""
     import torch
@@ -194,6 +203,9 @@ def check(config: DictConfig) -> None:
             f"where={config.where} recording={config.recording} do not go together: give "
             "where=recording recording=FILE, or neither"
         )
+    what = ("controller",) if config.run is None else ("run", "policy")
+    reason = f"nothing reads it with a {what[0]} and where={config.where}"
+    app.check_used((*OF_ALL, *what, *OF_PLACES[config.where]), reason)
     make_folder(Path(config.run_dir))
 
 

@@ -29,11 +29,12 @@ class Silent:
     """No controller."""
 
 
-OWN = [f"+controller._target_={__name__}.Guide", "rate=5.5", "simulation.seconds=6"]
+OWN = [f"+controller._target_={__name__}.Guide", "rate=5.5"]
+SHORT = [*OWN, "simulation.seconds=6"]
 
 
 def test_an_object_with_act_and_reset_drives_and_its_log_is_driven_by_again(tmp_path):
-    first = called("drive", *OWN, "hydra.run.dir=first", cwd=tmp_path)
+    first = called("drive", *SHORT, "hydra.run.dir=first", cwd=tmp_path)
     assert "33 scans (driving 33); the time was over; 0 laps." in first.stdout
     assert "CPU time of a scan: median" in (tmp_path / "first" / "drive.md").read_text()
     words = ["where=recording", "recording=first/drive.mcap", "hydra.run.dir=second"]
@@ -43,7 +44,7 @@ def test_an_object_with_act_and_reset_drives_and_its_log_is_driven_by_again(tmp_
 
 
 def test_topic_and_scanner_of_a_recording_are_chosen(tmp_path):
-    called("drive", *OWN, "hydra.run.dir=first", cwd=tmp_path)
+    called("drive", *SHORT, "hydra.run.dir=first", cwd=tmp_path)
     rows = read_messages(tmp_path / "first" / "drive.mcap", ["/scan"]).messages["/scan"]
     with RecordingWriter(tmp_path / "two.mcap") as writer:
         for number, row in enumerate(rows):
@@ -88,6 +89,12 @@ def test_a_shipped_policy_completes_a_lap_of_the_robot(tmp_path):
         ([*OWN, "recording=x.mcap"], "do not go together"),
         ([*OWN, "where=recording", "recording=x.mcap"], "x.mcap"),
         ([*OWN, "where=moon"], "where"),
+        ([*OWN, "policy=best"], "policy=best has no effect: nothing reads it with a controller"),
+        ([*OWN, "scan=/x"], "scan=/x has no effect: nothing reads it with a controller and where="),
+        ([*OWN, "ros.stamped=true"], "ros.stamped=true has no effect"),
+        ([*OWN, "where=ros", "simulation.laps=1"], "simulation.laps=1 has no effect"),
+        ([*OWN, "simulation.laps=0"], "simulation.laps=0"),
+        ([*OWN, "+simulation.lap=1"], "lap"),
         ([*OWN, "limits.longest_gap=0.1"], "longest_gap=0.1 s must be more than the time"),
         ([*OWN, "limits.blind=-1"], "blind=-1 must be"),
         ([*OWN, "car.speed=0"], "speed=0"),
