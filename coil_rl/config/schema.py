@@ -9,7 +9,7 @@ import json
 import os
 import re
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -327,8 +327,8 @@ class DriveConfig(PolicyConfig):
     rate: Annotated[float | None, Field(gt=0)] = None
     car: dict[str, Any] = MISSING
     perception: dict[str, Any] = MISSING
-    spline: Annotated[str, one_of("cubic", "quadratic")] = "cubic"
-    smoothing: Annotated[float, Field(ge=0)] = 0.1
+    spline: Annotated[str | None, typed_as(Literal["cubic", "quadratic"] | None)] = None
+    smoothing: Annotated[float | None, Field(ge=0)] = None
     limits: dict[str, Any] = field(default_factory=dict)
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
     ros: RosConfig = field(default_factory=RosConfig)

@@ -123,7 +123,8 @@ class SimulatedRobotEnv(SeededEnv):
         self.lidar = lidar or SimulatedLidar()
         self.rate = self.lidar.rate
         self.laps, self.max_steps = laps, round(time_limit * self.rate)
-        self.step_length, self.car_length = speed / self.rate, car_length
+        self.speed, self.car_length = speed, car_length
+        self.step_length = speed / self.rate
         self.max_steering = math.radians(max_steering)
         weights = RewardWeights(**(reward or {}))._asdict()
         self.weights = {key: torch.tensor(float(weight)) for key, weight in weights.items()}

@@ -271,7 +271,7 @@ class BoundaryMemory(nn.Module):
     ) -> None:
         super().__init__()
         self.fit = spline_fit(spline, smoothing)
-        self.sight = sight
+        self.spline, self.smoothing, self.sight = spline, smoothing, sight
         self.samples: Tensor = nn.Buffer(torch.zeros(2, SAMPLES, 2, batch))
         self.ever_valid: Tensor = nn.Buffer(torch.zeros(2, batch))
 

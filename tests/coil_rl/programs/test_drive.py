@@ -7,6 +7,7 @@ import pytest
 import torch
 from drives import scan
 from programs import called
+from run_folders import make_untrained_run
 from tensordict import TensorDict
 
 from coil_rl.envs.recordings.mcap_files import RecordingWriter, read_messages
@@ -58,6 +59,20 @@ def test_topic_and_scanner_of_a_recording_are_chosen(tmp_path):
     assert "33 scans (driving 33)" in done.stdout
 
 
+def test_a_policy_drives_with_what_it_was_trained_with(tmp_path):
+    words = ["env=simulated_robot", "preset=authors", "+env.max_steering=60", "env.smoothing=0.2"]
+    make_untrained_run(tmp_path / "run", "method=coil", *words)
+    drive = ["run=run", "policy=last", "simulation.seconds=2"]
+    done = called("drive", *drive, "hydra.run.dir=same", cwd=tmp_path)
+    assert "with which the policy was trained" not in done.stderr
+    given = ["perception.scale=7", "car.max_steering=80", "rate=5"]
+    done = called("drive", *drive, *given, "hydra.run.dir=other", cwd=tmp_path)
+    assert (
+        "drive: car.max_steering=80 instead of 60, perception.scale=7 instead of 5.625, "
+        "rate=5.0 instead of 5.5, with which the policy was trained\n"
+    ) in done.stderr
+
+
 @pytest.mark.slow
 def test_a_run_of_the_cone_world_drives_the_robot(tmp_path):
     words = ["method=guide", "track=generated", "track.test.count=1", "env.time_limit=1"]
@@ -96,6 +111,9 @@ def test_a_shipped_policy_completes_a_lap_of_the_robot(tmp_path):
         ([*OWN, "simulation.laps=0"], "simulation.laps=0"),
         ([*OWN, "+simulation.lap=1"], "lap"),
         ([*OWN, "limits.longest_gap=0.1"], "longest_gap=0.1 s must be more than the time"),
+        ([*OWN, "perception.scale=0"], "perception: scale=0 must be more than 0"),
+        ([*OWN, "perception.range_max=far"], "perception.range_max='far' must be"),
+        ([*OWN, "smoothing=-1"], "smoothing=-1.0 must be"),
         ([*OWN, "limits.blind=-1"], "blind=-1 must be"),
         ([*OWN, "car.speed=0"], "speed=0"),
         ([*OWN, "lift_after=-1"], "lift_after"),
