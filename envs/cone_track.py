@@ -163,7 +163,7 @@ class ConeTrackEnv(SeededEnv):
         self.every_sighting = cone_bonus == "every_sighting"
         self.kept_cones, self.speed, self.car_length = kept_cones, speed, car_length
         self.max_steering = math.radians(max_steering)
-        self.sight = sight
+        self.spline, self.smoothing, self.sight = spline, smoothing, sight
         self.boundaries = Boundaries(spline_fit(spline, smoothing), sight, hold=hold_boundary)
         if finish_in_sight:
             tracks = [begin_in_sight(track, sight, HALF_FIELD_OF_VIEW) for track in tracks]

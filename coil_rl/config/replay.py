@@ -4,13 +4,14 @@ A recording does not react to actions, so nothing can be learned there by trial.
 was recorded can be imitated, and the imitation is tested in another env, a closed loop.
 """
 
+import math
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from coil_rl.envs import RecordingError
+from coil_rl.envs import McapReplayEnv, RecordingError
 from coil_rl.envs.recordings.mcap_files import read_messages
 from coil_rl.errors import UserError
 from coil_rl.output import say
@@ -37,7 +38,8 @@ def check_replay(config: DictConfig, make_env: EnvMaker) -> None:
         make_env: makes its env.
 
     Raises:
-        UserError: for a method that needs the effect of its actions, and without a recording.
+        UserError: for a method that needs the effect of its actions, without a recording, and for
+            a budget that does not reach all scans.
     """
     if not replays(config):
         return
@@ -53,12 +55,31 @@ def check_replay(config: DictConfig, make_env: EnvMaker) -> None:
     if config.method.learner != "imitation" or explores:
         raise UserError(ONLY_IMITATION.format(method=config.method.name))
     env: Any = make_env.bare(None, TRAIN, None)
+    _check_pass(config, env)
     for line in about_demonstrations(env):
         say(line)
     if not (~env.stale & ~env.standing).any():
         raise UserError(
             "no scan has recorded steering to learn: there is no recent command at any, or the "
             "robot stands; give env.command=TOPIC, or other recordings"
+        )
+
+
+def _check_pass(config: DictConfig, env: McapReplayEnv) -> None:
+    """Raise a `UserError` for a training that ends before all scans of all recordings were seen."""
+    rows, recordings, longest = env.batch_size[0], len(env.recordings), int(env.length.max())
+    if rows < recordings:
+        raise UserError(
+            f"env.num_envs={rows} leaves out recordings, of which there are {recordings}; leave "
+            f"budget.num_envs and env.num_envs out, or give at least {recordings}"
+        )
+    steps = config.budget.steps
+    seen = math.ceil(config.budget.frames / (rows * steps)) * steps
+    if seen < longest:
+        raise UserError(
+            f"budget.frames={config.budget.frames} is {seen} steps of each recording, and the "
+            f"longest has {longest} scans, so the others would be left out; leave budget.frames "
+            f"out, or give at least {rows * longest}"
         )
 
 

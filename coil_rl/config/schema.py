@@ -9,7 +9,7 @@ import json
 import os
 import re
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
@@ -295,6 +295,24 @@ class ExportConfig(PolicyConfig):
 
 
 @dataclass
+class SimulationConfig(NodeConfig):
+    """Length of a drive of `coil-drive` on the simulated robot, in seconds and laps."""
+
+    seconds: Annotated[float, Field(gt=0, le=10**6)] = 140.0
+    laps: Annotated[int, Field(ge=1, le=10**6)] = 3
+
+
+@dataclass
+class RosConfig(NodeConfig):
+    """Parameters of the node of ROS 2, see `coil_rl.robot.ros_node.DriveNode`."""
+
+    scan: str = "/scan"
+    odometry: str = "/odom"
+    command: str = "/cmd_vel"
+    stamped: bool = False
+
+
+@dataclass
 class DriveConfig(PolicyConfig):
     """Configuration of `coil-drive`."""
 
@@ -302,15 +320,18 @@ class DriveConfig(PolicyConfig):
     controller: dict[str, Any] = field(default_factory=dict)
     policy: WhichPolicy = "handed_over"
     where: Annotated[str, one_of("simulation", "recording", "ros")] = "simulation"
-    recording: Any = None
+    recording: str | None = None
+    scan: str = "/scan"
+    frame: str | None = None
+    strict: bool = False
     rate: Annotated[float | None, Field(gt=0)] = None
     car: dict[str, Any] = MISSING
     perception: dict[str, Any] = MISSING
-    spline: Annotated[str, one_of("cubic", "quadratic")] = "cubic"
-    smoothing: Annotated[float, Field(ge=0)] = 0.1
+    spline: Annotated[str | None, typed_as(Literal["cubic", "quadratic"] | None)] = None
+    smoothing: Annotated[float | None, Field(ge=0)] = None
     limits: dict[str, Any] = field(default_factory=dict)
-    simulation: dict[str, Any] = field(default_factory=dict)
-    ros: dict[str, Any] = field(default_factory=dict)
+    simulation: SimulationConfig = field(default_factory=SimulationConfig)
+    ros: RosConfig = field(default_factory=RosConfig)
     lift_after: Annotated[float | None, Field(ge=0)] = None
 
 

@@ -131,19 +131,21 @@ class Imitation(Learner):
         Returns:
             The number of `samples`, and with `kept_key` of the steps that were `left_out`;
             `target_variance`, the mean squared error of predicting the
-            mean; `mse_ahead` and `r2_ahead`, on this batch before the fit; `mse_training` and
-            `r2_training`, on the data set after the fit; with `validate`, the metrics (and errors)
-            of `cross_validate`.
+            mean; `mse_ahead` and `r2_ahead`, on this batch before the fit, if anything in it is to
+            be learned; `mse_training` and `r2_training`, on the data set after the fit; with
+            `validate`, the metrics (and errors) of `cross_validate`.
+
+        Raises:
+            UserError: if nothing is to be learned in this batch and all before.
         """
         pairs = self._pairs(batch)
         dataset: TensorDictBase = pairs
         if self.dataset is not None:
             dataset = torch.cat([self.dataset, pairs])
-        if not len(pairs):
+        if not len(dataset):
             raise UserError(
                 f"none of {batch.numel()} steps is to be learned: there is no recent command at "
-                "any, the robot stands, or all were learned before; check env.command, the topic "
-                "of the commands"
+                "any, or the robot stands; check env.command, the topic of the commands"
             )
         self.dataset = dataset
         x, y = self.concat(*(dataset[key] for key in self.in_keys)), dataset["action"]
@@ -152,9 +154,7 @@ class Imitation(Learner):
             "left_out": float(batch.numel() - len(pairs)),
             "target_variance": float(y.var(0, correction=0).mean()),
         }
-        with torch.no_grad():
-            predicted = self.regressor(self.concat(*(pairs[key] for key in self.in_keys)))
-            metrics |= scores([predicted], [pairs["action"]], "ahead")
+        metrics |= self._ahead(pairs)
         if self.validate:
             groups = None if self.group_key is None else dataset[self.group_key].reshape(-1)
             metrics |= cross_validate(self.regressor, x, y, groups, self.seed)
@@ -180,6 +180,14 @@ class Imitation(Learner):
         kept = [key for key in self.sample_keys if key != self.advice_key or key in self.in_keys]
         pairs = rows.select(*kept)
         return pairs.set("action", rows[self.advice_key][:, self.guide])
+
+    @torch.no_grad()
+    def _ahead(self, pairs: TensorDictBase) -> dict[str, float]:
+        """Return the scores on samples before they are learned, if there are any."""
+        if not len(pairs):
+            return {}
+        predicted = self.regressor(self.concat(*(pairs[key] for key in self.in_keys)))
+        return scores([predicted], [pairs["action"]], "ahead")
 
     def _load(self, file: Path, env: EnvBase) -> TensorDictBase:
         """Load the entries of a data set that this learner needs."""

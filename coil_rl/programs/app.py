@@ -149,16 +149,17 @@ def check_used(used: Iterable[str], reason: str) -> None:
             )
 
 
-def check_evaluated(unused: Iterable[str], reason: str) -> None:
-    """Raise a `UserError` for an override of `evaluation` that has no effect.
+def check_unused(node: str, unused: Iterable[str], reason: str) -> None:
+    """Raise a `UserError` for an override in a node that has no effect.
 
     Args:
-        unused: keys of `evaluation` that have none.
+        node: top-level key, such as "evaluation".
+        unused: keys in it that have none.
         reason: why they have none.
     """
     for key, text in overrides():
         first, *rest = key.split(".")
-        if first == "evaluation" and rest and rest[0] in unused:
+        if first == node and rest and rest[0] in unused:
             raise UserError(f"{text} has no effect: {reason}; leave it out")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,8 +15,17 @@ from coil_rl.programs import app
 
 if TYPE_CHECKING:
     from coil_rl.envs.recordings.reading import Recording
-    from coil_rl.robot import DriveLog, LiveDriver
+    from coil_rl.robot import DriveLog, LiveDriver, Setup
     from coil_rl.robot.sources import Drive
+
+
+# Keys that have an effect everywhere, and in one of the places.
+OF_ALL = ("where", "rate", "car", "perception", "spline", "smoothing", "limits")
+OF_PLACES = {
+    "simulation": ("simulation", "lift_after"),
+    "recording": ("recording", "scan", "frame", "strict", "lift_after"),
+    "ros": ("ros",),
+}
 
 
 def drive(config: DictConfig) -> None:
@@ -29,10 +39,11 @@ def drive(config: DictConfig) -> None:
     folder = Path(config.run_dir)
     epoch = time.time() - time.monotonic() if config.where == "ros" else 0.0
     about = {"where": config.where, "run": str(config.run)}
+    controller, setup = _controller(config)
     log = DriveLog(
-        folder / "drive.mcap", epoch=epoch, max_steering=config.car.max_steering, about=about
+        folder / "drive.mcap", epoch=epoch, max_steering=setup.car.max_steering, about=about
     )
-    driver, recording = make_driver(config, log), _recording(config)
+    driver, recording = _driver(config, controller, setup, log), _recording(config)
     with log:
         result = _driven(config, driver, recording)
     if log.problem:
@@ -43,62 +54,91 @@ def drive(config: DictConfig) -> None:
         print(f"{text}\nsee {folder}")
 
 
-def make_driver(config: DictConfig, log: DriveLog) -> LiveDriver:
-    """Return the driver that a configuration describes.
+def _controller(config: DictConfig) -> tuple[Any, Setup]:
+    """Return what drives, and what it drives with: as in its training where nothing is given."""
+    from coil_rl.config.load import open_run
+    from coil_rl.config.nodes import build
+    from coil_rl.output import say
+    from coil_rl.robot.setup import Setup, setup_of
+
+    if config.run is None:
+        return build(config.controller, "controller"), _setup(config, Setup())
+    controller = open_run(config.run, device=config.device).controller(config.policy)
+    trained = setup_of(controller.plant)
+    setup = _setup(config, trained)
+    differences = setup.differences(trained)
+    if differences:
+        say(f"drive: {', '.join(differences)}, with which the policy was trained", error=True)
+    return controller, setup
+
+
+def _setup(config: DictConfig, trained: Setup) -> Setup:
+    """Return a setup with what the configuration gives."""
+    car = _changed(trained.car, config.car, "car")
+    setup = trained.for_car(car)
+    given = {key: config[key] for key in ("spline", "smoothing", "rate") if config[key] is not None}
+    perception = _changed(setup.perception, config.perception, "perception")
+    return replace(setup, perception=perception, **given)
+
+
+def _changed(part: Any, node: Any, name: str) -> Any:
+    """Return a dataclass with the values that a node gives, which are those that are not null."""
+    from coil_rl.config.arguments import check_arguments
+    from coil_rl.config.nodes import build
+
+    values: Any = OmegaConf.to_container(node, resolve=True)
+    values = {key: each for key, each in values.items() if each not in (None, {"_target_": None})}
+    others = [each.name for each in fields(part) if each.name not in values]
+    check_arguments(type(part), values, name, others)
+    for key, value in values.items():
+        if isinstance(value, dict):
+            values[key] = build(value, f"{name}.{key}")
+    try:
+        return replace(part, **values)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{name}: {error}") from error
+
+
+def _driver(config: DictConfig, controller: Any, setup: Setup, log: DriveLog) -> LiveDriver:
+    """Return the driver.
+
+    Args:
+        config: of the program, with the limits.
+        controller: what drives.
+        setup: what it drives with.
+        log: of the drive.
 
     Raises:
         UserError: for a policy that cannot drive a car by the entries of the cone world.
     """
-    from coil_rl.config.nodes import build
-    from coil_rl.envs import Perception
-    from coil_rl.robot.driver import Car, LiveDriver
+    from coil_rl.robot.driver import LiveDriver
     from coil_rl.robot.watchdog import Limits
 
-    car = build(config.car, "car", Car)
-    perception = build(config.perception, "perception", Perception)
-    controller, rate = _controller(config, car)
-    name = f"run={config.run}" if config.run is not None else "controller"
+    if setup.rate is None:
+        raise UserError(
+            f"run={config.run} is of env {type(controller.plant).__name__}, which has no rate of "
+            "scans; give a run of env=cone_track or env=simulated_robot, or rate=NUMBER"
+        )
     try:
-        limits = Limits(rate, **config.limits)
+        limits = Limits(setup.rate, **config.limits)
     except (TypeError, ValueError) as error:
         raise UserError(f"limits: {error}") from error
     try:
         return LiveDriver(
             controller,
-            perception,
+            setup.perception,
             limits,
-            car,
-            spline=config.spline,
-            smoothing=config.smoothing,
+            setup.car,
+            spline=setup.spline,
+            smoothing=setup.smoothing,
             log=log,
         )
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        name = f"run={config.run}" if config.run is not None else "controller"
         raise UserError(
             f"{name} cannot drive by what a robot observes ({error}); give a policy of "
             "env=cone_track or env=simulated_robot"
         ) from error
-
-
-def _controller(config: DictConfig, car: Any) -> tuple[Any, float]:
-    """Return what drives, and the scans per second for which it was trained."""
-    from coil_rl.config.load import open_run
-    from coil_rl.config.nodes import build
-
-    if config.run is None:
-        return build(config.controller, "controller"), config.rate
-    controller = open_run(config.run, device=config.device).controller(config.policy)
-    if config.rate is not None:
-        return controller, config.rate
-    plant: Any = controller.plant
-    length, rate = getattr(plant, "car_length", None), getattr(plant, "rate", None)
-    if not length or not rate:
-        raise UserError(
-            f"run={config.run} is of env {type(plant).__name__}, which has no car; give a run of "
-            "env=cone_track or env=simulated_robot"
-        )
-    speed = getattr(plant, "speed", None) or plant.step_length * rate
-    # The rate at which this car goes as far between two scans, in lengths of the car.
-    return controller, rate * (car.speed / car.car_length) / (speed / length)
 
 
 def _recording(config: DictConfig) -> Recording | None:
@@ -109,7 +149,14 @@ def _recording(config: DictConfig) -> Recording | None:
     if config.recording is None:
         return None
     try:
-        return read_recording(str(config.recording))
+        return read_recording(
+            config.recording,
+            scan=config.scan,
+            odometry=None,
+            command=None,
+            frame=config.frame,
+            strict=config.strict,
+        )
     except RecordingError as error:
         raise UserError(f"recording: {error}") from error
 
@@ -153,7 +200,8 @@ def described(result: Drive) -> list[str]:
     import numpy as np
 
     states = ", ".join(f"{state} {count}" for state, count in sorted(result.states.items()))
-    lines = [f"{result.scans} scans ({states}); {result.ended}; {result.laps} laps."]
+    laps = "" if result.laps is None else f"; {result.laps} laps"
+    lines = [f"{result.scans} scans ({states}); {result.ended}{laps}."]
     for reason, count in result.waits.most_common(3):
         lines.append(f"Waited after {count} scans: {reason}.")
     lines += [f"Stopped at {now:.2f} s: {reason}." for now, reason in result.stops]
@@ -186,6 +234,9 @@ def check(config: DictConfig) -> None:
             f"where={config.where} recording={config.recording} do not go together: give "
             "where=recording recording=FILE, or neither"
         )
+    what = ("controller",) if config.run is None else ("run", "policy")
+    reason = f"nothing reads it with a {what[0]} and where={config.where}"
+    app.check_used((*OF_ALL, *what, *OF_PLACES[config.where]), reason)
     make_folder(Path(config.run_dir))
 
 

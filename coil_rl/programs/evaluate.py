@@ -160,12 +160,14 @@ def check(config: DictConfig) -> None:
         else "a guide is evaluated without an agent"
     )
     app.check_used(OF_A_RUN if given else OF_GUIDES, reason)
-    app.check_evaluated(OF_TRAINING, "only a training reads it")
-    app.check_evaluated(("sections",), "only coil-listen reads it")
+    app.check_unused("evaluation", OF_TRAINING, "only a training reads it")
+    app.check_unused("evaluation", ("sections",), "only coil-listen reads it")
     if config.exported is not None:
-        app.check_evaluated(OF_AN_AGENT, "the exported policy acts alone, as it is in its file")
+        app.check_unused(
+            "evaluation", OF_AN_AGENT, "the exported policy acts alone, as it is in its file"
+        )
     elif not given:
-        app.check_evaluated(OF_AN_AGENT, reason)
+        app.check_unused("evaluation", OF_AN_AGENT, reason)
     app.check_run(config)
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from coil_rl.envs import McapReplayEnv
     from coil_rl.replay.open_loop import OpenLoop, Policies
 
+# Keys that have an effect without runs, too.
+USED = ("recording", "frame", "strict", "preset", "env", "guide", "runs")
 Runs = Mapping[str, tuple[Path, DictConfig]]  # folder and configuration by name of the policy
 
 
@@ -204,6 +206,12 @@ def check(config: DictConfig) -> None:
         )
     if not config.guide and not config.runs:
         raise UserError("there is no policy; give a guide, as in guide=spline, or runs=[FOLDER]")
+    if config.runs:
+        app.check_used((*USED, "policy"), "nothing in a replay reads it")
+    else:
+        app.check_used(USED, "nothing in a replay without runs reads it")
+    app.check_unused("env", ("num_envs",), "each recording has a row of its own")
+    app.check_unused("env", ("smooth",), "a replay earns no reward")
     make_folder(Path(config.run_dir))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from coil_rl.envs.recordings.mcap_files import RecordingWriter, digest, read_messages
 from coil_rl.envs.recordings.messages import TWIST, TWIST_STAMPED, header, twist
 from coil_rl.envs.robot.course import THICK, THIN
-from coil_rl.envs.sight import SAMPLES, SIGHT, WIDEST_ANGLE
+from coil_rl.envs.sight import SAMPLES, WIDEST_ANGLE
 from coil_rl.envs.track import SIDES
 from coil_rl.replay.open_loop import Floats, OpenLoop
 from coil_rl.report import style
@@ -125,7 +125,7 @@ def _boundaries(result: OpenLoop) -> Floats:
     This is the inverse of `sight.encode_samples`. The scale is that of the cone world.
     """
     distance, angle = np.moveaxis(result.observation.reshape(-1, 2, SAMPLES, 2), -1, 0)
-    distance, angle = (distance + 1) * (SIGHT / 2), angle * WIDEST_ANGLE
+    distance, angle = (distance + 1) * (result.sight / 2), angle * WIDEST_ANGLE
     return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1)
 
 

@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 from coil_rl.envs.recordings.recording import Recording
 from coil_rl.envs.recordings.replay_env import McapReplayEnv
 from coil_rl.envs.reward import HISTORY, recent_mean
+from coil_rl.errors import UserError
 
 RECORDED = "recorded"  # name of the recorded commands among the policies
 ROUNDING = 1.001  # of commands at the limit
@@ -58,6 +59,7 @@ class OpenLoop:
         valid: [N, 2], whether each side is valid in the scan.
         steering: by policy; `recorded_steering` is last, as `RECORDED`, if there are commands.
         max_steering: radians of an action of 1.
+        sight: m, range of view in the scale of the cone world.
         beyond: share of the recorded commands that ask for more than the robot can steer.
     """
 
@@ -68,6 +70,7 @@ class OpenLoop:
     valid: NDArray[np.bool_]
     steering: dict[str, Steering]
     max_steering: float
+    sight: float
     beyond: float = 0.0
 
     @property
@@ -98,7 +101,15 @@ def open_loop(
         policies: the policies by name, each with an env that has the transforms it needs.
         seed: of PyTorch's generator, set again for each policy.
         tick: called with the name of the policy after every scan.
+
+    Raises:
+        UserError: for an env with fewer rows than recordings.
     """
+    if env.batch_size[0] < len(env.recordings):
+        raise UserError(
+            f"env.num_envs={env.batch_size[0]} leaves out recordings, of which there are "
+            f"{len(env.recordings)}; leave it out for a row of each"
+        )
     scans = int(env.length.max())
     rollouts: dict[str, TensorDictBase] = {}
     for name, (policy_env, policy) in policies.items():
@@ -127,12 +138,13 @@ def _result(env: McapReplayEnv, row: int, rollouts: Mapping[str, TensorDictBase]
         columns = [step[key].squeeze(-1).double().numpy() for key in STEERING_KEYS]
         steering[name] = Steering(*columns)
     if recording.commands is not None:
-        robot = env.speed, env.car_length, env.max_steering
-        steering[RECORDED] = recorded_steering(recording, *robot)
-        beyond = _share_beyond(recording, *robot)
+        car = env.speed, env.car_length, env.max_steering
+        steering[RECORDED] = recorded_steering(recording, *car)
+        beyond = _share_beyond(recording, *car)
     view = next(iter(steps.values()))  # equal for all policies
     cones, count, observation, valid = (view[key].numpy() for key in VIEW_KEYS)
-    return OpenLoop(recording, cones, count, observation, valid, steering, env.max_steering, beyond)
+    robot = env.max_steering, env.memory.sight
+    return OpenLoop(recording, cones, count, observation, valid, steering, *robot, beyond)
 
 
 def recorded_steering(
@@ -140,7 +152,8 @@ def recorded_steering(
 ) -> Steering:
     """Return the recorded commands as steering, see `Recording.steering`.
 
-    It is NaN where there is no command.
+    It is NaN where there is no command, and its smoothness compares with the last commands that
+    there are.
 
     Args:
         recording: a recording with commands.
@@ -150,9 +163,12 @@ def recorded_steering(
     """
     angle, omega, _ = recording.steering(speed, car_length)
     action = (angle / max_steering).clip(-1, 1)
-    before = np.concatenate([np.zeros(HISTORY), np.nan_to_num(action[:-1])])
+    known = ~np.isnan(action)
+    given, smoothness = action[known], np.full(len(action), np.nan)
+    before = np.concatenate([np.zeros(HISTORY), given[:-1]])
     history = np.lib.stride_tricks.sliding_window_view(before, HISTORY)[:, ::-1].T.copy()
-    return Steering(action, omega, np.abs(action - recent_mean(torch.from_numpy(history)).numpy()))
+    smoothness[known] = np.abs(given - recent_mean(torch.from_numpy(history)).numpy())
+    return Steering(action, omega, smoothness)
 
 
 def _share_beyond(

@@ -17,6 +17,8 @@ from coil_rl.robot.driver import Car as Car
 from coil_rl.robot.driver import Command as Command
 from coil_rl.robot.driver import LiveDriver as LiveDriver
 from coil_rl.robot.driver import Moment as Moment
+from coil_rl.robot.setup import Setup as Setup
+from coil_rl.robot.setup import setup_of as setup_of
 from coil_rl.robot.sources import drive_recording as drive_recording
 from coil_rl.robot.sources import drive_simulation as drive_simulation
 from coil_rl.robot.watchdog import Limits as Limits

@@ -129,11 +129,10 @@ class LiveDriver:
 
     Example:
         >>> import coil_rl
-        >>> from coil_rl.envs import Perception, simulated_cone_classifier
-        >>> from coil_rl.robot import Limits, LiveDriver
+        >>> from coil_rl.robot import Limits, LiveDriver, setup_of
         >>> controller = coil_rl.open_run("outputs/robot").controller()  # doctest: +SKIP
-        >>> perception = Perception(simulated_cone_classifier())
-        >>> driver = LiveDriver(controller, perception, Limits(5.5))  # doctest: +SKIP
+        >>> setup = setup_of(controller.plant)  # doctest: +SKIP
+        >>> driver = LiveDriver(controller, setup.perception, Limits(5.5))  # doctest: +SKIP
         >>> speed, turn_rate = driver.scan(scan, time.monotonic())  # doctest: +SKIP
     """
 
@@ -150,8 +149,7 @@ class LiveDriver:
     ) -> None:
         self.controller, self.perception, self.car = controller, perception, car or Car()
         self.watchdog, self.log = Watchdog(limits), log
-        sight = perception.range_max * perception.scale
-        self.memory = BoundaryMemory(1, spline, smoothing, sight=sight)
+        self.memory = BoundaryMemory(1, spline, smoothing, sight=perception.sight)
         self._begin()
         self._rehearse()
         self._begin()

@@ -13,6 +13,7 @@ import numpy as np
 import rclpy
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -21,6 +22,7 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from coil_rl.envs.recordings.bearings import Angles, bearings
 from coil_rl.robot.driver import HALT, Command, LiveDriver
 from coil_rl.robot.watchdog import Scan
 
@@ -82,10 +84,26 @@ class DriveNode(Node):
         """Drive by a scan."""
         stamp = message.header.stamp
         ranges = np.asarray(message.ranges, np.float32)
-        angles = message.angle_min + message.angle_increment * np.arange(ranges.size)
+        angles = self._bearings(message, ranges.size)
         seconds = stamp.sec + stamp.nanosec * 1e-9
         scan = Scan(seconds, ranges, angles, message.range_min, message.range_max)
         self.publish(self.driver.scan(scan, self.now()))
+
+    def _bearings(self, message: Any, points: int) -> NDArray[np.float64]:
+        """Return the bearings of a scan as they are taken of a recording, [P] radians.
+
+        What had to be decided is logged the first time. Bearings that mean nothing are left to the
+        driver, which refuses the scan.
+        """
+        given = Angles(message.angle_min, message.angle_max, message.angle_increment)
+        first, step = given.first, given.step
+        try:
+            ((first, step),), doubts = bearings([given], np.array([points]))
+        except ValueError as error:
+            doubts = [f"has bearings that mean nothing: {error}"]
+        if doubts:
+            self.get_logger().warning(f"the scanner {doubts[0]}", once=True)
+        return np.asarray(first + step * np.arange(points), np.float64)
 
     def on_odometry(self, message: Any) -> None:
         """Compare the measured motion with the commands."""

@@ -29,7 +29,7 @@ class Drive:
         stops: s of the clock and reason of each stop.
         waits: number of scans after which the driver waited, by the reason.
         milliseconds: of CPU for each scan that was driven by.
-        laps: completed, of the simulated robot.
+        laps: completed, of the simulated robot; None where nobody counts them.
         ended: how the drive ended.
     """
 
@@ -38,7 +38,7 @@ class Drive:
     stops: list[tuple[float, str]] = field(default_factory=list)
     waits: Counter[str] = field(default_factory=Counter)
     milliseconds: list[float] = field(default_factory=list)
-    laps: int = 0
+    laps: int | None = None
     ended: str = ""
 
 

@@ -172,13 +172,18 @@ class Recording:
         return np.arcsin(sine.clip(-1, 1)), second, speed
 
     def _speeds(self, nominal_speed: float) -> Floats:
-        """Return the speed from each scan to the next one by the odometry, or the nominal one."""
-        if self.odometry is None:
+        """Return the speed from each scan to the next one by the odometry, or the nominal one.
+
+        It is negative for a robot that drives backwards. After the last scan it is that before it.
+        """
+        if self.odometry is None or len(self.log_time) < 2:
             return np.full(len(self.log_time), nominal_speed)
-        path = np.hypot(*np.diff(self.poses()[:, :2], axis=0).T)
-        time = np.diff(self.seconds)
-        speed = np.divide(path, time, out=np.zeros_like(path), where=time > 0)
-        return np.append(speed, 0.0)
+        x, y, heading = self.poses().T
+        east, north, middle = np.diff(x), np.diff(y), (heading[1:] + heading[:-1]) / 2
+        ahead = east * np.cos(middle) + north * np.sin(middle)
+        way, time = np.copysign(np.hypot(east, north), ahead), np.diff(self.seconds)
+        speed = np.divide(way, time, out=np.zeros_like(way), where=time > 0)
+        return np.append(speed, speed[-1])
 
 
 def ascending(times: Times) -> bool:

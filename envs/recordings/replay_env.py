@@ -21,7 +21,7 @@ from coil_rl.envs.limits import check_range
 from coil_rl.envs.recordings.reading import read_recording
 from coil_rl.envs.recordings.recording import STANDS, Recording
 from coil_rl.envs.reward import HISTORY, recent_mean
-from coil_rl.envs.robot.perception import BoundaryMemory, declare_specs
+from coil_rl.envs.robot.perception import BoundaryMemory, Perception, declare_specs
 from coil_rl.envs.sight import SIGHT
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.float64]], tuple[Any, Any]]
@@ -66,7 +66,8 @@ class McapReplayEnv(EnvBase):
         smoothing: lambda of the cubic smoothing spline, m^3 in the scale of the cone world.
         smooth: weight of the reward per unit of |a - mean of the last 20 actions|.
         kept_cones: K, the nearest cones of each side that are written.
-        sight: m, range of view in the scale of the cone world.
+        sight: m, range of view in the scale of the cone world; None for that of the perception,
+            and `SIGHT` for one that is no `Perception`.
         speed: m/s, of the robot.
         car_length: m, distance between the axles of the robot.
         max_steering: degrees of an action of 1, at most 90.
@@ -92,12 +93,14 @@ class McapReplayEnv(EnvBase):
         smoothing: float = 0.1,
         smooth: float = -0.1,
         kept_cones: int = 16,
-        sight: float = SIGHT,
+        sight: float | None = None,
         speed: float = 0.15,
         car_length: float = 2 / 7,
         max_steering: float = 80.0,
         device: torch.device | str = "cpu",
     ) -> None:
+        if sight is None:
+            sight = perception.sight if isinstance(perception, Perception) else SIGHT
         check_range(
             0, above=True, kept_cones=kept_cones, sight=sight, speed=speed, car_length=car_length
         )

@@ -121,12 +121,12 @@ class SimulatedRobotEnv(SeededEnv):
         self.lidar = lidar or SimulatedLidar()
         self.rate = self.lidar.rate
         self.laps, self.max_steps = laps, round(time_limit * self.rate)
-        self.step_length, self.car_length = speed / self.rate, car_length
+        self.speed, self.car_length = speed, car_length
+        self.step_length = speed / self.rate
         self.max_steering = math.radians(max_steering)
         weights = RewardWeights(**(reward or {}))._asdict()
         self.weights = {key: torch.tensor(float(weight)) for key, weight in weights.items()}
-        sight = self.perception.range_max * self.perception.scale
-        self.memory = BoundaryMemory(num_envs, spline, smoothing, sight=sight)
+        self.memory = BoundaryMemory(num_envs, spline, smoothing, sight=self.perception.sight)
         self.generator = torch.Generator()
         self.course = RobotCourse(self.tracks)
         index, poses, driven = map(torch.as_tensor, places(self.tracks, starts))
@@ -146,9 +146,8 @@ class SimulatedRobotEnv(SeededEnv):
     @property
     def meanings(self) -> dict[str, dict[str, str]]:
         """What the entries mean, see `coil_rl.envs.meanings`."""
-        scale = self.perception.scale
-        sight = self.perception.range_max * scale
-        return of_cones(sight, math.degrees(self.max_steering), scale)
+        max_steering = math.degrees(self.max_steering)
+        return of_cones(self.perception.sight, max_steering, self.perception.scale)
 
     def set_extra_state(self, state: Tensor) -> None:
         """Restore the state of the generator; the scans are perceived anew."""

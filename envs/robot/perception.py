@@ -173,6 +173,11 @@ class Perception:
         check_range(0, 180, above=True, bearing_max=self.bearing_max)
         check_range(-360, 360, laser_yaw=self.laser_yaw)
 
+    @property
+    def sight(self) -> float:
+        """Range of view in the scale of the cone world, m."""
+        return self.range_max * self.scale
+
     def __call__(
         self, ranges: NDArray[np.floating], angles: NDArray[np.floating]
     ) -> tuple[Array, Integers]:
@@ -266,7 +271,7 @@ class BoundaryMemory(nn.Module):
     ) -> None:
         super().__init__()
         self.fit = spline_fit(spline, smoothing)
-        self.sight = sight
+        self.spline, self.smoothing, self.sight = spline, smoothing, sight
         self.samples: Tensor = nn.Buffer(torch.zeros(2, SAMPLES, 2, batch))
         self.ever_valid: Tensor = nn.Buffer(torch.zeros(2, batch))
 

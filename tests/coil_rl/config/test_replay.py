@@ -1,17 +1,22 @@
 """Imitation of recorded drives by one command, tested in a closed loop."""
 
 import csv
+import math
 
 import odd_recordings as odd
 import pytest
 import torch
+from hydra import compose, initialize_config_module
 from programs import called
 
 import coil_rl
+from coil_rl.config.build import env_maker
 from coil_rl.envs import McapReplayEnv, Perception, SimulatedRobotEnv, record_drives
 from coil_rl.envs import simulated_cone_classifier as classifier
+from coil_rl.envs.splines import least_squares_parabola
 from coil_rl.guides import SplineGuide
 from coil_rl.run import checkpoint
+from coil_rl.run.parts import TEST
 
 SCANS = 33
 # A second of one robot is enough to see that it drives.
@@ -67,6 +72,21 @@ def test_recorded_steering_is_learned_and_the_imitation_drives(folder):
     assert torch.bincount(tracks).tolist() == [33, 33, 12]
 
 
+def test_the_test_drives_the_car_of_the_recordings():
+    words = ["method=oil", "env=mcap_replay", "env.speed=0.3", "env.car_length=0.6"]
+    words += ["env.max_steering=40", "env.spline=quadratic", "env.perception.range_max=1.6"]
+    words += ["env.perception.scale=5", "env.perception.bearing_max=90", "run_dir=unused"]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", words)
+    env = env_maker(config).bare(1, TEST, None)
+    assert isinstance(env, SimulatedRobotEnv)
+    assert env.step_length * env.rate == pytest.approx(0.3)
+    assert (env.car_length, env.max_steering) == (0.6, math.radians(40))
+    assert env.memory.fit is least_squares_parabola
+    seen = env.perception
+    assert (seen.range_max, seen.scale, seen.bearing_max, seen.laser_yaw) == (1.6, 5, 90, 0)
+
+
 @pytest.mark.slow
 def test_data_set_is_the_first_round_of_dagger(folder):
     trained(folder, "recording=[a.mcap,b.mcap]", "hydra.run.dir=two")
@@ -77,6 +97,16 @@ def test_data_set_is_the_first_round_of_dagger(folder):
     called("train", *arguments, cwd=folder)
     rows = table(folder / "dagger" / "metrics.csv")
     assert [float(row["learner/samples"]) for row in rows[1:]] == [76.0, 86.0]
+
+
+def test_a_second_pass_and_further_rows_teach_nothing_new(folder):
+    words = ["recording=[a.mcap,b.mcap]", "budget.num_envs=3", "budget.frames=198"]
+    done = trained(folder, *words, "hydra.run.dir=more")
+    assert "2 recordings: 66 of 66 scans are learned." in done.stdout
+    rows = table(folder / "more" / "metrics.csv")[-2:]
+    assert [float(row["learner/samples"]) for row in rows] == [66.0, 66.0]
+    assert [float(row["learner/left_out"]) for row in rows] == [33.0, 99.0]
+    assert (folder / "more" / "evaluation.md").exists()
 
 
 def test_run_is_evaluated_and_replayed_like_any_other(folder):
@@ -101,6 +131,9 @@ def test_python_gives_the_same_run_as_the_command(folder, monkeypatch):
         (["recording=null"], "recording must be an MCAP file or a rosbag2 folder, or a list"),
         (["recording=[]"], "env: recordings is empty"),
         (["recording=nothing.mcap"], "env: nothing.mcap cannot be read"),
+        (["budget.num_envs=1"], "env.num_envs=1 leaves out recordings, of which there are 2"),
+        (["env.num_envs=1"], "env.num_envs=1 leaves out recordings, of which there are 2"),
+        (["budget.frames=20", "budget.steps=10"], "longest has 33 scans, so the others would be"),
         (["recording=a.mcap"], "there is one recording, which cannot be left out to validate"),
         (["method=ppo", "learner=ppo"], "method=ppo cannot learn in env=mcap_replay"),
         (["method=dagger"], "method=dagger cannot learn in env=mcap_replay"),

@@ -63,6 +63,25 @@ def test_samples_are_the_actions_of_the_guide_in_the_same_states(env, batches):
     )
 
 
+def test_a_batch_without_anything_to_learn_changes_nothing(env, batches):
+    def keeping():
+        """Return a learner of a recording, whose env says what is to be learned."""
+        learner = Imitation(env, **linear())
+        learner.kept_key = "usable"
+        learner.keys.append("usable")
+        return learner
+
+    usable = torch.ones(7, 60, 1, dtype=torch.bool)
+    some, none = batches[0].clone().set("usable", usable), batches[1].clone().set("usable", ~usable)
+    learner = keeping()
+    first, second = learner.update(some), learner.update(none)
+    assert (first["samples"], second["samples"], second["left_out"]) == (420, 420, 420)
+    assert second["mse_training"] == first["mse_training"]
+    assert "mse_ahead" not in second
+    with pytest.raises(UserError, match="none of 420 steps is to be learned"):
+        keeping().update(none)
+
+
 def test_any_row_of_the_advice_can_be_imitated():
     env = cone_env({"middle": SplineGuide(), "random": RandomGuide(low=0.25, high=0.75)})
     learner = Imitation(env, **linear(guide=1))

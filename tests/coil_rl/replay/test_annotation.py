@@ -37,7 +37,7 @@ def perception(ranges, angles):
     return cones, count
 
 
-def annotated(folder, name, notes=(), **options):
+def annotated(folder, name, notes=(), sight=None, **options):
     """The result of a guide, and the annotated recording."""
     source = drive(folder / "drive.mcap", SCANS, odometry=True, commands=True)
     contents = read_messages(source)
@@ -47,7 +47,7 @@ def annotated(folder, name, notes=(), **options):
                 writer.copy(message)
         for note in notes:
             writer.describe(note, {"about": "it"})
-    env = McapReplayEnv(source, perception)
+    env = McapReplayEnv(source, perception, sight=sight)
     [result] = open_loop(env, {"spline": (env, SplineGuide())})
     options = {
         "topics": ["/scan", "/odom"],
@@ -178,6 +178,14 @@ def test_remembered_boundary_is_faded_and_one_never_valid_is_missing(read):
         False,
         False,
     ]
+
+
+def test_boundary_is_at_its_place_with_any_range_of_view(read, tmp_path):
+    far, _ = by_another_library(annotated(tmp_path, "far.mcap", sight=11.2)[1])
+    for near, wide in zip(read[0]["/coil/boundary"], far["/coil/boundary"], strict=True):
+        for one, other in zip(near.markers[1:], wide.markers[1:], strict=True):
+            for a, b in zip(one.points, other.points, strict=True):
+                assert (b.x, b.y) == pytest.approx((a.x, a.y), abs=1e-5)
 
 
 def test_markers_are_in_the_frame_of_a_lidar_that_points_to_the_left(read, tmp_path):

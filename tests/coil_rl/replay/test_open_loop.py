@@ -8,7 +8,8 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from coil_rl.envs import McapReplayEnv, Recording
+from coil_rl.envs import SIGHT, McapReplayEnv, Recording
+from coil_rl.errors import UserError
 from coil_rl.guides import ConstantGuide
 from coil_rl.replay.open_loop import RECORDED, OpenLoop, Steering, open_loop, recorded_steering
 from coil_rl.replay.report import describe, disagreement, extent, outcome
@@ -85,6 +86,24 @@ def test_scans_before_the_first_command_are_left_out_and_a_stop_is_straight():
         recorded_steering(recording(), 0.15, 2 / 7, MAX_STEERING)
 
 
+def test_smoothness_passes_over_scans_without_a_command():
+    """A robot that turns evenly steers smoothly, also where its commands are missing."""
+    scans, second = 80, 10**9
+    times = np.delete(np.arange(scans), np.s_[40:60]) * second
+    drive = recording(np.full(len(times), 0.2), times, scans=scans, period=second)
+    steering = recorded_steering(drive, 0.15, 2 / 7, MAX_STEERING)
+    unknown = np.isnan(steering.action)
+    assert unknown[44:60].all()
+    np.testing.assert_array_equal(np.isnan(steering.smoothness), unknown)
+    np.testing.assert_allclose(steering.smoothness[20:][~unknown[20:]], 0.0, atol=1e-12)
+
+
+def test_an_env_with_fewer_rows_than_recordings_is_refused():
+    env = McapReplayEnv([recording(), recording()], blind, num_envs=1)
+    with pytest.raises(UserError, match=r"env\.num_envs=1 leaves out recordings, .* are 2;"):
+        open_loop(env, {"straight": (env, ConstantGuide(0.0))})
+
+
 def test_random_draws_of_a_policy_depend_on_the_seed_alone():
     def drawing():
         return TensorDictModule(
@@ -109,7 +128,7 @@ def result_of(remarks=(), **actions):
     one = recording(period=10**9, notes={"simulated": {}})
     vars(one)["remarks"] = remarks
     arrays = np.zeros((4, 2, 1, 2)), np.zeros((4, 2)), np.zeros((4, 20))
-    return OpenLoop(one, *arrays, valid, steering, MAX_STEERING)
+    return OpenLoop(one, *arrays, valid, steering, MAX_STEERING, SIGHT)
 
 
 @pytest.fixture

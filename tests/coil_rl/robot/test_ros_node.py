@@ -38,6 +38,7 @@ class Node:
 
     def __init__(self, name):
         self.name, self.published, self.timers, self.services, self.topics = name, [], [], {}, {}
+        self.warned = []
 
     def declare_parameter(self, name, value):
         return SimpleNamespace(value=self.parameters.get(name, value))
@@ -59,7 +60,9 @@ class Node:
         return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
 
     def get_logger(self):
-        return SimpleNamespace(info=lambda text: None)
+        return SimpleNamespace(
+            info=lambda text: None, warning=lambda text, once: self.warned.append((text, once))
+        )
 
     def destroy_node(self):
         self.destroyed = True
@@ -132,14 +135,17 @@ def commands(node, topic="/cmd_vel"):
     return [(twist.linear.x, twist.angular.z) for twist in twists]
 
 
+def laser(ranges, first, last, step):
+    """Return a LaserScan with the bearings of its first and last range, and the step."""
+    angles = {"angle_min": first, "angle_max": last, "angle_increment": step}
+    return message(ranges=ranges, range_min=0.1, range_max=9.0, **angles)
+
+
 def test_scans_become_commands_and_states_are_published_once(ros):
     driver = Driver()
     node = ros.DriveNode(driver, now=lambda: 7.0)
     assert commands(node) == [(0.0, 0.0)]
-    scan = message(
-        ranges=[0.5, np.inf, 0.6], angle_min=-1.0, angle_increment=0.1, range_min=0.1, range_max=9.0
-    )
-    node.topics["/scan"][1](scan)
+    node.topics["/scan"][1](laser([0.5, np.inf, 0.6], -1.0, -0.8, 0.1))
     ((_, given, now),) = driver.told
     assert (given.stamp, given.range_min, given.range_max, now) == (3.5, 0.1, 9.0, 7.0)
     assert np.allclose(given.angles, [-1.0, -0.9, -0.8])
@@ -147,6 +153,32 @@ def test_scans_become_commands_and_states_are_published_once(ros):
     node.timers[0][1]()
     states = [each.data for name, each in node.published if name == "/coil/state"]
     assert states == ["waiting: no scan yet", "driving"]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        (-np.pi, np.pi - 2 * np.pi / 360, 2 * np.pi / 361),  # a step for one range too many
+        (-180.0, 179.0, 1.0),  # degrees
+        (np.pi - 2 * np.pi / 360, -np.pi, 2 * np.pi / 360),  # exchanged
+    ],
+)
+def test_bearings_are_those_that_are_taken_of_a_recording(ros, given):
+    driver = Driver()
+    node = ros.DriveNode(driver)
+    node.topics["/scan"][1](laser(np.ones(360), *given))
+    angles = driver.told[0][1].angles
+    np.testing.assert_allclose(angles, np.radians(np.arange(-180, 180)), atol=1e-6)
+    ((text, once),) = node.warned
+    assert text.startswith("the scanner has an")
+    assert once
+
+
+@pytest.mark.parametrize(("first", "step"), [(np.inf, 0.1), (np.nan, 0.1), (0.0, 0.0)])
+def test_bearings_that_mean_nothing_are_left_to_the_driver(ros, first, step):
+    driver = Driver()
+    ros.DriveNode(driver).topics["/scan"][1](laser(np.ones(3), first, first, step))
+    np.testing.assert_array_equal(driver.told[0][1].angles, first + step * np.arange(3))
 
 
 def test_the_watchdog_has_a_steady_timer_and_topics_their_quality_of_service(ros):

@@ -18,12 +18,15 @@ from coil_rl.envs import (
     McapReplayEnv,
     Perception,
     Recording,
+    SimulatedRobotEnv,
     read_recording,
+    record_drives,
     save_drive,
     shipped_tracks,
     simulated_cone_classifier,
     simulated_drive,
 )
+from coil_rl.envs.robot.perception import BoundaryMemory
 from coil_rl.errors import UserError
 from coil_rl.guides import SplineGuide
 from coil_rl.testing import check_env, check_transform
@@ -223,6 +226,23 @@ def test_invalid_arguments_are_refused(tmp_path, options, reason):
     arguments = {"recordings": drive(tmp_path / "a.mcap", 3), "perception": blind}
     with pytest.raises(ValueError, match=reason):
         McapReplayEnv(**arguments | options)
+
+
+@pytest.mark.parametrize("range_max", [1.0, 1.6])
+@pytest.mark.parametrize("scale", [7.0, 5.625])
+def test_observation_is_that_of_a_robot_with_the_same_perception(tmp_path, range_max, scale):
+    perception = Perception(simulated_cone_classifier(), range_max=range_max, scale=scale)
+    robot = SimulatedRobotEnv(perception=perception, time_limit=4.0)
+    record_drives(robot, SplineGuide(), [tmp_path / "a.mcap"])
+    seen = read_recording(tmp_path / "a.mcap")
+    env = McapReplayEnv(seen, perception)
+    assert env.memory.sight == robot.memory.sight == range_max * scale
+    observation = env.rollout(len(seen.ranges), SplineGuide())["observation"][0]
+    memory = BoundaryMemory(1, sight=perception.sight)
+    for scan, expected in zip(seen.ranges, observation, strict=True):
+        cones, count = perception(scan[None], seen.angles(0))
+        own, _ = memory(torch.from_numpy(cones).float(), torch.from_numpy(count))
+        torch.testing.assert_close(own[0], expected, rtol=0, atol=1e-6)
 
 
 def test_configuration_builds_the_env(tmp_path):
