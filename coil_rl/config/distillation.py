@@ -7,6 +7,7 @@ its proxies into its own folder.
 """
 
 import hashlib
+import math
 import shutil
 from collections.abc import Mapping
 from contextlib import suppress
@@ -91,7 +92,7 @@ def distil(config: DictConfig, folder: Path) -> int:
     """Put a proxy of each guide without parameters into the folder of a run, unless it is there.
 
     Returns:
-        The frames that the proxies were trained for, now or earlier.
+        The frames that the proxies took, now or earlier. Their last batch is a whole one.
     """
     names = guides_without_parameters(build_guides(config))
     proxies = {name: proxy_config(config, name) for name in names}
@@ -99,7 +100,13 @@ def distil(config: DictConfig, folder: Path) -> int:
         for proxy in proxies.values():
             run_configured(proxy, wait=True)
         copy_proxies({name: Path(proxy.run_dir) for name, proxy in proxies.items()}, folder)
-    return sum(proxy.budget.frames for proxy in proxies.values())
+    return sum(_frames(proxy.budget) for proxy in proxies.values())
+
+
+def _frames(budget: DictConfig) -> int:
+    """Return the frames that a training without tests takes with a budget: whole batches."""
+    batch = int(budget.num_envs) * int(budget.steps)
+    return math.ceil(budget.frames / batch) * batch
 
 
 def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:

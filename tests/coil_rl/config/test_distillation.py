@@ -14,6 +14,7 @@ from coil_rl.config.python import composed as composed_in_python
 from coil_rl.errors import UserError
 from coil_rl.programs.distill import distill
 from coil_rl.programs.train import train
+from coil_rl.report.runs import read_curve
 
 TINY = [
     "track=generated",
@@ -140,6 +141,13 @@ def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path):
         assert torch.equal(resumed[key], value), key
 
 
+@pytest.mark.parametrize(("asked", "taken"), [(1, 64), (64, 64), (65, 128)])
+def test_frames_of_a_proxy_are_whole_batches(asked, taken):
+    words = ["guide=spline", "method=dynamic_coil_sequential", f"proxy.budget.frames={asked}"]
+    proxy = distillation.proxy_config(composed(*words, "run_dir=unused"), "spline")
+    assert distillation._frames(proxy.budget) == taken
+
+
 @pytest.mark.slow
 def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
     (tmp_path / "run").mkdir()
@@ -160,6 +168,9 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
         "zero",
     ]
     assert len(list(proxies.glob("zero_*"))) == 1
+    used = [next(proxies.glob(f"{name}_*")) / "metrics.csv" for name in ("spline", "zero")]
+    taken = sum(read_curve(curve)[-1]["frames"] for curve in used)
+    assert read_curve(tmp_path / "run" / "metrics.csv")[0]["frames/before"] == taken
     guides = load.load_guides(tmp_path / "run", config)
     network, state = (
         guides["spline"],
