@@ -118,10 +118,10 @@ def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, caps
     )
     output = capsys.readouterr().out
     assert str(folder) in output
-    assert "distill: made 1; the lowest mean reward is" in output
+    assert "distill: made 0, found 1; the lowest mean reward is" in output
 
 
-def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path):
+def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path, capsys):
     whole = next(proxies.glob("constant_*"))
     stopped = tmp_path / whole.name
     stopped.mkdir()
@@ -162,6 +162,7 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
     ]
     config = composed(*overrides)
     check(config)
+    assert "distill: made 1, found 0;" in capsys.readouterr().out
     train(config)
     assert sorted(path.name for path in (tmp_path / "run" / "proxies").iterdir()) == [
         "spline",
