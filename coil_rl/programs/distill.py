@@ -56,7 +56,7 @@ def check(config: DictConfig) -> None:
     from coil_rl.config.check import check_proxies, make_folder
     from coil_rl.config.values import check_values
 
-    used = ("preset", "track", "env", "guide", "evaluation", "proxy")
+    used = ("preset", "track", "env", "disturb", "guide", "evaluation", "proxy")
     app.check_used(used, "a proxy is trained as the key proxy says")
     app.check_folder("proxy.folder")
     check_values(config)

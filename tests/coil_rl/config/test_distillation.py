@@ -8,6 +8,7 @@ import torch
 from hydra import compose, initialize_config_module
 
 from coil_rl.config import distillation, load
+from coil_rl.config.build import disturbances, env_maker
 from coil_rl.config.check import check
 from coil_rl.config.python import Named, named
 from coil_rl.config.python import composed as composed_in_python
@@ -15,6 +16,8 @@ from coil_rl.errors import UserError
 from coil_rl.programs.distill import distill
 from coil_rl.programs.train import train
 from coil_rl.report.runs import read_curve
+from coil_rl.run.parts import TEST, TRAIN
+from coil_rl.transforms import GuideActions, ObservationDelay
 
 TINY = [
     "track=generated",
@@ -79,6 +82,29 @@ def test_folder_of_a_proxy_follows_from_guide_env_and_settings():
     assert len({folder(), folder(guide="constant"), *others}) == 6
 
 
+def test_proxy_is_trained_behind_the_delays_and_noise_of_the_run():
+    def proxy(*overrides):
+        config = composed("guide=spline", "run_dir=unused", *overrides)
+        return distillation.proxy_config(config, "spline")
+
+    words = ["disturb=[observation_delay]", "+evaluation.disturb.observation_delay.max_lag=7"]
+    disturbed = proxy(*words)
+    kinds = [type(part) for part in env_maker(disturbed)().transform]
+    assert kinds.index(ObservationDelay) < kinds.index(GuideActions)
+    lags = [
+        disturbances(disturbed, cases)["observation_delay"]["max_lag"] for cases in (TRAIN, TEST)
+    ]
+    assert lags == [2, 7]
+    others = [
+        proxy(),
+        proxy(words[0]),
+        proxy(*words, "disturb.observation_delay.min_lag=1"),
+        proxy(*words, "+training.disturb.observation_delay=null"),
+    ]
+    assert disturbed.run_dir == proxy(*words, "seed=3").run_dir
+    assert len({disturbed.run_dir, *(other.run_dir for other in others)}) == 5
+
+
 def folder_of_proxy(guide):
     given = named("Pendulum-v1", guide, "place")
     words = [*given.words, "method=dynamic_coil_sequential"]
@@ -136,6 +162,7 @@ def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path, ca
             "guide=constant", f"proxy.folder={tmp_path}", f"run_dir={tmp_path}", name="distill"
         )
     )
+    assert "distill: made 1, found 0;" in capsys.readouterr().out
     resumed = torch.load(stopped / "policy_last.pt", weights_only=True)
     for key, value in torch.load(whole / "policy_last.pt", weights_only=True).items():
         assert torch.equal(resumed[key], value), key
@@ -162,7 +189,6 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
     ]
     config = composed(*overrides)
     check(config)
-    assert "distill: made 1, found 0;" in capsys.readouterr().out
     train(config)
     assert sorted(path.name for path in (tmp_path / "run" / "proxies").iterdir()) == [
         "spline",
