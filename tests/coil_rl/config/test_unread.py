@@ -3,6 +3,7 @@
 import pytest
 from programs import called
 
+import coil_rl
 from coil_rl import UserError, compose_train
 from coil_rl.config.unread import check_read
 
@@ -111,3 +112,15 @@ def test_word_that_another_method_of_a_sweep_reads_is_accepted(word):
 
 def test_noise_is_read_where_actions_are_numbers():
     assert unread("method=coil", "training.noise_correlation=0.5") == ""
+
+
+def test_words_from_python_are_read_too(tmp_path):
+    words = ["logger=none", "proxy.seed=3"]
+    folder = tmp_path / "run"
+    with pytest.raises(
+        UserError, match=r"proxy\.seed=3 has no effect: method=ppo trains no guides"
+    ):
+        coil_rl.prepare("cone_track", method="ppo", folder=folder, overrides=words)
+    with pytest.raises(UserError, match=r"budget\.frames=64 has no effect: method=guide trains"):
+        coil_rl.prepare("cone_track", guide="spline", method="guide", frames=64, folder=folder)
+    assert not folder.exists()
