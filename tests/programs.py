@@ -20,9 +20,9 @@ CONF = Path(coil_rl.conf.__path__[0])  # of the library that is tested, which ma
 
 TRACK = ["track=folder", f"track.dir={ROOT / 'tests' / 'ring.csv'}"]
 LAP = [*TRACK, "env.laps=1", "env.rate=6"]
+SHORT_LAP = [*LAP, "env.time_limit=2"]
 TINY = [
-    *LAP,
-    "env.time_limit=2",
+    *SHORT_LAP,
     "budget.frames=512",
     "budget.num_envs=8",
     "budget.steps=32",

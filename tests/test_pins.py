@@ -35,7 +35,7 @@ RUNS = {
         "learner.phases.agent_phase.frames=512",
         "learner.phases.guide_phase.frames=512",
         "proxy.budget.frames=512",
-        "budget.frames=3072",  # those of the two proxies are among them
+        "budget.frames=11008",  # 8960 of the two proxies, a batch of 14 x 320 each, are among them
         "proxy.learner.regressor.epochs=5",
     ],
     "sac": ["method=coil", "learner=sac", "learner.starts=256", "learner.ratio=2"],

@@ -7,6 +7,7 @@ its proxies into its own folder.
 """
 
 import hashlib
+import math
 import shutil
 from collections.abc import Mapping
 from contextlib import suppress
@@ -43,7 +44,8 @@ def guides_without_parameters(guides: Mapping[str, nn.Module]) -> list[str]:
 def proxy_config(config: DictConfig, name: str) -> DictConfig:
     """Return the configuration of the run that trains the proxy of one guide of a training run.
 
-    The key `proxy` of the training run must describe a network.
+    The env is that of the training run, with its delays and noise. The key `proxy` must describe a
+    network.
     """
     if config.proxy is None or config.proxy.method.observes is None:
         raise UserError("proxy.method.observes: a proxy needs observations; give proxy=network")
@@ -53,10 +55,12 @@ def proxy_config(config: DictConfig, name: str) -> DictConfig:
         **{key: resolved[key] for key in ("preset", "track", "observes", "device", "threads")},
         **{key: proxy[key] for key in ("method", "learner", "budget", "seed")},
         "env": resolved["env"] | resolved["training"]["imitation_env"] | proxy["env"],
+        "disturb": _drawn_anew(resolved["disturb"], proxy["seed"]),
+        "training": {"disturb": _drawn_anew(resolved["training"]["disturb"], proxy["seed"])},
         "guide": guide,
         "label": f"proxy of {name}",
         "evaluation": {key: resolved["evaluation"][key] for key in ("cases", "measures", "env")}
-        | {"gif": False},
+        | {"disturb": _drawn_anew(resolved["evaluation"]["disturb"], proxy["seed"]), "gif": False},
         "existing": "resume",
     }
     merged: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), values)
@@ -64,6 +68,14 @@ def proxy_config(config: DictConfig, name: str) -> DictConfig:
     parts = [name, fingerprint(merged), *_hash_of_user(merged, name)]
     merged.run_dir = f"{proxy['folder']}/{'_'.join(parts)}"
     return merged
+
+
+def _drawn_anew(nodes: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    """Return the nodes of disturbances with another seed, so that runs share their proxies."""
+    has_seed = [
+        name for name, node in nodes.items() if isinstance(node, Mapping) and "seed" in node
+    ]
+    return {**nodes, **{name: {**nodes[name], "seed": seed} for name in has_seed}}
 
 
 def _hash_of_user(config: DictConfig, name: str) -> list[str]:
@@ -115,7 +127,7 @@ def distil(config: DictConfig, folder: Path) -> int:
     """Put a proxy of each guide without parameters into the folder of a run, unless it is there.
 
     Returns:
-        The frames that the proxies were trained for, now or earlier.
+        The frames that the proxies took, now or earlier. Their last batch is a whole one.
     """
     names = guides_without_parameters(build_guides(config))
     proxies = {name: proxy_config(config, name) for name in names}
@@ -123,7 +135,13 @@ def distil(config: DictConfig, folder: Path) -> int:
         for proxy in proxies.values():
             run_configured(proxy, wait=True)
         copy_proxies({name: Path(proxy.run_dir) for name, proxy in proxies.items()}, folder)
-    return sum(proxy.budget.frames for proxy in proxies.values())
+    return sum(_frames(proxy.budget) for proxy in proxies.values())
+
+
+def _frames(budget: DictConfig) -> int:
+    """Return the frames that a training without tests takes with a budget: whole batches."""
+    batch = int(budget.num_envs) * int(budget.steps)
+    return math.ceil(budget.frames / batch) * batch
 
 
 def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:

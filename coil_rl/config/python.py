@@ -21,11 +21,12 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl.envs import EnvBase
 
 from coil_rl.config.build import assemble
-from coil_rl.config.check import check
+from coil_rl.config.check import check_parts, make_folder
 from coil_rl.config.default_method import method_for
 from coil_rl.config.given import import_path, keep
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import trust_own
+from coil_rl.config.unread import check_read
 from coil_rl.config.written import keep_written, quoted
 from coil_rl.envs.gate import foreign
 from coil_rl.errors import UserError
@@ -148,10 +149,12 @@ class Named:
     Args:
         words: of the command line.
         nodes: for objects that have no name, by their key.
+        shared: whether other runs have the same words, so that this one need not read all of them.
     """
 
     words: list[str]
     nodes: dict[str, Any]
+    shared: bool = False
 
 
 def named(env: Any, guide: Any, place: str) -> Named:
@@ -182,7 +185,10 @@ def prepared(given: Named, folder: str | Path) -> Run:
     """
     config = composed(given, folder)
     trust_own(config)
-    check(config)
+    check_parts(config)
+    if not given.shared:
+        check_read(config, given.words)
+    make_folder(Path(config.run_dir))
     run = assemble(config)
     run.command = ["coil-train", *given.words]
     return run

@@ -15,19 +15,10 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from coil_rl.config.hints import OF_CONES
 from coil_rl.errors import UserError
 
 # Where the files are whose order of composition is meant.
 SHIPPED = ("pkg://coil_rl.", "pkg://hydra", "structured://")
-# Keys that other values refer to, and that nothing else reads.
-REFERRED = (
-    "preset",
-    "track",
-    "training.learning_rate",
-    "training.imitation_env",
-    "budget.minibatches",
-)
 SEVERAL = ("guide", "disturb", "degrade")  # groups of which several files may be chosen
 REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
 
@@ -98,7 +89,7 @@ def _keep(config: DictConfig, values: Iterable[Written], typed: Sequence[str]) -
     """
     last: dict[str, Written] = {}
     for written in values:
-        if any(_covers(key, written.key) for key in typed):
+        if any(covers(key, written.key) for key in typed):
             continue
         other = last.get(written.key, written)
         last[written.key] = written
@@ -141,8 +132,13 @@ def quoted(text: str) -> str:
     return f"'{escaped}'"
 
 
-def _covers(one: str, other: str) -> bool:
-    """Return whether one of two keys is the other, or is inside it."""
+def covers(one: str, other: str) -> bool:
+    """Return whether one of two keys is the other, or is inside it.
+
+    Args:
+        one: a full key.
+        other: another one.
+    """
     return one == other or other.startswith(f"{one}.") or one.startswith(f"{other}.")
 
 
@@ -161,7 +157,7 @@ def _written(defaults: Iterable[Any], files: Any) -> Iterator[Written]:
             continue
         lists = frozenset(f"{path}.yaml" for path in _ancestors(default, parents))
         values: Any = OmegaConf.to_container(found.config, resolve=False)
-        for key, value in _leaves(values, default.package or ""):
+        for key, value in leaves(values, default.package or ""):
             if key.partition(".")[0] not in ("hydra", "defaults"):
                 yield Written(key, value, f"{default.config_path}.yaml", lists)
 
@@ -176,64 +172,15 @@ def _ancestors(default: Any, parents: Mapping[str, str | None]) -> set[str]:
     return paths
 
 
-def _leaves(node: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Yield full key and value of everything in nested mappings that is no mapping."""
+def leaves(node: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Yield full key and value of everything in nested mappings that is no mapping.
+
+    Args:
+        node: the mapping.
+        name: its own full key; empty for the whole configuration.
+    """
     if not isinstance(node, Mapping):
         yield name, node
         return
     for key, value in node.items():
-        yield from _leaves(value, f"{name}.{key}" if name else str(key))
-
-
-def check_read(config: DictConfig, task: Iterable[str], *, trains_guides: bool) -> None:
-    """Refuse an override of the command line that nothing reads.
-
-    Args:
-        config: composed.
-        task: overrides of the command line.
-        trains_guides: whether the method trains its guides, for which proxies are.
-
-    Raises:
-        UserError: for the first override without an effect.
-    """
-    references: set[str] | None = None
-    for text in task:
-        key = key_of(text)
-        if key.partition(".")[0] == "proxy" and "." in key and not trains_guides:
-            raise UserError(
-                f"{text} has no effect: method={config.method.name} trains no guides, for which a "
-                "proxy would stand; leave it out, or take method=dynamic_coil_sequential"
-            )
-        if key.partition(".")[0] == "learner" and config.method.search:
-            raise UserError(
-                f"{text} has no effect: method={config.method.name} tunes its guide and has no "
-                "learner; leave it out"
-            )
-        if _covers("training.tests", key) and key != "training" and not _tests(config):
-            raise UserError(
-                f"{text} has no effect: this run compares no policies while it trains; leave it "
-                "out, or give delivery=tested"
-            )
-        if "." not in key and key not in OF_CONES:
-            continue
-        if not any(_covers(each, key) for each in REFERRED):
-            continue
-        references = _references(config) if references is None else references
-        if not any(_covers(each, key) for each in references):
-            raise UserError(f"{text} has no effect: nothing in this run reads {key}; leave it out")
-
-
-def _tests(config: DictConfig) -> bool:
-    """Return whether a run compares policies in cases of the training."""
-    anchored = OmegaConf.select(config, "learner.anchor") is not None
-    return anchored or bool(config.method.search) or config.delivery == "tested"
-
-
-def _references(config: DictConfig) -> set[str]:
-    """Return the keys that values of a configuration refer to."""
-    values: Any = OmegaConf.to_container(config, resolve=False)
-    found: set[str] = set()
-    for key, value in _leaves(values, ""):
-        if isinstance(value, (str, list)):
-            found |= {name for name in REFERENCE.findall(str(value)) if name != key}
-    return found
+        yield from leaves(value, f"{name}.{key}" if name else str(key))

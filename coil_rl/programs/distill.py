@@ -16,10 +16,12 @@ def distill(config: DictConfig) -> float:
     from coil_rl.config.start import run_configured
     from coil_rl.report.runs import read_runs
     from coil_rl.report.table import TABLES, markdown_table, return_format
+    from coil_rl.run.folder import is_evaluated
 
-    table = []
+    table, found = [], 0
     for name in build_guides(config):
         proxy_config = distillation.proxy_config(config, name)
+        found += is_evaluated(Path(proxy_config.run_dir))
         reward = run_configured(proxy_config, wait=True)
         (finished,) = read_runs([Path(proxy_config.run_dir)])
         row: dict[str, Any] = {}
@@ -40,8 +42,8 @@ def distill(config: DictConfig) -> float:
     worst = min(table, key=lambda row: row["reward"])
     spec = return_format([worst["reward"], worst["guide_reward"]])
     print(
-        f"distill: made {len(table)}; the lowest mean reward is {worst['reward']:{spec}}, "
-        f"that of its guide {worst['guide_reward']:{spec}}"
+        f"distill: made {len(table) - found}, found {found}; the lowest mean reward is "
+        f"{worst['reward']:{spec}}, that of its guide {worst['guide_reward']:{spec}}"
     )
     return float(worst["reward"])
 
@@ -54,7 +56,7 @@ def check(config: DictConfig) -> None:
     from coil_rl.config.check import check_proxies, make_folder
     from coil_rl.config.values import check_values
 
-    used = ("preset", "track", "env", "guide", "evaluation", "proxy")
+    used = ("preset", "track", "env", "disturb", "guide", "evaluation", "proxy")
     app.check_used(used, "a proxy is trained as the key proxy says")
     app.check_folder("proxy.folder")
     check_values(config)

@@ -101,6 +101,7 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
 
     config = read_config(folder, "run", {"device": requested.device})
     resolved: Any = OmegaConf.to_container(requested, resolve=True)
+    _check_advice(config, resolved, folder)
     own: Any = OmegaConf.to_container(config.evaluation.advice, resolve=True)
     # The advice of the training is evaluated too.
     resolved["evaluation"]["advice"] = own | resolved["evaluation"]["advice"] | resolved["degrade"]
@@ -114,6 +115,22 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
     if config.method.observes is not None:
         check_measures(config, env_maker(config)(SOME_ROWS, TEST))
     return config
+
+
+def _check_advice(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> None:
+    """Raise a `UserError` for further advice where the policy has none that could be degraded."""
+    from coil_rl.config.build import advises
+
+    if advises(config) and not resolved.get("exported"):
+        return
+    reason = f"the policy of run={folder} has no advice"
+    if resolved.get("exported"):
+        reason = "the exported policy acts alone, as it is in its file"
+    asked = {"degrade": resolved["degrade"], "evaluation.advice": resolved["evaluation"]["advice"]}
+    for key, nodes in asked.items():
+        if nodes:
+            names = ",".join(map(str, nodes))
+            raise UserError(f"{key}=[{names}] has no effect: {reason}; leave it out")
 
 
 def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> list[str]:

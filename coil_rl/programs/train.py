@@ -30,11 +30,10 @@ def train(config: DictConfig) -> float:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration, or for what nothing reads."""
-    from coil_rl.config.build import trains_guides
-    from coil_rl.config.written import check_read
+    from coil_rl.config.unread import check_read
 
     app.check_run(config)
-    check_read(config, app.typed().task, trains_guides=trains_guides(config))
+    check_read(config, app.typed().task, shared=app.Jobs.is_sweep())
 
 
 def resume(folder: Path, frames: int | None = None) -> float:

@@ -134,4 +134,4 @@ def job_of(given: Named, arm: Arm, seed: int, frames: int | None, short: Sequenc
     nodes = dict(given.nodes)
     if arm.name != TUNE:
         nodes.pop("tune", None)
-    return Named(words, nodes)
+    return Named(words, nodes, shared=True)

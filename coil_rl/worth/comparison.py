@@ -19,6 +19,7 @@ from coil_rl.config.build import env_maker
 from coil_rl.config.check import check_parts
 from coil_rl.config.python import Named, composed, named
 from coil_rl.config.trust import trust_own
+from coil_rl.config.unread import check_read
 from coil_rl.errors import UserError
 from coil_rl.files import FAILED_JOBS, write_text
 from coil_rl.output import decoration, quietly, say
@@ -213,6 +214,8 @@ class Comparison:
             )
         trust_own(anchored)
         check_parts(anchored)
+        # What this arm does not read, none of them reads: it has a learner, advice and tests.
+        check_read(anchored, self.given.words)
         if self.tunes:
             check_parts(self._config(TUNE))
         return self._config(PPO)

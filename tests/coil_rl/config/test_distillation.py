@@ -9,12 +9,16 @@ import torch
 from hydra import compose, initialize_config_module
 
 from coil_rl.config import distillation, load
+from coil_rl.config.build import disturbances, env_maker
 from coil_rl.config.check import check
 from coil_rl.config.python import Named, named
 from coil_rl.config.python import composed as composed_in_python
 from coil_rl.errors import UserError
 from coil_rl.programs.distill import distill
 from coil_rl.programs.train import train
+from coil_rl.report.runs import read_curve
+from coil_rl.run.parts import TEST, TRAIN
+from coil_rl.transforms import GuideActions, ObservationDelay
 
 TINY = [
     "track=generated",
@@ -77,6 +81,29 @@ def test_folder_of_a_proxy_follows_from_guide_env_and_settings():
         for other in ("guide.spline.gain=0.9", "env.rate=20", "proxy.seed=1", "track.train.seed=5")
     ]
     assert len({folder(), folder(guide="constant"), *others}) == 6
+
+
+def test_proxy_is_trained_behind_the_delays_and_noise_of_the_run():
+    def proxy(*overrides):
+        config = composed("guide=spline", "run_dir=unused", *overrides)
+        return distillation.proxy_config(config, "spline")
+
+    words = ["disturb=[observation_delay]", "+evaluation.disturb.observation_delay.max_lag=7"]
+    disturbed = proxy(*words)
+    kinds = [type(part) for part in env_maker(disturbed)().transform]
+    assert kinds.index(ObservationDelay) < kinds.index(GuideActions)
+    lags = [
+        disturbances(disturbed, cases)["observation_delay"]["max_lag"] for cases in (TRAIN, TEST)
+    ]
+    assert lags == [2, 7]
+    others = [
+        proxy(),
+        proxy(words[0]),
+        proxy(*words, "disturb.observation_delay.min_lag=1"),
+        proxy(*words, "+training.disturb.observation_delay=null"),
+    ]
+    assert disturbed.run_dir == proxy(*words, "seed=3").run_dir
+    assert len({disturbed.run_dir, *(other.run_dir for other in others)}) == 5
 
 
 def folder_of_proxy(guide):
@@ -154,10 +181,10 @@ def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, caps
     )
     output = capsys.readouterr().out
     assert str(folder) in output
-    assert "distill: made 1; the lowest mean reward is" in output
+    assert "distill: made 0, found 1; the lowest mean reward is" in output
 
 
-def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path):
+def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path, capsys):
     whole = next(proxies.glob("constant_*"))
     stopped = tmp_path / whole.name
     stopped.mkdir()
@@ -172,9 +199,17 @@ def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path):
             "guide=constant", f"proxy.folder={tmp_path}", f"run_dir={tmp_path}", name="distill"
         )
     )
+    assert "distill: made 1, found 0;" in capsys.readouterr().out
     resumed = torch.load(stopped / "policy_last.pt", weights_only=True)
     for key, value in torch.load(whole / "policy_last.pt", weights_only=True).items():
         assert torch.equal(resumed[key], value), key
+
+
+@pytest.mark.parametrize(("asked", "taken"), [(1, 64), (64, 64), (65, 128)])
+def test_frames_of_a_proxy_are_whole_batches(asked, taken):
+    words = ["guide=spline", "method=dynamic_coil_sequential", f"proxy.budget.frames={asked}"]
+    proxy = distillation.proxy_config(composed(*words, "run_dir=unused"), "spline")
+    assert distillation._frames(proxy.budget) == taken
 
 
 @pytest.mark.slow
@@ -197,6 +232,9 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
         "zero",
     ]
     assert len(list(proxies.glob("zero_*"))) == 1
+    used = [next(proxies.glob(f"{name}_*")) / "metrics.csv" for name in ("spline", "zero")]
+    taken = sum(read_curve(curve)[-1]["frames"] for curve in used)
+    assert read_curve(tmp_path / "run" / "metrics.csv")[0]["frames/before"] == taken
     guides = load.load_guides(tmp_path / "run", config)
     network, state = (
         guides["spline"],

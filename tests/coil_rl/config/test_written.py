@@ -9,7 +9,6 @@ from omegaconf import OmegaConf
 from programs import CONF, called, shipped
 
 from coil_rl import UserError, compose_train
-from coil_rl.config.written import check_read
 
 METHODS = shipped("method")
 FAST = ("coil", "dagger", "rlpd")
@@ -147,24 +146,3 @@ def test_value_that_a_learner_does_not_take_is_refused_by_its_name(tmp_path):
     arguments = ["--config-dir", str(tmp_path), "env=mine", "env.id=Pendulum-v1", "method=coil"]
     refused = called("train", *arguments, "guide=zero", "learner=sac", cwd=tmp_path, code=2).stderr
     assert "SAC takes no gae_lambda" in refused
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("proxy.seed=3", "proxy.seed=3 has no effect: method=coil trains no guides"),
-        ("preset.perception.scale=2", "nothing in this run reads preset.perception.scale"),
-        ("method=dagger budget.minibatches=3", "nothing in this run reads budget.minibatches"),
-        ("learner=sac training.learning_rate=1", "reads training.learning_rate; leave it out"),
-        ("training.imitation_env.assignment=random", "reads training.imitation_env.assignment"),
-        ("training.tests.starts=5", "this run compares no policies while it trains"),
-    ],
-)
-def test_override_that_nothing_reads_is_refused(words, message, tmp_path):
-    refused = called("train", *words.split(), cwd=tmp_path, code=2).stderr
-    assert message in refused
-
-
-@pytest.mark.parametrize("word", ["method=coil_anchored", "delivery=tested"])
-def test_cases_of_comparisons_are_read_where_policies_are_compared(word):
-    check_read(compose_train([word]), ["training.tests.starts=5"], trains_guides=False)

@@ -33,6 +33,8 @@ TINY = shlex.split(
     "evaluation.repeats=1 logger=none checkpoint_every=1 "
     "budget.frames=256 budget.num_envs=4 budget.steps=16"
 )
+# What a guide alone does not read.
+OF_LEARNING = ("budget", "checkpoint_every", "logger", "evaluation.repeats", "evaluation.curve")
 SHORT = shlex.split("env.laps=1 env.time_limit=1 evaluation.curve.env.time_limit=1")
 OWN = dict.fromkeys(TRACKED, SHORT)
 OWN |= {env: [*overrides, *SMALL_CASES] for env, overrides in OTHERS.items()}
@@ -74,6 +76,8 @@ def kill(folder, overrides, mark):
 def trained(env, learner, folder):
     """Train to the end, evaluate the run again, and return the arguments of the training."""
     overrides = [f"env={env}", *LEARNERS[learner], *TINY, *OWN[env]]
+    if learner == "guide":
+        overrides = [word for word in overrides if not word.startswith(OF_LEARNING)]
     called("train", *overrides, f"hydra.run.dir={folder}", cwd=folder.parent)
     assert (folder / ("lines.gif" if env in TRACKED else "returns.png")).exists()
     again = ["evaluation.repeats=1", "evaluation.gif=false", "trust=[torchrl]"]

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from programs import called, command, environment
+from run_folders import make_untrained_run
 
 import coil_rl
 import coil_rl.run.run  # noqa: F401  before `started` replaces functions that it imports
@@ -442,6 +443,22 @@ def test_evaluation_of_a_run_refuses_what_it_does_not_read(started, run, name, c
     assert sentence == f"{change} has no effect: {reason}; leave it out"
 
 
+@pytest.mark.parametrize(
+    "words", [["degrade=[zeroed]"], ["+degrade@evaluation.advice.zeroed=zeroed"]]
+)
+@pytest.mark.parametrize("method", ["ppo", "guide"])
+def test_other_advice_is_refused_for_a_policy_without_any(method, words, tmp_path):
+    folder = make_untrained_run(tmp_path / "run", f"method={method}", *TINY)
+    for exported, reason in (
+        ([], f"the policy of run={folder} has no advice"),
+        (["exported=policy.onnx"], "the exported policy acts alone, as it is in its file"),
+    ):
+        given = [f"run={folder}", *words, *exported]
+        refused = called("evaluate", *given, cwd=tmp_path, code=2).stderr
+        assert "has no effect: " in refused
+        assert reason in refused
+
+
 def test_tracks_are_not_changed_where_none_are_chosen(started, run):
     sentence = refusal("evaluate", f"run={run}", "track.test.split=train")
     assert sentence.startswith(f"track.test.split=train has no effect alone: run={run} has its own")
@@ -644,7 +661,7 @@ def test_folder_in_place_of_the_lock_is_named(tmp_path):
     lock = tmp_path / "run" / ".lock"
     lock.mkdir(parents=True)
     ended = called(
-        "train", "method=guide", f"hydra.run.dir={tmp_path}/run", *TINY, cwd=tmp_path, code=2
+        "train", "method=guide", f"hydra.run.dir={tmp_path}/run", *TINY[2:], cwd=tmp_path, code=2
     )
     assert (
         ended.stderr

@@ -5,7 +5,7 @@ import time
 from importlib import metadata
 
 import pytest
-from programs import LAP, TINY, TRACK, called, command, environment
+from programs import SHORT_LAP, TINY, TRACK, called, command, environment
 
 STILL = "evaluation.gif=false"
 
@@ -46,13 +46,11 @@ def test_evaluate_repeats_the_numbers_of_train(run):
 
 
 def test_guide_alone_can_be_trained_and_evaluated(tmp_path):
-    done = called(
-        "train", *TINY, STILL, "method=guide", "guide=zero", "hydra.run.dir=run", cwd=tmp_path
-    )
+    words = [*SHORT_LAP, STILL, "method=guide", "guide=zero", "hydra.run.dir=run"]
+    done = called("train", *words, cwd=tmp_path)
     assert "guide: mean test reward" in done.stdout
     assert not (tmp_path / "run" / "metrics.csv").exists()
-    given = [*LAP, STILL, "env.time_limit=2"]
-    alone = called("evaluate", "guide=zero", *given, "hydra.run.dir=alone", cwd=tmp_path)
+    alone = called("evaluate", "guide=zero", *SHORT_LAP, STILL, "hydra.run.dir=alone", cwd=tmp_path)
     assert alone.stdout.splitlines()[:-1] == done.stdout.splitlines()[:-1]
 
 
@@ -163,6 +161,6 @@ def test_part_of_another_package_is_used_by_its_name(tmp_path, monkeypatch):
     (experiments / "mine.yaml").write_text(
         "# @package _global_\ndefaults:\n  - override /method: guide\n  - override /guide: theirs\n"
     )
-    mine = ["--config-dir", "conf", *TINY, STILL, "+experiment=mine", "hydra.run.dir=run"]
+    mine = ["--config-dir", "conf", *SHORT_LAP, STILL, "+experiment=mine", "hydra.run.dir=run"]
     done = called("train", *mine, cwd=tmp_path)
     assert "100%" in done.stdout, "a constant steering of 80 degrees crashes every car"

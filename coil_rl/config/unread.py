@@ -1,0 +1,159 @@
+"""Words of the command line that nothing reads: they would have no effect, and are refused."""
+
+from collections.abc import Collection, Iterable
+from functools import cached_property
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from coil_rl.config.build import advises, env_maker, learner_kind, trains_guides
+from coil_rl.config.written import REFERENCE, covers, key_of, leaves
+from coil_rl.errors import UserError
+
+# Keys that other values refer to, and that nothing else reads.
+REFERRED = (
+    "preset",
+    "track",
+    "recording",
+    "training.learning_rate",
+    "training.imitation_env",
+    "budget.minibatches",
+)
+# Keys that no run reads that tunes its guide.
+OF_A_LEARNER = (
+    "learner",
+    "network",
+    "training.learning_rate",
+    "training.normalise",
+    "training.scale_rewards",
+    "training.noise_correlation",
+    "budget.num_envs",
+    "budget.steps",
+    "budget.minibatches",
+    "checkpoint_every",
+    "evaluation.repeats",
+)
+# Keys that no run reads whose guide acts alone.
+OF_A_TRAINING = (
+    *("learner", "network", "training", "budget", "checkpoint_every", "logger", "watch"),
+    *("observes", "action", "compile", "evaluation.curve", "evaluation.guides"),
+    *("evaluation.repeats", "evaluation.policy"),
+)
+
+
+def check_read(config: DictConfig, task: Iterable[str], *, shared: bool = False) -> None:
+    """Refuse a word of the command line that a run does not read.
+
+    Args:
+        config: of the run, composed and checked.
+        task: words for the program.
+        shared: whether they may be meant for other runs too, as in a sweep over methods or envs:
+            what another one of these would read is accepted then.
+
+    Raises:
+        UserError: for the first word without an effect.
+    """
+    reasons = Reasons(config, shared=shared)
+    for text in task:
+        if reason := reasons.of(key_of(text)):
+            raise UserError(f"{text} has no effect: {reason}")
+
+
+class Reasons:
+    """Why a run does not read a key.
+
+    Args:
+        config: of the run, composed and checked.
+        shared: as for `check_read`.
+    """
+
+    def __init__(self, config: DictConfig, *, shared: bool) -> None:
+        self.config, self.method = config, f"method={config.method.name}"
+        always = (self._of_proxies, self._of_tests, self._of_references)
+        self.rules = (
+            always if shared else (*always, self._of_method, self._of_advice, self._of_noise)
+        )
+
+    def of(self, key: str) -> str:
+        """Return why the run does not read a key, and what to do; empty if it may read it.
+
+        Args:
+            key: full key of a word.
+        """
+        return next(filter(None, (rule(key) for rule in self.rules)), "")
+
+    def _of_proxies(self, key: str) -> str:
+        if not key.startswith("proxy.") or trains_guides(self.config):
+            return ""
+        return (
+            f"{self.method} trains no guides, for which a proxy would stand; leave it out, or take "
+            "method=dynamic_coil_sequential"
+        )
+
+    def _of_tests(self, key: str) -> str:
+        anchored = OmegaConf.select(self.config, "learner.anchor") is not None
+        tests = anchored or self.config.method.search or self.config.delivery == "tested"
+        if tests or not _inside(key, ["training.tests"]):
+            return ""
+        return (
+            "this run compares no policies while it trains; leave it out, or give delivery=tested"
+        )
+
+    def _of_references(self, key: str) -> str:
+        if not _inside(key, REFERRED) or _touches(key, self.references):
+            return ""
+        return f"nothing in this run reads {key}; leave it out"
+
+    def _of_method(self, key: str) -> str:
+        has_agent = self.config.method.observes is not None
+        if has_agent and not self.config.method.search:
+            return ""
+        unread = OF_A_LEARNER if has_agent else OF_A_TRAINING
+        if not _inside(key, unread) or _touches(key, self._references_beside(unread)):
+            return ""
+        what = "tunes its guide and has no learner" if has_agent else "trains nothing"
+        return f"{self.method} {what}; leave it out"
+
+    def _of_advice(self, key: str) -> str:
+        if not _inside(key, ["evaluation.advice"]) or advises(self.config):
+            return ""
+        return f"{self.method} gives the agent no advice that could be degraded; leave it out"
+
+    def _of_noise(self, key: str) -> str:
+        if key != "training.noise_correlation":
+            return ""
+        if learner_kind(self.config) == "imitation":
+            return f"{self.method} imitates, and explores without noise; leave it out"
+        env = env_maker(self.config)()
+        if env.full_action_spec[env.action_key].dtype.is_floating_point:
+            return ""
+        return "the actions of this env are choices, to which no noise is added; leave it out"
+
+    @cached_property
+    def references(self) -> set[str]:
+        """The keys that values of the configuration refer to."""
+        return self._references_beside(())
+
+    def _references_beside(self, unread: Collection[str]) -> set[str]:
+        """Return the keys that values refer to, but those that are not read.
+
+        Of an evaluation that is the number of rows, too: it has one for each case.
+        """
+        values: Any = OmegaConf.to_container(self.config, resolve=False)
+        found: set[str] = set()
+        for key, value in leaves(values, ""):
+            if unread and (_inside(key, unread) or key == "env.num_envs"):
+                continue
+            if isinstance(value, (str, list)):
+                found |= {name for name in REFERENCE.findall(str(value)) if name != key}
+        return found
+
+
+def _inside(key: str, others: Iterable[str]) -> bool:
+    """Return whether a key is one of some others, or inside one."""
+    return any(f"{key}.".startswith(f"{other}.") for other in others)
+
+
+def _touches(key: str, others: Iterable[str]) -> bool:
+    """Return whether a key is one of some others, inside one, or around one."""
+    return any(covers(key, other) for other in others)
