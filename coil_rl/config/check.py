@@ -20,6 +20,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from coil_rl.config import build
 from coil_rl.config.choices import about_choices, needs_numbers
 from coil_rl.config.distillation import (
+    frames_of,
     guides_with_untrained_proxies,
     guides_without_parameters,
     proxy_config,
@@ -37,6 +38,7 @@ from coil_rl.envs.gate import ForeignError
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
+from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.measures import measures_of
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
@@ -353,7 +355,9 @@ def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
             f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out"
         )
     guides = build.build_guides(config) if trains else {}
-    check_proxies(config, guides_without_parameters(guides))
+    replaced = guides_without_parameters(guides)
+    check_proxies(config, replaced)
+    _check_frames_of_proxies(config, replaced)
     untrained = guides_with_untrained_proxies(config) if guides else None
     learner = build.build_learner(config, env, untrained)
     if config.evaluation.fallback:
@@ -384,13 +388,20 @@ def _check_init(config: DictConfig, learner: Learner) -> None:
 
 
 def _check_batch(config: DictConfig, learner: Learner) -> None:
-    frames = config.budget.num_envs * config.budget.steps
+    """Raise a `UserError` if batches are too small, or the run ends before learning starts."""
+    rows, steps, frames = config.budget.num_envs, config.budget.steps, config.budget.frames
     try:
-        learner.check_batch(frames)
+        learner.check_batch(rows, steps)
     except ValueError as error:
         raise UserError(
-            f"learner.{error}; a batch has budget.num_envs x budget.steps = {frames} frames"
+            f"learner.{error}; a batch has budget.num_envs x budget.steps = {rows} x {steps} frames"
         ) from error
+    starts = learner.starts if isinstance(learner, OffPolicy) else 0
+    if frames <= starts:
+        raise UserError(
+            f"budget.frames={frames} ends before learning starts, after learner.starts={starts} "
+            f"stored steps; give more frames, or a learner.starts such as {frames // 4}"
+        )
 
 
 def _check_validation(config: DictConfig, learner: Learner) -> None:
@@ -439,6 +450,18 @@ def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
             check_parts(proxy_config(config, name))
         except UserError as error:
             raise UserError(f"proxy of guide.{name}: {error}") from error
+
+
+def _check_frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> None:
+    """Raise a `UserError` if the proxies of guides take all frames of a run."""
+    taken = sum(frames_of(proxy_config(config, name).budget) for name in guides)
+    budget = config.budget
+    if taken >= budget.frames:
+        raise UserError(
+            f"budget.frames={budget.frames} leaves nothing to the run, as the proxies of its "
+            f"guides take {taken} frames; give at least "
+            f"{taken + budget.num_envs * budget.steps}, or a smaller proxy.budget.frames"
+        )
 
 
 def _dotted(key: str | Iterable[Any]) -> str:

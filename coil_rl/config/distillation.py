@@ -135,11 +135,15 @@ def distil(config: DictConfig, folder: Path) -> int:
         for proxy in proxies.values():
             run_configured(proxy, wait=True)
         copy_proxies({name: Path(proxy.run_dir) for name, proxy in proxies.items()}, folder)
-    return sum(_frames(proxy.budget) for proxy in proxies.values())
+    return sum(frames_of(proxy.budget) for proxy in proxies.values())
 
 
-def _frames(budget: DictConfig) -> int:
-    """Return the frames that a training without tests takes with a budget: whole batches."""
+def frames_of(budget: DictConfig) -> int:
+    """Return the frames that a training without tests takes: whole batches.
+
+    Args:
+        budget: of the training, with `frames`, `num_envs` and `steps`.
+    """
     batch = int(budget.num_envs) * int(budget.steps)
     return math.ceil(budget.frames / batch) * batch
 

@@ -392,6 +392,8 @@ def of_replay(what: str, otherwise: int, *, _root_: DictConfig) -> int:
 
 # Process id in run folders: two runs may start within a microsecond.
 OmegaConf.register_new_resolver("pid", os.getpid, replace=True)
+# ${smaller:${budget.minibatches},${budget.num_envs}}
+OmegaConf.register_new_resolver("smaller", min, replace=True)
 # Keys of a table in a label: ${names:${degrade},intact}
 OmegaConf.register_new_resolver(
     "names", lambda table, none: "_".join(map(str, table)) or none, replace=True

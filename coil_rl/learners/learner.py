@@ -63,8 +63,13 @@ class Learner(ABC):
         """
         return []
 
-    def check_batch(self, frames: int) -> None:  # noqa: B027  optional
-        """Raise a `ValueError` if a batch of that many frames, B * T, is too small."""
+    def check_batch(self, rows: int, steps: int) -> None:  # noqa: B027  optional
+        """Raise a `ValueError` if batches [B, T] are too small.
+
+        Args:
+            rows: B, of the env.
+            steps: T, of each row.
+        """
 
     def export(self, folder: Path) -> None:  # noqa: B027  optional
         """Write what others need besides the policy into the folder of a finished run."""

@@ -9,7 +9,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
-from coil_rl.errors import UserError
 from coil_rl.learners.networks import REMEMBERED
 from coil_rl.learners.state import Stateful
 
@@ -87,15 +86,23 @@ class RowMinibatches(Minibatches):
         """Yield the minibatches [N] of all passes over `rows`.
 
         Raises:
-            UserError: if there are fewer rows than minibatches.
-            ValueError: if a minibatch would have less than two steps.
+            ValueError: if there are fewer rows than minibatches, or a minibatch would have less
+                than two steps.
         """
-        if len(rows) < self.count:
-            raise UserError(
-                f"minibatches={self.count} are more than the {len(rows)} envs, but with a memory "
-                "each needs all steps of an env; take fewer minibatches or more envs"
-            )
+        self.check_rows(len(rows))
         yield from map(self.remember, super().draw(rows))
+
+    def check_rows(self, rows: int) -> None:
+        """Raise a `ValueError` if there are fewer rows than minibatches.
+
+        Args:
+            rows: number of them.
+        """
+        if rows < self.count:
+            raise ValueError(
+                f"minibatches={self.count} are more than the {rows} envs, but with a memory each "
+                "needs all steps of an env; take fewer minibatches or more envs"
+            )
 
     def remember(self, rows: TensorDictBase) -> TensorDictBase:
         """Return the steps of whole rows [N, T] with `remembered`, [N * T]."""

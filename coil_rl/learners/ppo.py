@@ -30,7 +30,7 @@ from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.guided_steps import AGENT_ACTS, LossesOfAgentSteps, guide_may_act
 from coil_rl.learners.lean_update import LeanUpdate
 from coil_rl.learners.learner import Callback, Cases, Learner
-from coil_rl.learners.minibatches import minibatches_of
+from coil_rl.learners.minibatches import RowMinibatches, minibatches_of
 from coil_rl.learners.normaliser import normaliser
 from coil_rl.learners.reward_scale import RewardScale
 from coil_rl.learners.sampling import UNCLIPPED
@@ -288,9 +288,16 @@ class PPO(Stateful, Learner):
         """Return the start test of an anchored policy."""
         return start_tests(self.anchor, self.policy, cases)
 
-    def check_batch(self, frames: int) -> None:
-        """Raise a `ValueError` if a batch of that many frames has too few for the minibatches."""
-        if 2 * self.minibatches > frames:
+    def check_batch(self, rows: int, steps: int) -> None:
+        """Raise a `ValueError` if a batch [B, T] is too small for the minibatches.
+
+        Args:
+            rows: B, of the env. With a memory each minibatch has whole rows.
+            steps: T, of each row.
+        """
+        if isinstance(self.sampler, RowMinibatches):
+            self.sampler.check_rows(rows)
+        if 2 * self.minibatches > rows * steps:
             raise ValueError(
                 f"minibatches={self.minibatches} leaves less than 2 frames to each minibatch, too "
                 "few to standardise advantages"

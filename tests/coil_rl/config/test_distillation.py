@@ -209,7 +209,7 @@ def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path, ca
 def test_frames_of_a_proxy_are_whole_batches(asked, taken):
     words = ["guide=spline", "method=dynamic_coil_sequential", f"proxy.budget.frames={asked}"]
     proxy = distillation.proxy_config(composed(*words, "run_dir=unused"), "spline")
-    assert distillation._frames(proxy.budget) == taken
+    assert distillation.frames_of(proxy.budget) == taken
 
 
 @pytest.mark.slow
@@ -219,11 +219,13 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
         "method=dynamic_coil_sequential",
         "guide=[spline,zero]",
         f"proxy.folder={proxies}",
-        "budget.frames=64",
+        "budget.frames=192",
         "learner.epochs=1",
         "learner.minibatches=2",
         f"run_dir={tmp_path / 'run'}",
     ]
+    with pytest.raises(UserError, match="as the proxies of its guides take 128 frames"):
+        check(composed(*overrides, "budget.frames=128"))
     config = composed(*overrides)
     check(config)
     train(config)

@@ -152,10 +152,10 @@ def test_minibatches_of_a_pass_are_all_steps_once_in_another_order_each():
 def test_batch_must_have_two_frames_for_each_minibatch(frames, fits):
     learner = PPO(AnyEnv(4), minibatches=4)
     if fits:
-        learner.check_batch(frames)
+        learner.check_batch(1, frames)
     else:
         with pytest.raises(ValueError, match="minibatches=4 leaves less than 2 frames to each"):
-            learner.check_batch(frames)
+            learner.check_batch(1, frames)
 
 
 def test_learner_needs_only_an_update_and_a_state():
@@ -170,7 +170,7 @@ def test_learner_needs_only_an_update_and_a_state():
             pass
 
     idle = Idle()
-    idle.check_batch(0)
+    idle.check_batch(0, 0)
     idle.export(Path("nowhere"))
     assert idle.kind == "agent"
     assert idle.callbacks(None) == []

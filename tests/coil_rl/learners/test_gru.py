@@ -340,10 +340,10 @@ def one_guide():
 def test_more_minibatches_than_envs_are_refused():
     env = around(Recall(4), gru := Gru())
     learner = PPO(env, network=gru, minibatches=5)
-    with pytest.raises(
-        UserError,
-        match="minibatches=5 are more than the 4 envs, but with a memory each needs all steps",
-    ):
+    said = "minibatches=5 are more than the 4 envs, but with a memory each needs all steps"
+    with pytest.raises(ValueError, match=said):
+        learner.check_batch(rows=4, steps=8)
+    with pytest.raises(ValueError, match=said):
         learner.update(Rollout(env, learner.policy, 8, learner.keys).collect())
 
 

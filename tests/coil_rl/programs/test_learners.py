@@ -154,6 +154,18 @@ def test_compatible_method_and_learner_train(method, learner, tmp_path):
             "learner=dqn learner.capacity=10",
             "learner: capacity=10 must be at least 1 and at least starts=5000",
         ),
+        (
+            "learner=dqn budget.frames=5_000",
+            "budget.frames=5000 ends before learning starts, after learner.starts=5000 stored",
+        ),
+        (
+            "method=rlpd learner=sac budget.frames=4_999",
+            "budget.frames=4999 ends before learning starts",
+        ),
+        (
+            "method=ppo network=gru learner.minibatches=5",
+            "learner.minibatches=5 are more than the 4 envs, but with a memory each needs all",
+        ),
     ],
 )
 def test_other_incompatible_choices_are_refused(overrides, sentence, tmp_path):
