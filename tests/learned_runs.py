@@ -5,25 +5,30 @@ from outside_package.install import PROXY
 import coil_rl
 
 STEPS = 20
-TINY = ["budget.num_envs=2", "budget.steps=16", "evaluation.cases=2", "logger=none"]
-TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
-TINY += [f"env.max_steps={STEPS + 4}"]
+SHORT = ["evaluation.cases=2", "evaluation.gif=false", f"env.max_steps={STEPS + 4}"]
+TINY = ["budget.num_envs=2", "budget.steps=16", "logger=none", *SHORT]
+TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1"]
 REPLAY = ["learner.starts=16", "learner.ratio=1", "learner.batch_size=16"]
 ON_POLICY = ["learner.minibatches=2", "learner.epochs=1", "learner.action_gain=1"]
 FOREST = ["learner.regressor.estimator.n_estimators=3"]
 # What makes a method small, and its policy do something before it has learned anything.
 OPTIONS = dict.fromkeys(("cheq", "ibrl", "policy_decorator", "rlpd", "wsrl", "q_filter"), REPLAY)
-OPTIONS |= {"dagger": FOREST, "oil": FOREST, "guide": [], "coil_anchored": ON_POLICY[:2]}
+OPTIONS |= {"dagger": FOREST, "oil": FOREST, "coil_anchored": ON_POLICY[:2]}
 
 
 def learned(folder, method, *overrides, guide="thermostat.control:PI", env="thermostat:Room-v0"):
     """Return the folder of a run that has learned from one batch."""
-    words = [*TINY, *PROXY, *OPTIONS.get(method, ON_POLICY), f"proxy.folder={folder}_proxies"]
+    words, frames = [*TINY, *OPTIONS.get(method, ON_POLICY)], 32
+    if method == "guide":  # it learns nothing
+        words, frames = SHORT, None
+    if method.startswith("dynamic_coil"):
+        words += [*PROXY, f"proxy.folder={folder}_proxies"]
+        frames += 192  # those of its proxies
     run = coil_rl.prepare(
         env,
         guide=None if method == "ppo" else guide,
         method=method,
-        frames=32,
+        frames=frames,
         folder=folder,
         overrides=[*words, *overrides],
     )

@@ -19,6 +19,7 @@ from pydantic_core import PydanticCustomError, core_schema
 from coil_rl.measures import REDUCTIONS
 
 LARGEST = 2**63 - 1
+GRU = "coil_rl.learners.Gru"
 # Keys in which two runs with the same numbers may differ.
 IGNORED_KEYS = (
     "run_dir",
@@ -390,10 +391,22 @@ def of_replay(what: str, otherwise: int, *, _root_: DictConfig) -> int:
     return replay.of_replay(_root_, what) if replay.replays(_root_) else otherwise
 
 
+def minibatches(count: int, *, _root_: DictConfig) -> int:
+    """Return how many minibatches a pass over a batch has by default.
+
+    With a memory each has all steps of some rows of the env, so there are at most as many as rows.
+
+    Args:
+        count: of a policy without a memory.
+    """
+    network = OmegaConf.select(_root_, "learner.network._target_")
+    return min(count, _root_.budget.num_envs) if network == GRU else count
+
+
 # Process id in run folders: two runs may start within a microsecond.
 OmegaConf.register_new_resolver("pid", os.getpid, replace=True)
-# ${smaller:${budget.minibatches},${budget.num_envs}}
-OmegaConf.register_new_resolver("smaller", min, replace=True)
+# ${minibatches:${budget.minibatches}}
+OmegaConf.register_new_resolver("minibatches", minibatches, replace=True)
 # Keys of a table in a label: ${names:${degrade},intact}
 OmegaConf.register_new_resolver(
     "names", lambda table, none: "_".join(map(str, table)) or none, replace=True

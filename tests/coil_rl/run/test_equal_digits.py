@@ -95,7 +95,9 @@ class Near:
 
 def run_in(folder, box, method, *overrides, frames=128, reward_unit=1.0):
     low, high = box
-    words = [*TINY, *PROXY, *OPTIONS.get(method, ON_POLICY), f"proxy.folder={folder}_proxies"]
+    words = [*TINY, *OPTIONS.get(method, ON_POLICY)]
+    if method.startswith("dynamic_coil"):
+        words += [*PROXY, f"proxy.folder={folder}_proxies"]
     return coil_rl.prepare(
         partial(Plant, low, high, reward_unit),
         guide=None if method in WITHOUT_GUIDE else Near(Units(low, high)),
