@@ -289,7 +289,7 @@ class GuideActions(ActionTransform):
         module = Guides(guides, action_key, out_key)
         self.supplied = [key for key in SUPPLIED if key in module.in_keys]
         super().__init__(in_keys=module.in_keys, out_keys=module.out_keys)
-        self.guides, self.action_key = module, module.action_key
+        self.guides, self.action_key = module.eval(), module.action_key
         pure = all(getattr(guide, "pure", False) for guide in guides.values())
         self._cache = GuideCache() if pure and not self.needs_past else None
         self._checked: set[str] = set()
