@@ -52,8 +52,8 @@ def train(
             TorchRL env without batch; or a `Run`, which is trained as it is: of the other arguments
             it takes `frames` alone.
         guide: a class or a `functools.partial` of one, an object with `act(observation)`, a
-            function, a network; the import path "PACKAGE.MODULE:NAME" of one; the name of a file in conf/guide, such as "spline"; a
-            `Controller` of another run; or None.
+            function, a network; the import path "PACKAGE.MODULE:NAME" of one; the name of a file in
+            conf/guide, such as "spline"; a `Controller` of another run; or None.
         method: name of a file in conf/method; by default "coil_anchored" with a guide, "ppo"
             without one.
         frames: length of the run; by default that of the env's file.
