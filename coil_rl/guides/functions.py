@@ -151,11 +151,22 @@ class FunctionGuide(TensorDictModuleBase):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of NumPy, which gets tensors here
             together = torch.as_tensor(self.function(*(entry[order] for entry in rows)))
-        if together.numel() != alone.numel():
+        if together.numel() != alone.numel() or not self._has_form(together, alone):
             return False
         difference = (together.cpu().reshape(alone.shape) - alone[order]).abs()
         # NumPy and torch may add up in another order.
         return bool((difference <= ROUNDING * alone[order].abs().amax(-1, keepdim=True)).all())
+
+    def _has_form(self, together: Tensor, alone: Tensor) -> bool:
+        """Return whether an answer for a batch has the form of actions.
+
+        Args:
+            together: the answer.
+            alone: the action of each row alone, [n, A].
+        """
+        if together.shape == alone.shape:
+            return True
+        return self.space is not None and self.space.takes(together, alone.shape[:1])
 
 
 def _beside_others(entry: Tensor) -> Tensor:
