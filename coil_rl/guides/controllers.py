@@ -41,7 +41,8 @@ MINUS = str.maketrans(dict.fromkeys("\u2010\u2011\u2212\u2013\u2014\ufe63\uff0d"
 class PerRow(TensorDictModuleBase):
     """Python controllers as a guide, one object for each row of the env.
 
-    An object is made when its row first acts. `act(observation)` gets one NumPy array for each of
+    An object is made when its row first acts, and is not asked after the end of an episode, see
+    `Guides`. `act(observation)` gets one NumPy array for each of
     `in_keys` and returns an action: numbers, an index or a one-hot vector. `reset()`, if there is
     one, is called at the start of each episode; without it each episode gets a new object. Objects
     with `state_dict()` and `load_state_dict(state)` are part of a checkpoint; without these, new
@@ -67,7 +68,7 @@ class PerRow(TensorDictModuleBase):
         torch.Size([3, 1, 2])
     """
 
-    foreign = True
+    foreign = by_row = True
 
     def __init__(
         self,
@@ -235,8 +236,8 @@ class ControllerGuide(TensorDictModuleBase):
 
     @property
     def by_row(self) -> bool:
-        """Whether it is asked row by row."""
-        return getattr(self.guide, "by_row", False)
+        """Whether there is one object for each row, see `Guides`."""
+        return isinstance(self.guide, PerRow)
 
     def in_space(self, space: ActionSpace) -> None:
         """Tell the controller which actions the env has, if it asks for that.

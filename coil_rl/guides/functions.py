@@ -60,11 +60,6 @@ class FunctionGuide(TensorDictModuleBase):
         self.space: ActionSpace | None = None  # unknown outside of an env
         self.shared = SharedCheck(self.title)
 
-    @property
-    def by_row(self) -> bool:
-        """Whether it is asked row by row."""
-        return self.for_batch is False
-
     def in_space(self, space: ActionSpace) -> None:
         """Take the space of the actions of an env, which decides what has the form of actions."""
         self.space = space
