@@ -234,6 +234,19 @@ class ActionSpace:
                 )
             raise ValueError(f"is neither an index below {max(self.choices)} nor a one-hot vector")
 
+    def takes(self, action: Tensor, batch: torch.Size) -> bool:
+        """Return whether the action of a guide has a shape of which `advice` makes a vector.
+
+        Args:
+            action: of the guide.
+            batch: of the action.
+        """
+        try:
+            self._indices(self._as_vector(action, batch), batch)
+        except ValueError:
+            return False
+        return True
+
     def _check_one_hot(self, vectors: Tensor) -> None:
         """Raise a `ValueError` for vectors [..., A] without exactly one 1 for each choice."""
         chosen = torch.stack([part.sum(-1) for part in vectors.split(self.choices, -1)], -1)

@@ -8,6 +8,7 @@ keeps the advice for the states in which episodes begin, and `GuideActions` is t
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import ClassVar
 
@@ -65,8 +66,24 @@ def unfit_action(
     return UnfitActionError(name, problem)
 
 
+@dataclass(frozen=True)
+class Ended:
+    """Rows whose episode is over, so that nothing needs new advice for them.
+
+    Args:
+        rows: which these are, [*batch].
+        advice: the last advice of all rows, [*batch, *agents, n_guides, A].
+    """
+
+    rows: Tensor
+    advice: Tensor
+
+
 class Guides(TensorDictModuleBase):
     """Several guides as one module that writes their actions side by side.
+
+    A guide with the attribute `by_row = True` has one object for each row, and no memory in the
+    data. It is not asked after the end of an episode: rows that have ended keep their last advice.
 
     Args:
         guides: name to guide, in the order of the rows of the advice.
@@ -140,6 +157,7 @@ class Guides(TensorDictModuleBase):
         tensordict: TensorDictBase,
         convert: Callable[[str, Tensor, torch.Size], Tensor] | None = None,
         memory: TensorDictBase | None = None,
+        ended: Ended | None = None,
     ) -> Tensor:
         """Return the advice [*batch, n_guides, A].
 
@@ -147,20 +165,40 @@ class Guides(TensorDictModuleBase):
             tensordict: observations; each guide gets a copy of its own entries.
             convert: applied to name, action and batch of each guide.
             memory: by guide; replaced by what the guides remember for the next step.
+            ended: rows for which guides with `by_row` are not asked.
         """
         rows = []
-        for name, guide in self.guides.items():
-            data = tensordict.select(*self._in_keys_of[name], strict=False)
-            if name in self._input_dtype:
-                data = data.apply(partial(_converted, dtype=self._input_dtype[name]))
-            if memory is not None and name in self.memories:
-                data = guide(data.update(memory[name]))
-                memory.set(name, data["next"].select(*self.memories[name].specs))
-            else:
-                data = guide(data)
-            action = data[self.action_key]
-            rows.append(action if convert is None else convert(name, action, tensordict.batch_size))
+        for number, (name, guide) in enumerate(self.guides.items()):
+            by_row = getattr(guide, "by_row", False)
+            if ended is None or not by_row or not ended.rows.any():
+                rows.append(self._asked(name, tensordict, convert, memory))
+                continue
+            advice = ended.advice.select(-2, number)
+            if not ended.rows.all():
+                running = ~ended.rows
+                new = self._asked(name, tensordict[running], convert, memory)
+                advice = advice.index_put((running,), new)
+            rows.append(advice)
         return torch.stack(rows, -2)
+
+    def _asked(
+        self,
+        name: str,
+        tensordict: TensorDictBase,
+        convert: Callable[[str, Tensor, torch.Size], Tensor] | None,
+        memory: TensorDictBase | None,
+    ) -> Tensor:
+        """Return the advice of a guide [*batch, A]; the arguments are those of `advice`."""
+        data = tensordict.select(*self._in_keys_of[name], strict=False)
+        if name in self._input_dtype:
+            data = data.apply(partial(_converted, dtype=self._input_dtype[name]))
+        if memory is not None and name in self.memories:
+            data = self.guides[name](data.update(memory[name]))
+            memory.set(name, data["next"].select(*self.memories[name].specs))
+        else:
+            data = self.guides[name](data)
+        action: Tensor = data[self.action_key]
+        return action if convert is None else convert(name, action, tensordict.batch_size)
 
     def tell(self, space: ActionSpace) -> None:
         """Tell the guides that ask for it, by a method `in_space`, which actions there are.
@@ -289,7 +327,7 @@ class GuideActions(ActionTransform):
         module = Guides(guides, action_key, out_key)
         self.supplied = [key for key in SUPPLIED if key in module.in_keys]
         super().__init__(in_keys=module.in_keys, out_keys=module.out_keys)
-        self.guides, self.action_key = module, module.action_key
+        self.guides, self.action_key = module.eval(), module.action_key
         pure = all(getattr(guide, "pure", False) for guide in guides.values())
         self._cache = GuideCache() if pure and not self.needs_past else None
         self._checked: set[str] = set()
@@ -371,8 +409,26 @@ class GuideActions(ActionTransform):
         action = self.given_space.vectors(tensordict[self.action_key])
         data = next_tensordict.select(*self.in_keys, strict=False)
         memory = tensordict.select(*(("guide_state", name) for name in self.guides.memories))
-        advice, memory = self._advice_with_past(data, memory, self.rows, action)
+        ended = self._ended(tensordict, next_tensordict)
+        advice, memory = self._advice_with_past(data, memory, self.rows, action, ended)
         return self._write(next_tensordict, advice, memory)
+
+    def _ended(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Ended | None:
+        """Return the rows that need no advice after a step; None where that is not known.
+
+        In training a critic may read the advice after the last step of a truncated episode.
+
+        Args:
+            tensordict: before the step.
+            next_tensordict: after it.
+        """
+        if not any(getattr(guide, "by_row", False) for guide in self.guides.guides.values()):
+            return None
+        rows = next_tensordict.get("terminated" if self.training else "done", None)
+        advice, batch = tensordict.get(self.out_keys[0], None), next_tensordict.batch_size
+        if rows is None or advice is None or rows.numel() != batch.numel():
+            return None
+        return Ended(rows.reshape(batch), advice)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -415,13 +471,17 @@ class GuideActions(ActionTransform):
         return tensordict.set(self.out_keys[0], advice)
 
     @torch.no_grad()
-    def _advice(self, tensordict: TensorDictBase, memory: TensorDictBase | None = None) -> Tensor:
+    def _advice(
+        self,
+        tensordict: TensorDictBase,
+        memory: TensorDictBase | None = None,
+        ended: Ended | None = None,
+    ) -> Tensor:
         """Return the advice within the bounds of the action; the memory is replaced by the next."""
-        self.calls += tensordict.numel() * len(self.names)
         if not self._checked:
             self.guides.match_dtypes(tensordict)
             self.guides.tell(self.guide_space)
-        return self.guides.advice(tensordict, self._fitted, memory)
+        return self.guides.advice(tensordict, self._fitted, memory, ended)
 
     def _advice_with_past(
         self,
@@ -429,6 +489,7 @@ class GuideActions(ActionTransform):
         memory: TensorDictBase | None,
         rows: Tensor,
         action: Tensor | None = None,
+        ended: Ended | None = None,
     ) -> tuple[Tensor, TensorDictBase]:
         """Return the advice of guides that depend on earlier steps, and their memory.
 
@@ -438,6 +499,7 @@ class GuideActions(ActionTransform):
             rows: numbers of the rows, [*batch, 1].
             action: the last action that the env was given, as vectors [*batch, *agents, A]; None
                 for the first step.
+            ended: rows that need no advice.
         """
         batch = data.batch_size
         state = TensorDict({}, batch, device=data.device)
@@ -454,7 +516,7 @@ class GuideActions(ActionTransform):
         for key in self.supplied:
             if key not in data:  # an entry of the env comes first
                 data.set(key, supplied[key])
-        return self._advice(data, state), state
+        return self._advice(data, state, ended), state
 
     def _fitted(self, name: str, action: Tensor, batch: torch.Size) -> Tensor:
         """Return the action of a guide within the bounds.
@@ -462,6 +524,7 @@ class GuideActions(ActionTransform):
         It is checked in the first step; that of a guide with the attribute `foreign`, the code of
         somebody else, in every step.
         """
+        self.calls += batch.numel()
         guide = self.guides.guides[name]
         try:
             foreign = getattr(guide, "foreign", False)

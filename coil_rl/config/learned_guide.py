@@ -76,6 +76,11 @@ class LearnedGuide(TensorDictModuleBase):
         self.requires_grad_(False)
         self.eval()
 
+    @property
+    def by_row(self) -> bool:
+        """Whether there is one object for each row, see `Guides`."""
+        return isinstance(self.guide, PerRow)
+
     def in_space(self, space: ActionSpace) -> None:
         """Check the action of an env.
 

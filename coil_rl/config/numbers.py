@@ -9,6 +9,7 @@ import copy
 import inspect
 import math
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -190,7 +191,8 @@ def _with_arguments(node: dict[str, Any], arguments: dict[str, Any]) -> dict[str
 
 def _parameters(target: Any) -> Mapping[str, inspect.Parameter]:
     """Return the arguments of a class or function; none of an object that is made already."""
-    if not inspect.isclass(target) and not inspect.isroutine(target):
+    called = target.func if isinstance(target, partial) else target
+    if not inspect.isclass(called) and not inspect.isroutine(called):
         return {}
     try:
         return inspect.signature(target).parameters

@@ -52,9 +52,9 @@ def train(
             conf/env, such as "cone_track"; a class or function that makes a Gymnasium env, or a
             TorchRL env without batch; or a `Run`, which is trained as it is: of the other arguments
             it takes `frames` alone.
-        guide: a class, an object with `act(observation)`, a function, a network; the import path
-            "PACKAGE.MODULE:NAME" of one; the name of a file in conf/guide, such as "spline"; a
-            `Controller` of another run; or None.
+        guide: a class or a `functools.partial` of one, an object with `act(observation)`, a
+            function, a network; the import path "PACKAGE.MODULE:NAME" of one; the name of a file in
+            conf/guide, such as "spline"; a `Controller` of another run; or None.
         method: name of a file in conf/method; by default "coil_anchored" with a guide, "ppo"
             without one.
         frames: length of the run; by default that of the env's file.

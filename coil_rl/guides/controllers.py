@@ -31,6 +31,7 @@ from coil_rl.envs.gate import ForeignError, Predictor, action_array, foreign, pr
 from coil_rl.errors import did_you_mean
 from coil_rl.files import LARGEST_TABLE, read_text
 from coil_rl.guides.functions import FunctionGuide
+from coil_rl.guides.networks import NetworkGuide, acts, maker_of_rows
 from coil_rl.transforms.action_space import ActionSpace, nested_key, written_key
 
 # Other minus signs, as text programs write them: hyphens, the sign itself, and dashes.
@@ -40,7 +41,8 @@ MINUS = str.maketrans(dict.fromkeys("\u2010\u2011\u2212\u2013\u2014\ufe63\uff0d"
 class PerRow(TensorDictModuleBase):
     """Python controllers as a guide, one object for each row of the env.
 
-    An object is made when its row first acts. `act(observation)` gets one NumPy array for each of
+    An object is made when its row first acts, and is not asked after the end of an episode, see
+    `Guides`. `act(observation)` gets one NumPy array for each of
     `in_keys` and returns an action: numbers, an index or a one-hot vector. `reset()`, if there is
     one, is called at the start of each episode; without it each episode gets a new object. Objects
     with `state_dict()` and `load_state_dict(state)` are part of a checkpoint; without these, new
@@ -66,7 +68,7 @@ class PerRow(TensorDictModuleBase):
         torch.Size([3, 1, 2])
     """
 
-    foreign = True
+    foreign = by_row = True
 
     def __init__(
         self,
@@ -192,12 +194,14 @@ class ControllerGuide(TensorDictModuleBase):
     | it is | it becomes |
     | --- | --- |
     | a TensorDictModule, or a class of such | the guide itself, with its own `in_keys` |
-    | another `nn.Module`, or a class of such | a network: entries [B, N] to actions [B, A] |
-    | one of these two as an object with weights | a copy of it, which alone a method may train |
     | a class with a method `act` | `PerRow`: one object for each row of the env |
-    | an object with a method `act` | `PerRow`: one copy for each row of the env |
+    | an object with a method `act`, or a network with one | `PerRow`: one copy for each row |
     | a trained model with `predict`, as of Stable-Baselines3 | `PerRow`: one state for each row |
+    | another `nn.Module`, or a class of such | `NetworkGuide`: entries [B, N] to actions [B, A] |
     | a function | `FunctionGuide`: of one observation, or of a batch of them |
+
+    A `functools.partial` of a class is used as the class. Of a module with weights a copy is used,
+    which alone a method may train.
 
     Args:
         of: the controller, or its name, such as `my_package.control:MyPID`.
@@ -217,16 +221,32 @@ class ControllerGuide(TensorDictModuleBase):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         thing = load(of) if isinstance(of, str) else of
-        title = getattr(of, "__name__", type(of).__name__)
+        if isinstance(thing, partial):  # Hydra has its own kind, which it checks at every call
+            thing = partial(thing.func, *thing.args, **thing.keywords)
+        title = getattr(_called(of), "__name__", type(of).__name__)
         if isinstance(of, (str, int, float)):
             title = str(of)
         keys = None if in_keys is None else [nested_key(key) for key in in_keys]
-        make = _of_class if inspect.isclass(thing) else _of_object
+        make = _of_class if inspect.isclass(_called(thing)) else _of_object
         guide = make(thing, title, keys, dict(options or {}))
         self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
         super().__init__()
-        self.guide, self.pure = guide, getattr(thing, "pure", False)
+        self.guide, self.pure = guide, getattr(_called(thing), "pure", False)
         self.title = title
+
+    @property
+    def by_row(self) -> bool:
+        """Whether there is one object for each row, see `Guides`."""
+        return isinstance(self.guide, PerRow)
+
+    def in_space(self, space: ActionSpace) -> None:
+        """Tell the controller which actions the env has, if it asks for that.
+
+        Args:
+            space: of the actions.
+        """
+        if hasattr(self.guide, "in_space"):
+            self.guide.in_space(space)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action; what the controller raises is a `ForeignError`."""
@@ -242,43 +262,48 @@ class ControllerGuide(TensorDictModuleBase):
         return ForeignError(f"the controller {self.title}: its action {problem}")
 
 
+def _called(thing: Any) -> Any:
+    """Return the class or function that a `functools.partial` calls; anything else itself."""
+    return thing.func if isinstance(thing, partial) else thing
+
+
 def _of_class(
-    kind: type, title: str, keys: list[NestedKey] | None, options: dict[str, Any]
+    make: Callable[..., Any], title: str, keys: list[NestedKey] | None, options: dict[str, Any]
 ) -> TensorDictModuleBase:
-    """Return the guide of a class, made with `options`."""
-    if issubclass(kind, nn.Module):
-        _check_call(kind, title, [], options)
-        return _of_module(kind(**options), title, keys)
-    if predicts(kind):
-        _check_call(kind, title, [], options)
-        return _of_model(partial(kind, **options), title, keys)
-    act = getattr(kind, "act", None)
-    if not callable(act):
+    """Return the guide of a class, or of a partial of one, made with `options`."""
+    kind, read = _called(make), keys or ["observation"]
+    is_module = issubclass(kind, nn.Module)
+    if not (is_module or acts(kind) or predicts(kind)):
         raise ValueError(
             f"of={title} is a class without act(observation); give it this method, or name a "
             "function"
         )
-    read = keys or ["observation"]
-    _check_call(kind, title, [], options)
-    _check_call(act, f"{title}.act", ["self", *read], {})
-    return PerRow(partial(kind, **options), read, title=title)
+    _check_call(make, title, [], options)
+    made = partial(make, **options)
+    if predicts(kind) and not issubclass(kind, TensorDictModuleBase):
+        return _of_model(made, title, keys)
+    if is_module:
+        return _of_module(made(), title, keys)
+    bound = isinstance(inspect.getattr_static(kind, "act"), (staticmethod, classmethod))
+    _check_call(kind.act, f"{title}.act", read if bound else ["self", *read], {})
+    return PerRow(made, read, title=title)
 
 
 def _of_object(
     thing: Any, title: str, keys: list[NestedKey] | None, options: dict[str, Any]
 ) -> TensorDictModuleBase:
     """Return the guide of a function, or of an object that is made already."""
-    is_module, acts = isinstance(thing, nn.Module), callable(getattr(thing, "act", None))
-    if (is_module or acts or predicts(thing)) and options:
+    is_module = isinstance(thing, nn.Module)
+    if (is_module or acts(thing) or predicts(thing)) and options:
         raise ValueError(f"of={title} is an object, which takes no options; leave options out")
     if predicts(thing) and not isinstance(thing, TensorDictModuleBase):
         return _of_model(lambda: thing, title, keys)
     if is_module:
         return _of_module(_copy_of(thing, title), title, keys)
     read = keys or ["observation"]
-    if acts:
+    if acts(thing):
         _check_call(thing.act, f"{title}.act", read, {})
-        return PerRow(partial(copy.deepcopy, thing), read, title=title)
+        return PerRow(maker_of_rows(thing), read, title=title)
     if not callable(thing):
         raise ValueError(
             f"of={title} is {type(thing).__name__}; name a class, a function, an object with "
@@ -385,12 +410,16 @@ def _copy_of(module: nn.Module, title: str) -> nn.Module:
 
 
 def _of_module(module: nn.Module, title: str, keys: list[NestedKey] | None) -> TensorDictModuleBase:
-    """Return the guide of a network."""
-    if not isinstance(module, TensorDictModuleBase):
-        return TensorDictModule(module, in_keys=keys or ["observation"], out_keys=["action"])
-    if keys is not None:
-        raise ValueError(f"of={title} has its own in_keys={module.in_keys}; leave in_keys out")
-    return module
+    """Return the guide of a module: its `act`, if its class has one, is what acts."""
+    if isinstance(module, TensorDictModuleBase):
+        if keys is not None:
+            raise ValueError(f"of={title} has its own in_keys={module.in_keys}; leave in_keys out")
+        return module
+    read = keys or ["observation"]
+    if not acts(module):
+        return NetworkGuide(module, read, title)
+    _check_call(module.act, f"{title}.act", read, {})  # type: ignore[arg-type]
+    return PerRow(maker_of_rows(module), read, title=title)
 
 
 class EntryGuide(TensorDictModule):

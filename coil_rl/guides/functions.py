@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coil_rl.envs.gate import ForeignError, action_array, foreign, shown
+from coil_rl.guides.shared import SharedCheck
 from coil_rl.transforms.action_space import ActionSpace, nested_key
 
 # Factor and offset of a row, and of two others that a function for a batch must not mix with it:
@@ -28,8 +29,8 @@ class FunctionGuide(TensorDictModuleBase):
     A function for a batch gets tensors [B, N] and returns actions [B, A]. One for a single
     observation gets NumPy arrays [N] and returns an action [A], a number or an index. Which of the
     two it is, is found out at its first call: it is for a batch if it gives the same for a row
-    beside quite other ones as for the row alone, or if it cannot take a row alone. Then it is also
-    asked the same twice, because a function that remembers something would mix the rows.
+    beside quite other ones as for the row alone, in the form of actions, or if it cannot take a row
+    alone. A function that remembers something would mix the rows: `SharedCheck` finds it.
 
     Args:
         function: takes one value for each of `in_keys`; it must give the same action for the same
@@ -39,8 +40,7 @@ class FunctionGuide(TensorDictModuleBase):
 
     Raises:
         ForeignError: at a call, for what the function raises, for a batch if it can take neither,
-            for what it returns that is no action, and at the first call for another action for the
-            same observation.
+            for what it returns that is no action, and for another action for the same observation.
     """
 
     foreign = True
@@ -57,24 +57,23 @@ class FunctionGuide(TensorDictModuleBase):
         self.function = function
         self.title = title or getattr(function, "__name__", type(function).__name__)
         self.for_batch: bool | None = None  # unknown before the first call
+        self.space: ActionSpace | None = None  # unknown outside of an env
+        self.shared = SharedCheck(self.title)
+
+    def in_space(self, space: ActionSpace) -> None:
+        """Take the space of the actions of an env, which decides what has the form of actions."""
+        self.space = space
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         if self.for_batch is None:
-            first = self._rows(tensordict)
-            self.for_batch = self._takes_batch(first)
-            self._check_repeats(first)
+            self.for_batch = self._takes_batch(self._rows(tensordict))
         if self.for_batch:  # traced for an export, so that nothing here may depend on the rows
-            action = self._of_batch([tensordict[key] for key in self.in_keys])
-            return tensordict.set("action", action)
-        entries = self._rows(tensordict)
-        rows = [self._alone(entries, row) for row in range(len(entries[0]))]
-        if len({row.shape for row in rows}) > 1:
-            shapes = ", ".join(sorted({str(list(row.shape)) for row in rows}))
-            raise ForeignError(
-                f"the controller {self.title} returned actions of the shapes {shapes} in one step"
+            entries = [tensordict[key] for key in self.in_keys]
+            return tensordict.set(
+                "action", self.shared(self._of_batch, entries, tensordict.batch_dims)
             )
-        action = torch.as_tensor(np.stack(rows), device=tensordict.device)
+        action = self.shared(self._of_rows, self._rows(tensordict), 1).to(tensordict.device)
         return tensordict.set("action", action.reshape(*tensordict.batch_size, *action.shape[1:]))
 
     def unfit(
@@ -102,6 +101,16 @@ class FunctionGuide(TensorDictModuleBase):
             return torch.as_tensor(action_array(action), device=entries[0].device)
         except ForeignError as error:
             raise ForeignError(f"the controller {self.title}: {error}") from error
+
+    def _of_rows(self, entries: Sequence[Tensor]) -> Tensor:
+        """Return the actions for one row after the other."""
+        rows = [self._alone(entries, row) for row in range(len(entries[0]))]
+        if len({row.shape for row in rows}) > 1:
+            shapes = ", ".join(sorted({str(list(row.shape)) for row in rows}))
+            raise ForeignError(
+                f"the controller {self.title} returned actions of the shapes {shapes} in one step"
+            )
+        return torch.as_tensor(np.stack(rows))
 
     def _alone(self, entries: Sequence[Tensor], row: int) -> NDArray[Any]:
         """Return the action for one row, as an array of at least one dimension."""
@@ -137,27 +146,22 @@ class FunctionGuide(TensorDictModuleBase):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of NumPy, which gets tensors here
             together = torch.as_tensor(self.function(*(entry[order] for entry in rows)))
-        if together.numel() != alone.numel():
+        if together.numel() != alone.numel() or not self._has_form(together, alone):
             return False
         difference = (together.cpu().reshape(alone.shape) - alone[order]).abs()
         # NumPy and torch may add up in another order.
         return bool((difference <= ROUNDING * alone[order].abs().amax(-1, keepdim=True)).all())
 
-    def _check_repeats(self, entries: Sequence[Tensor]) -> None:
-        """Refuse a function that gives another action when it is asked the same again."""
-        first, again = (self._first_action(entries) for _ in range(2))
-        if first.shape != again.shape or not torch.allclose(first, again, equal_nan=True):
-            raise ForeignError(
-                f"the controller {self.title} returned {shown(first)} and then {shown(again)} for "
-                "the same observation: all rows share a function, so it must not remember or draw "
-                "anything; write a class with act(observation) and reset()"
-            )
+    def _has_form(self, together: Tensor, alone: Tensor) -> bool:
+        """Return whether an answer for a batch has the form of actions.
 
-    def _first_action(self, entries: Sequence[Tensor]) -> Tensor:
-        """Return the numbers of the action for the first row."""
-        if self.for_batch:
-            return torch.atleast_1d(self._of_batch(entries).detach())[:1].double().flatten()
-        return torch.as_tensor(self._alone(entries, 0)).double()
+        Args:
+            together: the answer.
+            alone: the action of each row alone, [n, A].
+        """
+        if together.shape == alone.shape:
+            return True
+        return self.space is not None and self.space.takes(together, alone.shape[:1])
 
 
 def _beside_others(entry: Tensor) -> Tensor:

@@ -1,8 +1,12 @@
 """The numbers of guides that `tune` names: which there are, and what is refused."""
 
+from functools import partial
+
 import pytest
 from hydra import compose, initialize_config_module
 
+from coil_rl.config.given import keep
+from coil_rl.config.nodes import build
 from coil_rl.config.numbers import (
     GuideWithNumbers,
     _number,
@@ -39,6 +43,14 @@ def composed(*overrides):
 def test_numbers_of_a_controller_are_the_arguments_of_its_class():
     found = numbers_of(CONTROLLER, "guide.controller")
     assert found == {"kp": (2, False), "ki": (0, False), "kd": (0.1, False), "horizon": (5, True)}
+
+
+def test_numbers_of_a_partial_of_a_class_are_those_that_it_gives():
+    node = CONTROLLER | {"of": keep("test#guide", partial(PID, kp=3.0, kd=0.5)), "options": {}}
+    found = numbers_of(node, "guide.controller")
+    assert found == {"kp": (3, False), "ki": (0, False), "kd": (0.5, False), "horizon": (5, True)}
+    tuned = build(with_numbers(node, "guide.controller", {"kp": 7.0}), "guide.controller")
+    assert tuned.guide.make().kp == 7.0
 
 
 def test_numbers_of_a_function_are_its_arguments_and_the_items_of_lists():

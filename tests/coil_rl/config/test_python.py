@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -96,7 +97,14 @@ def proportional_for_all(observation):
 
 
 @pytest.mark.parametrize(
-    "guide", [Held(0.7), lambda observation: [0.4], proportional, proportional_for_all]
+    "guide",
+    [
+        Held(0.7),
+        partial(Held, power=0.7),
+        lambda observation: [0.4],
+        proportional,
+        proportional_for_all,
+    ],
 )
 def test_object_or_function_is_a_guide_and_acts_row_by_row(guide, tmp_path):
     run = coil_rl.prepare(ENV, guide=guide, method="guide", folder=tmp_path / "run")
@@ -106,7 +114,8 @@ def test_object_or_function_is_a_guide_and_acts_row_by_row(guide, tmp_path):
     if guide is proportional_for_all:
         expected = [float(guide(torch.tensor(row[None]))) for row in observations]
     else:
-        act = getattr(guide, "act", guide)
+        made = guide() if isinstance(guide, partial) else guide
+        act = getattr(made, "act", made)
         expected = [float(np.ravel(act(row))[0]) for row in observations]
     assert sent == pytest.approx(expected)
 

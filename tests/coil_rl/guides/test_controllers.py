@@ -142,6 +142,51 @@ def test_python_objects_are_one_a_row_and_reset_with_their_episodes():
     torch.testing.assert_close(advice.squeeze(-1), 0.001 * steps_of_episode(rollout))
 
 
+class Static:
+    @staticmethod
+    def act(observation):
+        return -0.5
+
+
+class OfClass:
+    gain = 0.25
+
+    @classmethod
+    def act(cls, observation):
+        return cls.gain
+
+
+class Plain:
+    def __init__(self, gain, sign=1):
+        self.gain, self.sign = gain, sign
+
+    def act(self, observation):
+        return self.sign * self.gain
+
+
+@pytest.mark.parametrize(
+    ("of", "options", "action"),
+    [
+        (Static, {}, -0.5),
+        (Static(), {}, -0.5),
+        (OfClass, {}, 0.25),
+        (OfClass(), {}, 0.25),
+        (partial(Plain, 0.125), {}, 0.125),
+        (partial(Plain, gain=0.125), {"sign": -1}, -0.125),
+        (partial(partial(Plain, sign=-1), 0.125), {}, -0.125),
+        (partial(lambda observation, gain: gain, gain=0.125), {}, 0.125),
+    ],
+)
+def test_class_and_object_act_however_their_act_is_defined(of, options, action):
+    guide = ControllerGuide(of, options=options)
+    assert cones(guide).reset()["guide_action"].unique().tolist() == [action]
+
+
+def test_partial_of_a_class_with_a_wrong_argument_is_refused():
+    with pytest.raises(ValueError, match=r"^Plain takes \(gain, .*\(gian=\): .* mean gain"):
+        ControllerGuide(partial(Plain), options={"gian": 1})
+
+
 def test_object_without_reset_is_made_anew_for_each_episode():
     class Forgetful:
         count = 0

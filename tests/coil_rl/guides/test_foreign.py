@@ -158,6 +158,26 @@ def test_function_of_one_observation_does_not_mix_the_rows(action):
     torch.testing.assert_close(found, torch.tensor([float(action(each)) for each in observations]))
 
 
+@pytest.mark.parametrize(
+    ("id", "action", "for_batch"),
+    [
+        ("Pendulum-v1", lambda x: -x[..., 0], False),
+        ("Pendulum-v1", lambda x: 1 * (x[..., 0] > 0), False),
+        ("Pendulum-v1", lambda x: -x[..., :1], True),
+        ("CartPole-v1", lambda x: 1 * (x[..., 2] > 0), True),
+        ("CartPole-v1", lambda x: 1.0 * (x[..., 2] > 0), True),
+    ],
+)
+def test_function_is_for_a_batch_only_if_its_answer_has_the_form_of_actions(id, action, for_batch):
+    guide = ControllerGuide(action)
+    rollout = driven(guide, id)
+    assert guide.guide.for_batch is for_batch
+    found = rollout["guide_action"][:, :, 0]
+    found = found[..., 1] if id == "CartPole-v1" else found[..., 0]
+    expected = action(rollout["observation"]).reshape(found.shape)
+    torch.testing.assert_close(found, expected.to(found.dtype))
+
+
 def test_function_that_remembers_is_refused():
     calls = itertools.count()
     for action in (lambda x: float(next(calls)), lambda x: x[:, :1] * 0 + next(calls)):

@@ -1,0 +1,97 @@
+"""Networks as guides: what acts is their `act`, if their class has one, else `forward`."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from coil_rl.guides import ControllerGuide
+from coil_rl.transforms import GuideActions
+
+
+class Actor(nn.Module):
+    """As published ones: `forward` gives raw numbers, and `act` the action."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer, self.drop = nn.Linear(1, 1), nn.Dropout(0.9)
+        nn.init.constant_(self.layer.weight, 1.0)
+        nn.init.constant_(self.layer.bias, 0.0)
+        self.count = 0
+
+    def forward(self, observation):
+        return 100.0 * self.drop(self.layer(observation))
+
+    def act(self, observation):
+        assert observation.shape == (1,)
+        self.count += 1
+        return torch.tanh(self.forward(torch.as_tensor(observation)) / 100.0) + self.count
+
+
+def asked(guide, values, *, first):
+    rows = len(values)
+    entries = {
+        "observation": torch.tensor(values)[:, None],
+        "row": torch.arange(rows)[:, None],
+        "is_init": torch.full((rows, 1), first),
+    }
+    return guide(TensorDict(entries, [rows]))["action"]
+
+
+@pytest.mark.parametrize("given", [Actor, Actor()], ids=["class", "object"])
+def test_network_with_act_is_asked_by_it_row_by_row(given):
+    guide = ControllerGuide(given)
+    for episode in range(2):
+        for step in range(3):
+            values = [0.3 + step, -0.5 * episode]
+            expected = torch.tanh(torch.tensor(values))[:, None] + step + 1
+            found = asked(guide, values, first=step == 0)
+            torch.testing.assert_close(found, expected)  # each episode has a copy of its own
+    if not isinstance(given, type):
+        assert given.count == 0
+        assert given.training
+
+
+def test_rows_share_the_weights_of_a_network():
+    guide = ControllerGuide(Actor)
+    asked(guide, [0.0, 0.0], first=True)
+    one, other = guide.guide.objects.values()
+    assert one is not other
+    assert one.layer.weight is other.layer.weight
+
+
+def test_activation_that_is_called_act_is_no_controller():
+    class Net(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.act, self.layer = nn.ReLU(), nn.Linear(1, 1)
+
+        def forward(self, observation):
+            return -self.act(observation)
+
+    class Shared(nn.Module):
+        act = nn.ReLU()
+
+        def forward(self, observation):
+            return -self.act(observation)
+
+    for given in (Net, Net(), Shared, Shared()):
+        found = ControllerGuide(given)(TensorDict({"observation": torch.tensor([[2.0]])}, [1]))
+        assert found["action"].item() == -2.0
+
+
+def test_act_that_needs_more_is_refused_at_construction():
+    class Needs(nn.Module):
+        def act(self, observation, state):
+            return observation
+
+    for given in (Needs, Needs()):
+        with pytest.raises(
+            ValueError, match=r"Needs.act takes \(observation, state\), but is call"
+        ):
+            ControllerGuide(given)
+
+
+def test_guides_are_in_evaluation_mode_from_the_start():
+    network = nn.Sequential(nn.BatchNorm1d(1), nn.Dropout())
+    assert not GuideActions({"theirs": ControllerGuide(network)}).guides.training
