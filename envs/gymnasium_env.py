@@ -73,7 +73,7 @@ class GymnasiumEnv(SeededRows):
         first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
             draw the seeds.
         cases: number of different episodes, by default `num_envs`; needs `first_seed`.
-        info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], 0 where
+        info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], NaN where
             missing.
         controllers: by name, a controller or its import path "PACKAGE.MODULE:THING". A class gets
             one object an env, `THING(env)`, with a method `act(observation)` and, if it wants,
@@ -92,6 +92,9 @@ class GymnasiumEnv(SeededRows):
             the same.
         device: of all tensors.
         dtype: of all floating-point tensors.
+
+    Attributes:
+        optional: entries in which NaN is a number without a value, not a fault: those of `info`.
 
     Raises:
         ValueError: if the env cannot be made, has a space that is not supported or an entry with a
@@ -152,7 +155,7 @@ class GymnasiumEnv(SeededRows):
         self.make_row, self.asked = make_row, workers
         self.kind = f"{settings} {wrappers} {makers}"
         self.workers: Workers | None = None
-        self.info = tuple(info)
+        self.info, self.optional = tuple(info), [("info", name) for name in info]
         # With processes, row 0 of this one only says what the spaces are.
         self.held = Rows(make_row, range(1 if workers else num_envs), self.info)
         self.parts: list[Entries] = []  # of all rows, as the processes returned them

@@ -220,7 +220,7 @@ def test_spaces_become_entries():
     assert after["both", "1"].tolist() == [[0.25]] * 3
     assert "mission" not in after
     assert after["info", "success"].tolist() == [[1.0]] * 3
-    assert env.reset()["info", "success"].tolist() == [[0.0]] * 3
+    assert env.reset()["info", "success"].isnan().all(), "a reset has no info here"
     assert build("Echo-v0").reset()["real"].dtype == torch.float32
 
 
@@ -390,8 +390,38 @@ def test_name_that_is_never_in_info_is_said(name, said):
         warnings.simplefilter("always")
         env.rollout(10)
     texts = [str(each.message) for each in found]
-    expected = "had no sucess in the info of an episode, which counts as 0; at its end it has suc"
-    assert any(expected in text for text in texts) == said
+    expected = (
+        "had no sucess in the info of an episode, so it is NaN there, a number without a value"
+    )
+    found = [text for text in texts if expected in text]
+    assert bool(found) == said
+    assert all(text.endswith("; at its end info has success") for text in found)
+
+
+class Rare(Place):
+    """Place that has its step number in info in every second step only."""
+
+    def __init__(self):
+        super().__init__(0.0, step=1.0)
+
+    def step(self, action):
+        observation, reward, *ends, _ = super().step(action)
+        return observation, reward, *ends, {} if self.place % 2 else {"time": self.place}
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_number_that_is_missing_in_a_step_has_no_value_there(workers):
+    env = GymnasiumEnv(Rare, 2, info=["time"], workers=workers)
+    times = env.rollout(5)["next", "info", "time"].squeeze(-1)
+    env.close()
+    nan = float("nan")
+    assert np.array_equal(times, 2 * [[nan, 2, nan, 4, nan]], equal_nan=True)
+
+
+def test_env_whose_info_lacks_numbers_fits_the_contract():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of no limit of steps
+        check_env(GymnasiumEnv(Rare, 2, info=["time"]))
 
 
 def test_mask_of_actions_is_said_not_to_be_used():
