@@ -94,6 +94,7 @@ class GymnasiumEnv(SeededRows):
         dtype: of all floating-point tensors.
 
     Attributes:
+        observation_bounds: declared bounds of the entries that have any, which they may leave.
         optional: entries in which NaN is a number without a value, not a fault: those of `info`.
 
     Raises:
@@ -175,6 +176,7 @@ class GymnasiumEnv(SeededRows):
     def _declare_specs(self, id: str, controllers: Iterable[str], dtype: torch.dtype) -> None:
         action, number = action_spec(id, self.space, dtype), Unbounded(1, dtype=dtype)
         observation = Composite()
+        self.observation_bounds: dict[Any, tuple[torch.Tensor, torch.Tensor]] = {}
         for entry in self.entries:
             name = entry.key[0]
             if name in RESERVED:
@@ -182,6 +184,10 @@ class GymnasiumEnv(SeededRows):
                     f"the observation of {id} has an entry {name!r}: rename it with a wrapper"
                 )
             observation[entry.key] = entry.spec
+            if (bounds := entry.bounds) is not None:
+                key = entry.key if len(entry.key) > 1 else name
+                low, high = (bound.to(self.device) for bound in bounds)
+                self.observation_bounds[key] = low, high
         for name in self.info:
             observation["info", name] = number.clone()
         for name in controllers:

@@ -249,7 +249,8 @@ class Rows(RowsInTurn):
             known = sorted({str(name) for row in self.rows for name in row.info})
             warnings.warn(
                 f"the env {self.rows[0].name} had no {missing} in the info of an episode, so it is "
-                f"NaN there, a number without a value; at its end info has {', '.join(known) or 'nothing'}",
+                "NaN there, a number without a value; at its end info has "
+                f"{', '.join(known) or 'nothing'}",
                 stacklevel=2,
             )
             self.unseen.clear()

@@ -103,7 +103,7 @@ class Entry:
         elif isinstance(space, spaces.Box):
             self.spec = Unbounded(space.shape or (1,), dtype=dtype)
         elif isinstance(space, spaces.MultiBinary):
-            self.spec = Bounded(0, 1, space.shape, dtype=dtype)
+            self.spec = Binary(shape=torch.Size(space.shape), dtype=dtype)
         else:
             raise ValueError(
                 f"the observation of {id} has a {type(space).__name__} space: replace it with a "
@@ -147,6 +147,20 @@ class Entry:
             wrong = float(value.reshape(-1)[~np.isfinite(converted.reshape(-1))][0])
             raise ForeignError(f"{self.title} holds {wrong}, not a finite number of {self.dtype}")
         return converted
+
+    @property
+    def bounds(self) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Declared bounds, of the shape and dtype of `spec`; None for pixels and choices.
+
+        They are not those of `spec`, as some published envs leave them.
+        """
+        if not isinstance(self.space, spaces.Box) or not self.spec.dtype.is_floating_point:
+            return None
+        low, high = (
+            torch.from_numpy(bound.astype(self.dtype).reshape(self.given))
+            for bound in (self.space.low, self.space.high)
+        )
+        return low, high
 
     def outside(self, values: NDArray[Any]) -> tuple[int, float, float, float] | None:
         """Return where numbers are farthest outside the bounds of the space; None if nowhere.
