@@ -310,7 +310,7 @@ class PolicyStep(nn.Module):
         for part in reversed(self.parts):
             part.act(data, after)
         action = data[self.action_key]
-        after["last_action"] = self.space.vectors(action)
+        after["last_action"] = self.space.clamp(self.space.vectors(action))
         return (self.executed(action), *(after[entry.key] for entry in self.state))
 
     def executed(self, action: Tensor) -> Tensor:

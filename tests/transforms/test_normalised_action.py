@@ -239,6 +239,23 @@ def test_guide_reads_its_last_action_in_the_unit_of_the_env():
     assert [round(float(each)) for each in seen[1:]] == [140, 140, 140]
 
 
+@pytest.mark.parametrize("normalised", [True, False], ids=["normalised", "own unit"])
+@pytest.mark.parametrize(("low", "high"), [(-1, 1), (0, 100), (-1, INF), (5, INF)])
+def test_action_beyond_the_bounds_counts_as_the_bound_in_any_unit(low, high, normalised):
+    seen = []
+
+    def act(last):
+        seen.append(float(last))
+        return torch.full_like(last, low)
+
+    guide = TensorDictModule(act, in_keys=["last_action"], out_keys=["action"])
+    env = advised(box([low], [high]), guide, RewardCoupling(1.0), normalised=normalised)
+    below = -3.0 if normalised else low - 3.0
+    after = env.step(env.reset().set("action", torch.tensor([[below]])))["next"]
+    assert seen[-1] == low
+    assert float(after["guide_distance"]) == 0
+
+
 def test_normalised_action_outside_an_env_says_so():
     with pytest.raises(RuntimeError, match="NormalisedAction needs an env"):
         NormalisedAction().units  # noqa: B018
