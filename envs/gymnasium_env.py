@@ -91,7 +91,8 @@ class GymnasiumEnv(SeededRows):
             "auto" for as many as there are cores if a timed step is long enough. The digits are
             the same.
         device: of all tensors.
-        dtype: of all floating-point tensors.
+        dtype: of all floating-point tensors; an action of float64 with a range of less than 100
+            steps of it stays float64.
 
     Attributes:
         observation_bounds: declared bounds of the entries that have any, which they may leave.
@@ -193,9 +194,7 @@ class GymnasiumEnv(SeededRows):
         for name in controllers:
             # Advice is written as given, and may be out of bounds.
             advice = action.clone()
-            if isinstance(action, Bounded):
-                advice = Unbounded(action.shape, dtype=dtype)
-            elif self.first_choices is not None:
+            if isinstance(action, Bounded) or self.first_choices is not None:
                 advice = Unbounded(action.shape, dtype=action.dtype)
             observation["controller", name] = advice
         flag = Binary(1, dtype=torch.bool)

@@ -281,13 +281,29 @@ def _whole_numbers(id: str, space: spaces.Box) -> TensorSpec:
     return MultiCategorical([int(size) for size in sizes], dtype=torch.int64)
 
 
+def _fine_enough(space: spaces.Box, dtype: torch.dtype) -> torch.dtype:
+    """Return the dtype of an action: float64 where its range has too few steps of the given one.
+
+    Args:
+        space: of the action; one that is as coarse itself needs no finer dtype.
+        dtype: of other actions.
+    """
+    if space.dtype.kind != "f" or space.dtype.itemsize <= dtype.itemsize:
+        return dtype
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    with np.errstate(all="ignore"):  # an infinite range is never coarse
+        largest = np.maximum(abs(low), abs(high))
+        count = (high - low) / np.spacing(largest.astype(torch.empty(0, dtype=dtype).numpy().dtype))
+    return torch.float64 if (count < COARSE).any() else dtype
+
+
 def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> TensorSpec:
     """Return the spec of an action of one env; a matrix of real numbers is a vector.
 
     Args:
         id: of the env, for the `ValueError` about a space that is not supported.
         space: of the action.
-        dtype: of actions that are real numbers.
+        dtype: of actions that are real numbers, unless it is too coarse for their range.
     """
     if has_whole_numbers(space):
         return _whole_numbers(id, space)
@@ -295,6 +311,7 @@ def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> Tensor
         shape = (math.prod(space.shape),)
         if not (np.isfinite(space.low).any() or np.isfinite(space.high).any()):
             return Unbounded(shape, dtype=dtype)
+        dtype = _fine_enough(space, dtype)
         low, high = (
             torch.as_tensor(bound, dtype=dtype).reshape(shape) for bound in (space.low, space.high)
         )

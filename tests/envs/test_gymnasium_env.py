@@ -292,6 +292,34 @@ def test_numbers_too_fine_for_the_dtype_are_said(offset, step, coarse):
     assert not coarse or "number 0 of the observation goes from 5412345.67" in found[0]
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "own", "expected"),
+    [
+        (1e7, 1e7 + 10, np.float64, torch.float64),
+        (-1e9 - 1, -1e9, np.float64, torch.float64),
+        (1e7, 1e7 + 10, np.float32, torch.float32),
+        (0, 1e7, np.float64, torch.float32),
+        (1e7, np.inf, np.float64, torch.float32),
+    ],
+)
+def test_actions_too_fine_for_the_dtype_keep_their_own(low, high, own, expected):
+    class Acts(Place):
+        action_space = spaces.Box(low, high, (2,), own)
+
+        def step(self, action):
+            self.got = action
+            return super().step(action)
+
+    env = GymnasiumEnv(partial(Acts, 0.0), controllers={"same": lambda env, seen: [low, low]})
+    assert env.action_spec.dtype == expected
+    state = env.reset()
+    assert state["controller", "same"].dtype == expected
+    wish = torch.tensor([[low + 0.125, low + 0.875]], dtype=torch.float64)
+    env.step(state.set("action", wish.to(expected)))
+    if expected == torch.float64:
+        assert torch.equal(torch.as_tensor(env.rows[0].gate.env.unwrapped.got), wish[0])
+
+
 @pytest.mark.parametrize("dtype", [np.int32, np.uint32, np.int64, float])
 def test_whole_numbers_too_large_for_the_dtype_are_said(dtype):
     make = partial(Place, 1_700_000_000, 1, dtype)

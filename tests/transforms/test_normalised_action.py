@@ -256,6 +256,16 @@ def test_action_beyond_the_bounds_counts_as_the_bound_in_any_unit(low, high, nor
     assert float(after["guide_distance"]) == 0
 
 
+def test_guide_acts_exactly_where_float32_is_too_coarse():
+    space = box([1e7], [1e7 + 10], np.float64)
+    got = followed(advised(space, ControllerGuide(lambda seen: [1e7 + 6.375])))
+    assert np.ravel(got).tolist() == [1e7 + 6.375] * 3
+    env = advised(space, ControllerGuide(lambda seen: [1e7 + 6.375]), ResidualAction(0.5))
+    env.step(env.reset().set("action", torch.full((1, 1), 0.25)))
+    (got,) = env.base_env.rows[0].gate.env.got[-1] - 1e7
+    assert got == pytest.approx(6.375 + 0.5 * 0.25 * 5, abs=1e-6)
+
+
 def test_normalised_action_outside_an_env_says_so():
     with pytest.raises(RuntimeError, match="NormalisedAction needs an env"):
         NormalisedAction().units  # noqa: B018
