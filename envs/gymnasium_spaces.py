@@ -290,10 +290,14 @@ def _fine_enough(space: spaces.Box, dtype: torch.dtype) -> torch.dtype:
     """
     if space.dtype.kind != "f" or space.dtype.itemsize <= dtype.itemsize:
         return dtype
-    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-    with np.errstate(all="ignore"):  # an infinite range is never coarse
-        largest = np.maximum(abs(low), abs(high))
-        count = (high - low) / np.spacing(largest.astype(torch.empty(0, dtype=dtype).numpy().dtype))
+    # From a single bound on, actions count in units of 1.
+    low, high = (
+        np.where(np.isfinite(bound), bound, other + side)
+        for bound, other, side in ((space.low, space.high, -1), (space.high, space.low, 1))
+    )
+    floats = torch.empty(0, dtype=dtype).numpy().dtype
+    with np.errstate(all="ignore"):  # of coordinates without bounds, and of very large ones
+        count = (high - low) / np.spacing(np.maximum(abs(low), abs(high)).astype(floats))
     return torch.float64 if (count < COARSE).any() else dtype
 
 

@@ -299,7 +299,10 @@ def test_numbers_too_fine_for_the_dtype_are_said(offset, step, coarse):
         (-1e9 - 1, -1e9, np.float64, torch.float64),
         (1e7, 1e7 + 10, np.float32, torch.float32),
         (0, 1e7, np.float64, torch.float32),
-        (1e7, np.inf, np.float64, torch.float32),
+        (1e7, np.inf, np.float64, torch.float64),
+        (-np.inf, 1e7, np.float64, torch.float64),
+        (-1, np.inf, np.float64, torch.float32),
+        (-1e38, 1e38, np.float64, torch.float32),
     ],
 )
 def test_actions_too_fine_for_the_dtype_keep_their_own(low, high, own, expected):
@@ -310,11 +313,12 @@ def test_actions_too_fine_for_the_dtype_keep_their_own(low, high, own, expected)
             self.got = action
             return super().step(action)
 
-    env = GymnasiumEnv(partial(Acts, 0.0), controllers={"same": lambda env, seen: [low, low]})
+    edge = low if np.isfinite(low) else high - 1
+    env = GymnasiumEnv(partial(Acts, 0.0), controllers={"same": lambda env, seen: [edge, edge]})
     assert env.action_spec.dtype == expected
     state = env.reset()
     assert state["controller", "same"].dtype == expected
-    wish = torch.tensor([[low + 0.125, low + 0.875]], dtype=torch.float64)
+    wish = torch.tensor([[edge + 0.125, edge + 0.875]], dtype=torch.float64)
     env.step(state.set("action", wish.to(expected)))
     if expected == torch.float64:
         assert torch.equal(torch.as_tensor(env.rows[0].gate.env.unwrapped.got), wish[0])
