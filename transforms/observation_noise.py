@@ -70,10 +70,10 @@ class ObservationNoise(Disturbance):
         """Return what an env declares of the entries that no transform in front has changed."""
         found = getattr(env, "observation_bounds", {})
         found = found[0] if isinstance(found, list) else found  # of several envs in one
-        parts = [part for part in env.modules() if isinstance(part, Transform)]
-        changed = [
-            key for part in parts if not isinstance(part, Disturbance) for key in part.out_keys
-        ]
+        changed: list[NestedKey] = []
+        for part in env.modules():
+            if isinstance(part, Transform) and not isinstance(part, Disturbance):
+                changed += part.out_keys
         return {key: found[key] for key in self.in_keys if key in found and key not in changed}
 
     def _noisy(self, tensordict: TensorDictBase, after_reset: bool = False) -> TensorDictBase:
