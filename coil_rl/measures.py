@@ -29,7 +29,8 @@ class Measure:
         reduction: of the numbers of the steps: their `mean`, `sum`, `min`, `max`, the `last` one;
             whether `any` is not 0, their `count`, or the mean of those that are not 0
             (`mean_nonzero`). Without a number, a mean is NaN. A NaN in a step makes means and sums
-            NaN; for the others it is no number.
+            NaN, but in `info` it is a number without a value, and its step does not count; for the
+            others it is no number.
         where: key of a flag; only the steps with it count.
         at_least: makes the measure a flag: whether the number is at least this. An episode without
             a number is within no bound; a mean or sum of steps with a NaN is undecided, NaN.
@@ -89,6 +90,11 @@ def _key(key: Any) -> str | tuple[str, ...]:
     if not isinstance(key, Sequence) or not key or not all(isinstance(part, str) for part in key):
         raise ValueError(f"{key} is no entry; name one, as in reward or [info, lap]")
     return tuple(key)
+
+
+def in_info(key: str | tuple[str, ...]) -> bool:
+    """Return whether an entry is one of `info`, in which NaN is a number without a value."""
+    return not isinstance(key, str) and key[0] == "info"
 
 
 def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:

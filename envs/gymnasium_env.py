@@ -73,7 +73,7 @@ class GymnasiumEnv(SeededRows):
         first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
             draw the seeds.
         cases: number of different episodes, by default `num_envs`; needs `first_seed`.
-        info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], 0 where
+        info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], NaN where
             missing.
         controllers: by name, a controller or its import path "PACKAGE.MODULE:THING". A class gets
             one object an env, `THING(env)`, with a method `act(observation)` and, if it wants,
@@ -91,7 +91,12 @@ class GymnasiumEnv(SeededRows):
             "auto" for as many as there are cores if a timed step is long enough. The digits are
             the same.
         device: of all tensors.
-        dtype: of all floating-point tensors.
+        dtype: of all floating-point tensors; an action of float64 with a range of less than 100
+            steps of it stays float64.
+
+    Attributes:
+        observation_bounds: declared bounds of the entries that have any, which they may leave.
+        optional: entries in which NaN is a number without a value, not a fault: those of `info`.
 
     Raises:
         ValueError: if the env cannot be made, has a space that is not supported or an entry with a
@@ -152,7 +157,7 @@ class GymnasiumEnv(SeededRows):
         self.make_row, self.asked = make_row, workers
         self.kind = f"{settings} {wrappers} {makers}"
         self.workers: Workers | None = None
-        self.info = tuple(info)
+        self.info, self.optional = tuple(info), [("info", name) for name in info]
         # With processes, row 0 of this one only says what the spaces are.
         self.held = Rows(make_row, range(1 if workers else num_envs), self.info)
         self.parts: list[Entries] = []  # of all rows, as the processes returned them
@@ -172,6 +177,7 @@ class GymnasiumEnv(SeededRows):
     def _declare_specs(self, id: str, controllers: Iterable[str], dtype: torch.dtype) -> None:
         action, number = action_spec(id, self.space, dtype), Unbounded(1, dtype=dtype)
         observation = Composite()
+        self.observation_bounds: dict[Any, tuple[torch.Tensor, torch.Tensor]] = {}
         for entry in self.entries:
             name = entry.key[0]
             if name in RESERVED:
@@ -179,14 +185,16 @@ class GymnasiumEnv(SeededRows):
                     f"the observation of {id} has an entry {name!r}: rename it with a wrapper"
                 )
             observation[entry.key] = entry.spec
+            if (bounds := entry.bounds) is not None:
+                key = entry.key if len(entry.key) > 1 else name
+                low, high = (bound.to(self.device) for bound in bounds)
+                self.observation_bounds[key] = low, high
         for name in self.info:
             observation["info", name] = number.clone()
         for name in controllers:
             # Advice is written as given, and may be out of bounds.
             advice = action.clone()
-            if isinstance(action, Bounded):
-                advice = Unbounded(action.shape, dtype=dtype)
-            elif self.first_choices is not None:
+            if isinstance(action, Bounded) or self.first_choices is not None:
                 advice = Unbounded(action.shape, dtype=action.dtype)
             observation["controller", name] = advice
         flag = Binary(1, dtype=torch.bool)

@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import math
 import pkgutil
 import warnings
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
@@ -135,8 +136,8 @@ class Row:
             )
 
     def number_of(self, name: str) -> float:
-        """Return a number of info, 0 where it is missing."""
-        value = self.info.get(name, 0)
+        """Return a number of info, NaN where it is missing."""
+        value = self.info.get(name, math.nan)
         if np.ndim(value) == 1 and np.size(value) == 1:
             value = np.ravel(value)[0]
         with self.gate.placed():
@@ -241,14 +242,15 @@ class Rows(RowsInTurn):
         return found
 
     def _look_for_info(self) -> None:
-        """Warn of a name that no info has had when the first episode is over, and counts as 0."""
+        """Warn of a name that no info has had when the first episode is over."""
         self.unseen.difference_update(*(row.info for row in self.rows))
         if self.unseen and any(row.terminated or row.truncated for row in self.rows):
             missing = ", ".join(sorted(self.unseen))
             known = sorted({str(name) for row in self.rows for name in row.info})
             warnings.warn(
-                f"the env {self.rows[0].name} had no {missing} in the info of an episode, which "
-                f"counts as 0; at its end it has {', '.join(known) or 'nothing'}",
+                f"the env {self.rows[0].name} had no {missing} in the info of an episode, so it is "
+                "NaN there, a number without a value; at its end info has "
+                f"{', '.join(known) or 'nothing'}",
                 stacklevel=2,
             )
             self.unseen.clear()

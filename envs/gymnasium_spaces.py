@@ -103,7 +103,7 @@ class Entry:
         elif isinstance(space, spaces.Box):
             self.spec = Unbounded(space.shape or (1,), dtype=dtype)
         elif isinstance(space, spaces.MultiBinary):
-            self.spec = Bounded(0, 1, space.shape, dtype=dtype)
+            self.spec = Binary(shape=torch.Size(space.shape), dtype=dtype)
         else:
             raise ValueError(
                 f"the observation of {id} has a {type(space).__name__} space: replace it with a "
@@ -147,6 +147,20 @@ class Entry:
             wrong = float(value.reshape(-1)[~np.isfinite(converted.reshape(-1))][0])
             raise ForeignError(f"{self.title} holds {wrong}, not a finite number of {self.dtype}")
         return converted
+
+    @property
+    def bounds(self) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Declared bounds, of the shape and dtype of `spec`; None for pixels and choices.
+
+        They are not those of `spec`, as some published envs leave them.
+        """
+        if not isinstance(self.space, spaces.Box) or not self.spec.dtype.is_floating_point:
+            return None
+        low, high = (
+            torch.from_numpy(bound.astype(self.dtype).reshape(self.given))
+            for bound in (self.space.low, self.space.high)
+        )
+        return low, high
 
     def outside(self, values: NDArray[Any]) -> tuple[int, float, float, float] | None:
         """Return where numbers are farthest outside the bounds of the space; None if nowhere.
@@ -267,13 +281,33 @@ def _whole_numbers(id: str, space: spaces.Box) -> TensorSpec:
     return MultiCategorical([int(size) for size in sizes], dtype=torch.int64)
 
 
+def _fine_enough(space: spaces.Box, dtype: torch.dtype) -> torch.dtype:
+    """Return the dtype of an action: float64 where its range has too few steps of the given one.
+
+    Args:
+        space: of the action; one that is as coarse itself needs no finer dtype.
+        dtype: of other actions.
+    """
+    if space.dtype.kind != "f" or space.dtype.itemsize <= dtype.itemsize:
+        return dtype
+    # From a single bound on, actions count in units of 1.
+    low, high = (
+        np.where(np.isfinite(bound), bound, other + side)
+        for bound, other, side in ((space.low, space.high, -1), (space.high, space.low, 1))
+    )
+    floats = torch.empty(0, dtype=dtype).numpy().dtype
+    with np.errstate(all="ignore"):  # of coordinates without bounds, and of very large ones
+        count = (high - low) / np.spacing(np.maximum(abs(low), abs(high)).astype(floats))
+    return torch.float64 if (count < COARSE).any() else dtype
+
+
 def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> TensorSpec:
     """Return the spec of an action of one env; a matrix of real numbers is a vector.
 
     Args:
         id: of the env, for the `ValueError` about a space that is not supported.
         space: of the action.
-        dtype: of actions that are real numbers.
+        dtype: of actions that are real numbers, unless it is too coarse for their range.
     """
     if has_whole_numbers(space):
         return _whole_numbers(id, space)
@@ -281,6 +315,7 @@ def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> Tensor
         shape = (math.prod(space.shape),)
         if not (np.isfinite(space.low).any() or np.isfinite(space.high).any()):
             return Unbounded(shape, dtype=dtype)
+        dtype = _fine_enough(space, dtype)
         low, high = (
             torch.as_tensor(bound, dtype=dtype).reshape(shape) for bound in (space.low, space.high)
         )

@@ -354,9 +354,14 @@ class ActionTransform(Transform):
         return given_units(self.parent)
 
     def given_vectors(self, action: Tensor) -> Tensor:
-        """Return an action, as the env was given it, as vectors of `action_space` [..., A]."""
+        """Return an action, as the env was given it, as vectors of `action_space` [..., A].
+
+        They are within its bounds, to which an env clamps what it is given.
+        """
         vectors = self.action_space.vectors(action)
-        return vectors if self.given_units is None else self.given_units.normalise(vectors)
+        if self.given_units is not None:
+            vectors = self.given_units.normalise(vectors)
+        return self.action_space.clamp(vectors)
 
 
 class ChosenActionTransform(ActionTransform):

@@ -406,7 +406,7 @@ class GuideActions(ActionTransform):
         if not self.needs_past:
             return self._call(next_tensordict)
         # The data of the step hold the action as the env got it, after the transforms.
-        action = self.given_space.vectors(tensordict[self.action_key])
+        action = self.given_space.clamp(self.given_space.vectors(tensordict[self.action_key]))
         data = next_tensordict.select(*self.in_keys, strict=False)
         memory = tensordict.select(*(("guide_state", name) for name in self.guides.memories))
         ended = self._ended(tensordict, next_tensordict)

@@ -53,19 +53,27 @@ class LastAction(ChosenActionTransform):
         self.steps, self.action_key, self.out_key = steps, nested_key(action_key), out_key
 
     @cached_property
-    def _none(self) -> Tensor:
-        """The entry at the start of an episode."""
+    def observation_at_start(self) -> Tensor:
+        """The entry at the start of an episode, [*batch, ...]."""
         return self._spec().zero()
+
+    def shifted(self, actions: Tensor, newest: Tensor) -> Tensor:
+        """Return the entry after a further action.
+
+        Args:
+            actions: the entry before, [..., steps * A].
+            newest: the action as a vector, [..., A].
+        """
+        return torch.cat([newest, actions[..., : -newest.shape[-1]]], -1)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         newest = self.chosen_vectors(tensordict)
-        before = tensordict[self.out_key][..., : -newest.shape[-1]]
-        return next_tensordict.set(self.out_key, torch.cat([newest, before], -1))
+        return next_tensordict.set(self.out_key, self.shifted(tensordict[self.out_key], newest))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        return tensordict_reset.set(self.out_key, self._none)
+        return tensordict_reset.set(self.out_key, self.observation_at_start)
 
     def _spec(self) -> TensorSpec:
         space, env = self.action_space, self.parent

@@ -64,9 +64,8 @@ class ActionUnits:
 
     def denormalise(self, numbers: Tensor) -> Tensor:
         """Return numbers [..., *A] in the unit of the env, within its bounds."""
-        if self.identity:
-            return numbers
-        return (self.centre + self.unit * numbers).clamp(*self.bounds)
+        given = numbers if self.identity else self.centre + self.unit * numbers
+        return given.clamp(*self.bounds)
 
     @property
     def assumed(self) -> list[str]:

@@ -9,7 +9,8 @@ from functools import cached_property
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite
+from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, TensorSpec
+from torchrl.envs import EnvBase, Transform
 
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.disturbance import Disturbance
@@ -18,6 +19,9 @@ from coil_rl.transforms.guide_transform import SeededGenerator
 
 class ObservationNoise(Disturbance):
     """Observations with Gaussian noise, independent at every step, within the bounds of the entry.
+
+    Noise takes no number out of its bounds; one that lies outside without it is noisy inwards only.
+    Bounds are those of the spec, or what the env declares in `observation_bounds`.
 
     In front of `GuideActions` the guides see the noise too, where they read these entries; behind
     it only the agent does.
@@ -59,7 +63,18 @@ class ObservationNoise(Disturbance):
             return {}
         specs, first = env.full_observation_spec, (0,) * len(env.batch_size)
         spaces = {key: specs[key].space for key in self.in_keys if isinstance(specs[key], Bounded)}
-        return {key: (space.low[first], space.high[first]) for key, space in spaces.items()}
+        bounds = {key: (space.low[first], space.high[first]) for key, space in spaces.items()}
+        return self._declared(env) | bounds
+
+    def _declared(self, env: EnvBase) -> dict[NestedKey, tuple[Tensor, Tensor]]:
+        """Return what an env declares of the entries that no transform in front has changed."""
+        found = getattr(env, "observation_bounds", {})
+        found = found[0] if isinstance(found, list) else found  # of several envs in one
+        changed: list[NestedKey] = []
+        for part in env.modules():
+            if isinstance(part, Transform) and not isinstance(part, Disturbance):
+                changed += part.out_keys
+        return {key: found[key] for key in self.in_keys if key in found and key not in changed}
 
     def _noisy(self, tensordict: TensorDictBase, after_reset: bool = False) -> TensorDictBase:
         shapes = [tensordict[key].shape for key in self.in_keys]
@@ -70,7 +85,8 @@ class ObservationNoise(Disturbance):
             values = tensordict[key]
             noisy = torch.add(values, draw.to(values), alpha=self.sigma)
             if key in self.bounds:
-                noisy = noisy.clamp(*self.bounds[key])
+                low, high = self.bounds[key]
+                noisy = noisy.clamp(values.minimum(low), values.maximum(high))
             tensordict.set(key, noisy)
         return tensordict
 
@@ -90,7 +106,7 @@ class ObservationNoise(Disturbance):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Check the entries; raises a `ValueError` for one that cannot be noisy."""
         specs = {key: observation_spec[key] for key in observation_spec.keys(True, True)}
-        real = [key for key, spec in specs.items() if (spec.dtype or torch.int).is_floating_point]
+        real = [key for key, spec in specs.items() if _is_real(spec)]
         for key in self.in_keys:
             if key not in real:
                 raise ValueError(
@@ -98,3 +114,9 @@ class ObservationNoise(Disturbance):
                     f"numbers: {', '.join(map(repr, real))}"
                 )
         return observation_spec
+
+
+def _is_real(spec: TensorSpec) -> bool:
+    """Return whether an entry is of real numbers: neither of whole ones nor of choices."""
+    choices = isinstance(spec, (Categorical, MultiCategorical, OneHot))
+    return not choices and (spec.dtype or torch.int).is_floating_point

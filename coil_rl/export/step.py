@@ -36,6 +36,7 @@ from coil_rl.transforms.combined_actions import AdaptiveMixedAction, CombinedAct
 from coil_rl.transforms.degraded_advice import DegradedAdvice
 from coil_rl.transforms.disturbance import Disturbance
 from coil_rl.transforms.guide_transform import GuideTransform, SeededGenerator
+from coil_rl.transforms.last_action import LastAction
 
 ADVICE = "guide_action"  # input for the actions of guides that are outside
 # Transforms that neither change what the policy sees nor what it does. A controller takes off what
@@ -192,6 +193,25 @@ class _Dropout(_Part):
         self.transform._write(data, given)
 
 
+class _LastAction(_Part):
+    """The actions that the agent chose in the steps before."""
+
+    def __init__(self, transform: LastAction) -> None:
+        self.transform, self.key = transform, transform.out_key
+        first = transform.observation_at_start[0]
+        # Not the entry itself: a guide may read the executed action by the same key.
+        own = ("past", *([self.key] if isinstance(self.key, str) else self.key))
+        self.past = Entry(own, tuple(first.shape), first.dtype, first)
+        self.state = [self.past]
+
+    def observe(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
+        data.set(self.key, data[self.past.key])
+
+    def act(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
+        newest = self.transform.action_space.vectors(data[self.transform.action_key])
+        after[self.past.key] = self.transform.shifted(data[self.past.key], newest)
+
+
 class _Other(_Part):
     """Any other transform, which must not remember anything."""
 
@@ -204,6 +224,8 @@ class _Other(_Part):
                     f"{name} degrades the advice at random or by that of earlier steps, which is "
                     "for experiments only; train without degrade"
                 )
+        elif getattr(transform, "needs_past", False):
+            raise NotExportableError(f"{name} remembers earlier steps in a way of its own")
         self.transform = transform
         self.reads = list(transform.in_keys or ())
 
@@ -288,7 +310,7 @@ class PolicyStep(nn.Module):
         for part in reversed(self.parts):
             part.act(data, after)
         action = data[self.action_key]
-        after["last_action"] = self.space.vectors(action)
+        after["last_action"] = self.space.clamp(self.space.vectors(action))
         return (self.executed(action), *(after[entry.key] for entry in self.state))
 
     def executed(self, action: Tensor) -> Tensor:
@@ -327,6 +349,12 @@ def _transforms(transform: Transform) -> Iterable[Transform]:
         yield transform
 
 
+def check_transforms(controller: Controller) -> None:
+    """Raise a `NotExportableError` for a transform of a controller that no function can be."""
+    for each in _transforms(controller.env.transform):
+        _part(each, inside=False)
+
+
 def _part(transform: Transform, inside: bool) -> _Part:
     if isinstance(transform, GuideActions):
         return _Advice(transform, inside)
@@ -334,6 +362,8 @@ def _part(transform: Transform, inside: bool) -> _Part:
         return _Combined(transform)
     if isinstance(transform, AdviceDropout):
         return _Dropout(transform)
+    if isinstance(transform, LastAction):
+        return _LastAction(transform)
     return _Other(transform)
 
 

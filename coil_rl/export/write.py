@@ -19,7 +19,7 @@ from coil_rl.export.parity import LIMIT, WITH_GUIDE, Parity, compare, expected
 from coil_rl.export.policy import ExportedPolicy
 from coil_rl.export.recording import Recording, record
 from coil_rl.export.session import require
-from coil_rl.export.step import NotExportableError, PolicyStep
+from coil_rl.export.step import NotExportableError, PolicyStep, check_transforms
 from coil_rl.files import temporary
 from coil_rl.guides.controllers import EntryGuide, PerRow
 from coil_rl.guides.functions import FunctionGuide
@@ -61,6 +61,10 @@ def export_policy(
     require("onnx", "onnxscript", "onnxruntime")
     check_range(1, 1_000_000, observations=observations)
     controller = run.controller(which)
+    try:
+        check_transforms(controller)
+    except NotExportableError as error:
+        raise UserError(_impossible(run, str(error))) from error
     recording = _recorded(run, controller, observations, seed)
     outside = _cause(controller)
     step, contents, parity = None, dict[str, bytes](), None

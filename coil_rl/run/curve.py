@@ -141,8 +141,9 @@ class EvaluationCurve:
                 count = env.batch_size.numel() // len(updates)
                 results = measures(env, policies, cases=count, watch=self.watch, tick=bar.update)
                 for name, values in results.items():
-                    means = values.view(len(updates), -1).double().mean(1).tolist()
-                    for row, mean in zip(rows, means, strict=True):
+                    numbers = values.view(len(updates), -1).double()
+                    means = numbers.mean(1) if name == "return" else numbers.nanmean(1)
+                    for row, mean in zip(rows, means.tolist(), strict=True):
                         row[f"{cases}/{name}"] = mean
         return rows
 

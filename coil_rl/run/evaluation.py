@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.envs.seeded_env import SeededEnv
-from coil_rl.measures import Measure
+from coil_rl.measures import Measure, in_info
 from coil_rl.run.lean_steps import LeanEnv
 from coil_rl.transforms.guide_transform import SeededGenerator
 
@@ -146,8 +146,8 @@ class Totals:
             elif reduction == "mean_nonzero":
                 mask = mask & (values != 0)
             extreme = reduction in ("min", "max", "last")
-            if extreme:
-                mask = mask & ~values.isnan()
+            left_out = torch.tensor([[extreme or in_info(m.entry)] for m in group])
+            mask = mask & ~(values.isnan() & left_out.to(values.device))
             empty = torch.full_like(values, torch.nan if extreme else 0.0), torch.zeros_like(values)
             value, count = self.state.get(reduction, empty)
             if reduction == "last":

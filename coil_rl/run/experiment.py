@@ -46,7 +46,7 @@ class Experiment:
         folder: of the run; it exists.
         logger: any TorchRL logger, in addition to the CSV file.
         watch: further entries to log, as means over finished episodes ("episode") or over all steps
-            ("step").
+            ("step"), without those that are NaN.
         checkpoint_every: updates between two checkpoints.
         callbacks: called before the first update and between updates. One with `names` measures:
             its numbers are columns of the log. One without acts after the row was logged.
@@ -313,9 +313,9 @@ class Experiment:
         }
         for name, key in self.watch.get("episode", {}).items():
             ended = after[tuple(key)][done].float()
-            row[f"train/{name}"] = float(ended.mean()) if done.any() else math.nan
+            row[f"train/{name}"] = float(ended.nanmean())
         for name, key in self.watch.get("step", {}).items():
-            row[f"train/{name}"] = float(after[tuple(key)].float().mean())
+            row[f"train/{name}"] = float(after[tuple(key)].float().nanmean())
         return row
 
     def save(self) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.errors import UserError
 from coil_rl.run.exploration import noise_of
 from coil_rl.run.lean_steps import LeanSteps
@@ -48,6 +49,8 @@ class Rollout:
         self.env, self.policy, self.steps = env.train(), policy, steps
         self.base_env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
         self.keys = None if keys is None else list(dict.fromkeys(keys))
+        optional = self.base_env.optional if isinstance(self.base_env, GymnasiumEnv) else []
+        self.unchecked = [*optional, *(("next", *key) for key in optional)]
         self.lean: LeanSteps | None = None
         if self.keys is not None and LeanSteps.covers(env, policy, self.keys):
             self.lean = LeanSteps(env, policy, self.keys)
@@ -76,16 +79,18 @@ class Rollout:
                 carrier = self._drive(columns) if self.lean is None else self._drive_lean(columns)
         except Exception:
             # NaN of an earlier step may be the cause.
-            check_batch(self._stacked(columns), self.taken)
-            check_batch(
-                self.acting.unsqueeze(-1), self.taken + max(map(len, columns.values()), default=0)
-            )
+            self._check(self._stacked(columns), 0)
+            self._check(self.acting.unsqueeze(-1), max(map(len, columns.values()), default=0))
             raise
         batch = self._stacked(columns)
-        check_batch(batch, self.taken)
+        self._check(batch, 0)
         self.carrier = carrier
         self.taken += self.steps
         return batch
+
+    def _check(self, batch: TensorDictBase, steps: int) -> None:
+        """Check a batch [*B, T] that comes `steps` after the last one, see `check_batch`."""
+        check_batch(batch.exclude(*self.unchecked), self.taken + steps)
 
     def _drive(self, columns: dict[NestedKey, list[Tensor]]) -> TensorDictBase:
         """Take the steps of a batch by TorchRL's step, and return the data of the next one.

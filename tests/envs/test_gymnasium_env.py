@@ -220,7 +220,7 @@ def test_spaces_become_entries():
     assert after["both", "1"].tolist() == [[0.25]] * 3
     assert "mission" not in after
     assert after["info", "success"].tolist() == [[1.0]] * 3
-    assert env.reset()["info", "success"].tolist() == [[0.0]] * 3
+    assert env.reset()["info", "success"].isnan().all(), "a reset has no info here"
     assert build("Echo-v0").reset()["real"].dtype == torch.float32
 
 
@@ -290,6 +290,38 @@ def test_numbers_too_fine_for_the_dtype_are_said(offset, step, coarse):
     found = said_of_coarse_numbers(GymnasiumEnv(partial(Place, offset, step), max_steps=1000))
     assert bool(found) == coarse
     assert not coarse or "number 0 of the observation goes from 5412345.67" in found[0]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "own", "expected"),
+    [
+        (1e7, 1e7 + 10, np.float64, torch.float64),
+        (-1e9 - 1, -1e9, np.float64, torch.float64),
+        (1e7, 1e7 + 10, np.float32, torch.float32),
+        (0, 1e7, np.float64, torch.float32),
+        (1e7, np.inf, np.float64, torch.float64),
+        (-np.inf, 1e7, np.float64, torch.float64),
+        (-1, np.inf, np.float64, torch.float32),
+        (-1e38, 1e38, np.float64, torch.float32),
+    ],
+)
+def test_actions_too_fine_for_the_dtype_keep_their_own(low, high, own, expected):
+    class Acts(Place):
+        action_space = spaces.Box(low, high, (2,), own)
+
+        def step(self, action):
+            self.got = action
+            return super().step(action)
+
+    edge = low if np.isfinite(low) else high - 1
+    env = GymnasiumEnv(partial(Acts, 0.0), controllers={"same": lambda env, seen: [edge, edge]})
+    assert env.action_spec.dtype == expected
+    state = env.reset()
+    assert state["controller", "same"].dtype == expected
+    wish = torch.tensor([[edge + 0.125, edge + 0.875]], dtype=torch.float64)
+    env.step(state.set("action", wish.to(expected)))
+    if expected == torch.float64:
+        assert torch.equal(torch.as_tensor(env.rows[0].gate.env.unwrapped.got), wish[0])
 
 
 @pytest.mark.parametrize("dtype", [np.int32, np.uint32, np.int64, float])
@@ -390,8 +422,38 @@ def test_name_that_is_never_in_info_is_said(name, said):
         warnings.simplefilter("always")
         env.rollout(10)
     texts = [str(each.message) for each in found]
-    expected = "had no sucess in the info of an episode, which counts as 0; at its end it has suc"
-    assert any(expected in text for text in texts) == said
+    expected = (
+        "had no sucess in the info of an episode, so it is NaN there, a number without a value"
+    )
+    found = [text for text in texts if expected in text]
+    assert bool(found) == said
+    assert all(text.endswith("; at its end info has success") for text in found)
+
+
+class Rare(Place):
+    """Place that has its step number in info in every second step only."""
+
+    def __init__(self):
+        super().__init__(0.0, step=1.0)
+
+    def step(self, action):
+        observation, reward, *ends, _ = super().step(action)
+        return observation, reward, *ends, {} if self.place % 2 else {"time": self.place}
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_number_that_is_missing_in_a_step_has_no_value_there(workers):
+    env = GymnasiumEnv(Rare, 2, info=["time"], workers=workers)
+    times = env.rollout(5)["next", "info", "time"].squeeze(-1)
+    env.close()
+    nan = float("nan")
+    assert np.array_equal(times, 2 * [[nan, 2, nan, 4, nan]], equal_nan=True)
+
+
+def test_env_whose_info_lacks_numbers_fits_the_contract():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of no limit of steps
+        check_env(GymnasiumEnv(Rare, 2, info=["time"]))
 
 
 def test_mask_of_actions_is_said_not_to_be_used():

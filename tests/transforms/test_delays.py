@@ -1,12 +1,16 @@
 """Delays: each row of each episode has its own lag, and nothing else changes."""
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 import worlds
+from gymnasium import spaces
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, Unbounded
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import Compose, EnvBase, ObservationNorm, TransformedEnv
 
+from coil_rl import GymnasiumEnv
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import SplineGuide
 from coil_rl.testing import check_env, check_transform
@@ -204,6 +208,62 @@ def test_noise_has_its_standard_deviation_and_stays_within_the_bounds():
     noise = torch.stack([step["observation"] for step in noisy]) - values
     assert abs(float(noise[values.abs() < 0.5].std()) - 0.1) < 0.003
     assert float((values + noise).abs().max()) <= 1
+
+
+class Ramp(gymnasium.Env):
+    """Numbers that rise by 0.1 a step, up to beyond their bounds."""
+
+    observation_space = spaces.Dict(
+        x=spaces.Box(np.float32([0, -np.inf, 0]), np.float32([1, 1, np.inf])),
+        choice=spaces.Discrete(3),
+        pair=spaces.MultiDiscrete([2, 3]),
+        flags=spaces.MultiBinary(2),
+    )
+    action_space = spaces.Discrete(2)
+
+    def observe(self):
+        rest = {"choice": 0, "pair": np.zeros(2, int), "flags": np.zeros(2, np.int8)}
+        return {"x": np.full(3, self.place, np.float32), **rest}
+
+    def reset(self, *, seed=None, options=None):
+        self.place = 0.0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.place += 0.1
+        return self.observe(), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("lag", [0, 1])
+def test_noise_stays_within_the_bounds_of_a_gymnasium_env(lag):
+    def seen(*transforms):
+        env = GymnasiumEnv(Ramp, 64, max_steps=20)
+        env = TransformedEnv(env, Compose(ObservationDelay(lag, lag), *transforms))
+        return env.rollout(18)["x"].unbind(-1)
+
+    exact, noisy = seen(), seen(ObservationNoise(0.5, ["x"]))
+    assert float(exact[0].max()) > 1, "the env leaves its own bounds"
+    for values, found, low, high in zip(exact, noisy, (0, None, 0), (1, 1, None), strict=True):
+        assert low is None or bool((found >= values.clamp(max=low)).all())
+        assert high is None or bool((found <= values.clamp(min=high)).all())
+        assert float((found - values).std()) > 0.25
+
+
+def test_noise_takes_no_bounds_for_those_of_a_changed_entry():
+    scaled = ObservationNorm(0.0, 100.0, in_keys=["x"])
+    env = TransformedEnv(
+        GymnasiumEnv(Ramp, 64, max_steps=20), Compose(scaled, ObservationNoise(0.5, ["x"]))
+    )
+    assert float(env.reset()["x"].min()) < -1
+
+
+@pytest.mark.parametrize("key", ["choice", "pair", "flags"])
+def test_noise_on_choices_is_refused(key):
+    env = TransformedEnv(GymnasiumEnv(Ramp, max_steps=20), ObservationNoise(0.5, [key]))
+    with pytest.raises(
+        ValueError, match=f"has '{key}', but the env writes these real numbers: 'x'"
+    ):
+        env.observation_spec  # noqa: B018  made of the transforms
 
 
 @pytest.mark.parametrize(

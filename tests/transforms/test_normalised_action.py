@@ -239,6 +239,33 @@ def test_guide_reads_its_last_action_in_the_unit_of_the_env():
     assert [round(float(each)) for each in seen[1:]] == [140, 140, 140]
 
 
+@pytest.mark.parametrize("normalised", [True, False], ids=["normalised", "own unit"])
+@pytest.mark.parametrize(("low", "high"), [(-1, 1), (0, 100), (-1, INF), (5, INF)])
+def test_action_beyond_the_bounds_counts_as_the_bound_in_any_unit(low, high, normalised):
+    seen = []
+
+    def act(last):
+        seen.append(float(last))
+        return torch.full_like(last, low)
+
+    guide = TensorDictModule(act, in_keys=["last_action"], out_keys=["action"])
+    env = advised(box([low], [high]), guide, RewardCoupling(1.0), normalised=normalised)
+    below = -3.0 if normalised else low - 3.0
+    after = env.step(env.reset().set("action", torch.tensor([[below]])))["next"]
+    assert seen[-1] == low
+    assert float(after["guide_distance"]) == 0
+
+
+def test_guide_acts_exactly_where_float32_is_too_coarse():
+    space = box([1e7], [1e7 + 10], np.float64)
+    got = followed(advised(space, ControllerGuide(lambda seen: [1e7 + 6.375])))
+    assert np.ravel(got).tolist() == [1e7 + 6.375] * 3
+    env = advised(space, ControllerGuide(lambda seen: [1e7 + 6.375]), ResidualAction(0.5))
+    env.step(env.reset().set("action", torch.full((1, 1), 0.25)))
+    (got,) = env.base_env.rows[0].gate.env.got[-1] - 1e7
+    assert got == pytest.approx(6.375 + 0.5 * 0.25 * 5, abs=1e-6)
+
+
 def test_normalised_action_outside_an_env_says_so():
     with pytest.raises(RuntimeError, match="NormalisedAction needs an env"):
         NormalisedAction().units  # noqa: B018

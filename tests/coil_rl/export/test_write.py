@@ -11,6 +11,7 @@ import torch
 from learned_runs import learned
 from outside_package.install import SOURCE
 from programs import shipped
+from torchrl.envs import Transform
 
 import coil_rl
 from coil_rl.export import write
@@ -231,6 +232,41 @@ def test_forest_is_refused(method, tmp_path):
 def test_delayed_advice_is_refused(tmp_path):
     run = coil_rl.open_run(learned(tmp_path / "run", "coil", "degrade=[delayed]"))
     with pytest.raises(coil_rl.UserError, match="DelayedAdvice degrades the advice"):
+        coil_rl.export_policy(run, tmp_path / "exported", observations=5)
+
+
+@pytest.mark.parametrize(
+    ("method", "guide", "observed"),
+    [
+        ("ppo", None, "last_action"),
+        # The memory of this guide reads the executed action.
+        pytest.param("residual", "BatchedPI", "guide_action,last_action", marks=pytest.mark.slow),
+    ],
+)
+def test_last_actions_of_the_agent_go_in_and_out(method, guide, observed, tmp_path):
+    words = ["+transform=last_action", "method.transforms.last_action.steps=3"]
+    words += [f"method.observes=[{observed}]"]
+    guide = guide and f"thermostat.control:{guide}"
+    run, policy = exported(tmp_path, method, *words, guide=guide)
+    state = {entry["input"]: entry["shape"] for entry in policy.contract["state"]}
+    assert state["state.past.last_action"] == [3]
+    assert ("state.last_action" in state) == (guide is not None)
+    same_actions(run, policy, rooms())
+
+
+class OwnPast(Transform):
+    """A transform that remembers, and says so."""
+
+    needs_past = True
+
+
+def test_transform_that_remembers_is_refused_before_the_drive(tmp_path, monkeypatch):
+    run = coil_rl.open_run(learned(tmp_path / "run", "ppo"))
+    controller = run.controller()
+    controller.env.append_transform(OwnPast())
+    monkeypatch.setattr(type(run), "controller", lambda *_: controller)
+    monkeypatch.setattr(write, "record", None)
+    with pytest.raises(coil_rl.UserError, match="OwnPast remembers earlier steps"):
         coil_rl.export_policy(run, tmp_path / "exported", observations=5)
 
 

@@ -169,6 +169,19 @@ def test_nan_is_no_event_and_shows_in_means():
     assert all(math.isnan(found[name]) for name in ("mean", "sum", "mean_nonzero"))
 
 
+@pytest.mark.parametrize("reduction", REDUCTIONS)
+def test_steps_without_a_number_of_info_do_not_count(reduction):
+    measures = {"all": Measure(("info", "x"), reduction), "none": Measure(("info", "y"), reduction)}
+    totals, numbers = Totals(measures), [3.0, math.nan, 0.0, 5.0, math.nan]
+    for number in numbers:
+        info = {"x": torch.tensor([[number]]), "y": torch.tensor([[math.nan]])}
+        after = TensorDict({"info": info}, [1])
+        totals.add(after, torch.ones(1, 1, dtype=torch.bool))
+    found = {name: value.item() for name, value in totals.results().items()}
+    assert found["all"] == REDUCE[reduction](np.array([3.0, 0.0, 5.0]))
+    assert found["none"] == pytest.approx(OF_NOTHING[reduction], nan_ok=True)
+
+
 def test_last_number_is_that_of_the_last_step_that_has_one():
     totals = Totals({"last": Measure("number", "last")})
     for step in ([0.0, math.nan], [2.0, math.nan], [math.nan, math.nan]):

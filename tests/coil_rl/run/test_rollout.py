@@ -3,7 +3,9 @@ import torch
 import worlds
 from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, TransformedEnv
+from torchrl.modules import RandomPolicy
 
+from coil_rl import GymnasiumEnv
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
 from coil_rl.guides import RandomGuide, SplineGuide
@@ -136,6 +138,14 @@ def test_first_nan_is_reported_with_its_entry_step_and_row(places, message):
         batch[key][car, t, number] = torch.nan
     with pytest.raises(UserError, match=f"^{message}$"):
         check_batch(batch, steps=100)
+
+
+def test_number_of_info_without_a_value_is_no_fault():
+    env = GymnasiumEnv("CartPole-v1", 2, info=["lap"])
+    collected = Rollout(env, RandomPolicy(env.action_spec), 5)
+    with pytest.warns(UserWarning, match="had no lap in the info"):
+        batches = [collected.collect() for _ in range(20)]
+    assert all(batch["next", "info", "lap"].isnan().all() for batch in batches)
 
 
 def test_infinity_is_reported_also_without_a_batch_dimension():
