@@ -10,11 +10,9 @@ import hashlib
 import math
 import shutil
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import hydra.utils
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
@@ -22,12 +20,11 @@ from torch import nn
 from coil_rl.config import load
 from coil_rl.config.build import build_guides, build_learner, env_maker
 from coil_rl.config.fingerprint import fingerprint as fingerprint_of_object
-from coil_rl.config.fingerprint import is_of_user
 from coil_rl.config.given import kept_objects
 from coil_rl.config.nodes import find_target
 from coil_rl.config.schema import TrainConfig, fingerprint
 from coil_rl.config.start import run_configured
-from coil_rl.config.trust import import_paths
+from coil_rl.config.user_code import code_of_user
 from coil_rl.errors import UserError
 from coil_rl.files import temporary, whole_file
 from coil_rl.guides import ControllerGuide
@@ -89,38 +86,10 @@ def _hash_of_user(config: DictConfig, name: str) -> list[str]:
     things = kept_objects(config, "env")
     if find_target(guide.get("_target_"), f"guide.{name}") is ControllerGuide:
         things += kept_objects(config, "guide")
-    parts = OmegaConf.create({"guide": guide, "env": config.env})
-    named = [*map(_named, sorted(import_paths(parts))), _registered(config.env.get("id"))]
-    things += [thing for thing in named if thing is not None and is_of_user(thing)]
-    if not things:
+    found = [*map(fingerprint_of_object, things), *code_of_user(config, ("guide", "env"))]
+    if not found:
         return []
-    text = " ".join(map(fingerprint_of_object, things))
-    return [hashlib.sha256(text.encode()).hexdigest()[:10]]
-
-
-def _named(path: str) -> Any:
-    """Return what an import path names; None for nothing, which is refused where it is built.
-
-    Args:
-        path: written with points only.
-    """
-    with suppress(Exception):
-        return hydra.utils.get_object(path)
-    return None
-
-
-def _registered(id: Any) -> Any:
-    """Return what makes an env that is registered with Gymnasium; None for another one.
-
-    Args:
-        id: of the env; it may be anything.
-    """
-    if isinstance(id, str):
-        with suppress(Exception):
-            from coil_rl.envs.gymnasium_makers import registered_maker
-
-            return registered_maker(id)
-    return None
+    return [hashlib.sha256(" ".join(found).encode()).hexdigest()[:10]]
 
 
 def distil(config: DictConfig, folder: Path) -> int:

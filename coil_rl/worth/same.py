@@ -1,6 +1,7 @@
 """The plan in the folder of a comparison, and whether a repeated command is about the same one."""
 
 import copy
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +13,7 @@ from coil_rl.config.fingerprint import fingerprint
 from coil_rl.config.given import kept
 from coil_rl.config.python import Named
 from coil_rl.config.saved import identity
+from coil_rl.config.user_code import code_of_user
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
 from coil_rl.run.folder import check_same
@@ -24,7 +26,8 @@ def identity_of(given: Named, config: DictConfig, minutes: float, seed: int) -> 
     """Return everything on which the numbers of a comparison depend.
 
     These are the arguments, and the values that they are composed to: files of the user may change
-    between two commands. An object has no value, but is told apart by its class and its state.
+    between two commands. An object has no value, but is told apart by its class and its state, and
+    what a name of the user's stands for by its code.
 
     Args:
         given: env, guide and everything else that was given.
@@ -32,12 +35,14 @@ def identity_of(given: Named, config: DictConfig, minutes: float, seed: int) -> 
         minutes: that it may take.
         seed: of the first trainings.
     """
+    code = code_of_user(config, ("env", "guide"))
     arguments = {
         "words": list(given.words),
         "objects": sorted(given.nodes),
         "tune": given.nodes.get("tune"),
         "minutes": minutes,
         "seed": seed,
+        "code of env and guide": hashlib.sha256(" ".join(code).encode()).hexdigest()[:10],
     }
     described = copy.deepcopy(config)
     with open_dict(described):

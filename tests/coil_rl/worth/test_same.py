@@ -1,6 +1,9 @@
 """A folder goes on with the same comparison only."""
 
+import importlib
 import json
+import shutil
+import sys
 
 import pytest
 
@@ -52,6 +55,25 @@ def test_changed_file_of_the_user_is_refused_by_the_value_that_differs(tmp_path)
     file.write_text("# @package _global_\nlearner: {gamma: 0.8}\nenv: {workers: 2}\n")
     with pytest.raises(UserError, match=r"learner\.gamma=0\.9, not 0\.8; give the same arguments"):
         known_plan(tmp_path / "plan.json", identity(tmp_path, *words))
+
+
+def test_changed_code_of_a_controller_that_is_named_is_refused(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    text = "class Rule:\n    def act(self, observation):\n        return {} * observation[:1]\n"
+    plan = tmp_path / "plan.json"
+
+    def written(gain):
+        sys.modules.pop("rule_of_mine", None)
+        shutil.rmtree(tmp_path / "__pycache__", ignore_errors=True)
+        (tmp_path / "rule_of_mine.py").write_text(text.format(gain))
+        importlib.invalidate_caches()
+        return identity(tmp_path, guide="rule_of_mine:Rule")
+
+    keep_plan(plan, written(1.0), PLAN)
+    assert known_plan(plan, written(1.0)) == PLAN
+    with pytest.raises(UserError, match="holds a comparison with code of env and guide="):
+        known_plan(plan, written(2.0))
+    monkeypatch.delitem(sys.modules, "rule_of_mine")
 
 
 def test_plan_without_a_configuration_is_said_to_be_damaged(tmp_path):
