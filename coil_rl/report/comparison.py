@@ -388,24 +388,41 @@ def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str,
 
     In a case where it crashes or earns nothing, or next to nothing, its mean over the other cases
     is taken: a ratio to such a reward would be all of a mean. The result is empty if a run was
-    evaluated in cases in which no guide earns anything: scores of all runs are to be alike.
+    evaluated in cases in which no guide earns anything, or in which each of them loses too much for
+    a ratio: scores of all runs are to be alike.
     """
     references: dict[tuple[str, ...], Array] = {}
     for guide in sorted(guides, key=lambda group: group.rank):
         rewards = guide.by_seed("reward").mean()
-        earned = rewards[rewards > 0]
+        earned, crashed = rewards[rewards > 0], rewards.iloc[:0]
         if guide.has("crashed"):
-            earned = earned[~(guide.by_seed("crashed") > 0).any()]
+            crashed = rewards[(guide.by_seed("crashed") > 0).any()]
+            earned = earned.drop(crashed.index, errors="ignore")
         if len(earned) > 1:
             others = (earned.sum() - earned) / (len(earned) - 1)
             earned = earned[earned >= NEXT_TO_NOTHING * others]
-        if len(earned):
+        if len(earned) and not _loses(rewards, crashed, earned.mean()):
             filled = rewards.where(rewards.index.isin(earned.index), earned.mean())
             references.setdefault(guide.cases, filled.values)
     for run in runs:
         if tuple(run.evaluation["case"].unique()) not in references:
             return {}
     return references
+
+
+def _loses(rewards: pd.Series, crashed: pd.Series, earned: float) -> bool:
+    """Return whether a guide loses so much in a case that its rewards have no zero to divide by.
+
+    That is more than next to nothing of what it earns, and in a crash, which may be punished, more
+    than all of it.
+
+    Args:
+        rewards: of the guide in each case.
+        crashed: those of the cases in which it crashes.
+        earned: its mean over the cases in which it earns something.
+    """
+    driven = rewards.drop(crashed.index)
+    return bool((driven < -NEXT_TO_NOTHING * earned).any() or (crashed < -earned).any())
 
 
 def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:

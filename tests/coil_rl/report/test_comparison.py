@@ -80,6 +80,7 @@ def test_completion_ranks_before_the_mean(tmp_path):
         {"rewards": {"b": -1.0}},
         {"rewards": {"b": 9.0}, "crashed": 1.0},
         {"rewards": {"b": 1e-3}},
+        {"rewards": {"b": -100.0}, "crashed": 1.0},
     ],
 )
 def test_where_the_guide_fails_its_mean_over_the_other_cases_is_the_reference(failure, tmp_path):
@@ -97,6 +98,28 @@ def test_scores_are_rewards_if_no_guide_earns_anything(tmp_path):
     comparison = compare(read_runs([tmp_path]))
     assert not comparison.normalised
     assert comparison.agents[0].score.mean == 550
+
+
+@pytest.mark.parametrize(
+    ("returns", "crashed"),
+    [
+        ([0.01, -50.0, -60.0, -40.0, -55.0], [0, 0, 0, 0, 0]),
+        ([100.0, -2.0, 90.0], [0, 0, 0]),
+        ([10.0, -50.0, 12.0], [0, 1, 0]),
+    ],
+)
+def test_scores_are_rewards_if_the_guide_loses_in_a_case(returns, crashed, tmp_path):
+    guide = [
+        row
+        for case, reward, crash in zip("abcde", returns, crashed, strict=False)
+        for row in driven("guide", {case: reward}, crashed=float(crash))[:1]
+    ]
+    agent = driven("agent", {row["case"]: -40.0 for row in guide})
+    make_run(tmp_path / "0", "agent", 0, guide + agent)
+    comparison = compare(read_runs([tmp_path]))
+    assert not comparison.normalised
+    assert comparison.agents[0].score.mean == -40
+    assert comparison.guides[0].score.mean == pytest.approx(sum(returns) / len(returns))
 
 
 def test_every_case_counts_as_much_however_much_it_pays(tmp_path):
