@@ -43,6 +43,8 @@ class Group:
         needs_guide: whether the policy needs its guide during evaluation; None if that does not
             apply.
         measures: definitions of the measures in the table by name.
+        label: of the runs of an agent; empty for a guide.
+        of_runs: for a guide the number of its evaluation in the table, by label and seed of a run.
         reference: [cases], rewards that scores are divided by; None if scores are rewards.
     """
 
@@ -53,6 +55,8 @@ class Group:
     guide: Group | None = None
     needs_guide: bool | None = None
     measures: Mapping[str, Measure] = field(default_factory=dict, repr=False)
+    label: str = ""
+    of_runs: Mapping[tuple[str, int], int] = field(default_factory=dict, repr=False)
     reference: Array | None = None
 
     @property
@@ -89,6 +93,25 @@ class Group:
         if score and self.reference is not None:
             values = values / self.reference
         return pd.DataFrame(values, index, self.cases)
+
+    def beside(self, other: Group) -> tuple[list[int], list[int]]:
+        """Return the seeds that this policy has in common with another one.
+
+        Of a guide with several evaluations it is the one of the same run.
+
+        Args:
+            other: the other policy.
+
+        Returns:
+            The seeds here, and for each of them the seed in the table of the other policy.
+        """
+        seeds = self.table.index.unique("seed").tolist()
+        theirs = {seed: seed for seed in other.table.index.unique("seed")}
+        if other.is_guide:
+            numbers = {seed: other.of_runs.get((self.label, seed)) for seed in seeds}
+            theirs = {seed: number for seed, number in numbers.items() if number is not None}
+        common = [seed for seed in seeds if seed in theirs]
+        return common, [theirs[seed] for seed in common]
 
     @cached_property
     def score(self) -> Estimate:
@@ -296,16 +319,34 @@ class Comparison:
                 rows.append(about | {"case": case} | means | counts)
         return rows
 
+    def unpaired(self, against: str | None) -> list[str]:
+        """Return the agents without a seed in common with what they are compared with.
+
+        Args:
+            against: see `table`.
+        """
+        names = []
+        for group in self.agents:
+            other = self._other(group, against)
+            if other is None or group.advice or _is_shared(other):
+                continue
+            if not group.beside(other)[0]:
+                names.append(group.name)
+        return names
+
     def _pairs(self, group: Group, against: str | None) -> Paired | None:
         """Return the comparison of a policy with `against`; None if they cannot be compared."""
+        other = self._other(group, against)
+        return None if other is None else paired(group, other)
+
+    def _other(self, group: Group, against: str | None) -> Group | None:
+        """Return the policy that another one is compared with; None for no other one."""
         if against == GUIDE:
             other = group.guide
         else:
             agents = {agent.name: agent for agent in self.agents if not agent.advice}
             other = agents.get(against or "")
-        if other is None or other is group or group.is_guide:
-            return None
-        return paired(group, other)
+        return None if other is group or group.is_guide else other
 
 
 def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
@@ -331,7 +372,7 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     for label, frame in labels.items():
         rows = frame[~_is_guide(frame) & (frame["actions"] == actions)]
         best_guide = normalised[guides[label][0]] if label in guides else None
-        variants = _variants(rows, references, measures, best_guide, needs_guide[label])
+        variants = _variants(label, rows, references, measures, best_guide, needs_guide[label])
         agents += sorted(variants, key=lambda group: (group.advice != "", group.rank))
     # The first group of a name is the one with unaltered advice.
     best = {group.name: group.rank for group in reversed(agents)}
@@ -354,6 +395,7 @@ def _is_guide(frame: pd.DataFrame) -> pd.Series:
 
 
 def _variants(
+    label: str,
     rows: pd.DataFrame,
     references: Mapping[tuple[str, ...], Array],
     measures: Mapping[str, Measure],
@@ -363,7 +405,8 @@ def _variants(
     """Return the agent of a label, with each alteration of its advice, and with a fallback.
 
     Args:
-        rows: evaluations of the agent of a label.
+        label: of the runs.
+        rows: evaluations of the agent.
         references: the rewards that scores are divided by, by cases.
         measures: definitions by name.
         guide: its best guide.
@@ -378,6 +421,7 @@ def _variants(
             guide=guide,
             needs_guide=None if advice else needs_guide or driver.endswith(FALLBACK),
             measures=measures,
+            label=label,
         )
         variants.append(replace(variant, reference=references.get(variant.cases)))
     return variants
@@ -461,16 +505,28 @@ class _Guide:
         name: "guide", or "guide NAME".
         labels: which share the guide.
         results: the different evaluations of the guide.
+        of_runs: the evaluation of each run, by label and seed.
     """
 
     name: str
-    labels: list[str]
-    results: list[pd.DataFrame]
+    labels: list[str] = field(default_factory=list)
+    results: list[pd.DataFrame] = field(default_factory=list)
+    of_runs: dict[tuple[str, int], pd.DataFrame] = field(default_factory=dict)
 
-    def add(self, label: str, results: Iterable[pd.DataFrame]) -> None:
-        """Let another label share the guide."""
+    def add(self, label: str, of_seeds: Mapping[int, pd.DataFrame]) -> None:
+        """Let a label share the guide.
+
+        Args:
+            label: of the runs.
+            of_seeds: the evaluation in each of them by seed.
+        """
         self.labels.append(label)
-        self.results[:] = _different([*self.results, *results])
+        self.results[:] = _different([*self.results, *of_seeds.values()])
+        self.of_runs.update({(label, seed): rows for seed, rows in of_seeds.items()})
+
+    def numbers(self) -> dict[tuple[str, int], int]:
+        """Return the number of the evaluation of each run, by label and seed."""
+        return {run: _position(self.results, rows) for run, rows in self.of_runs.items()}
 
     def listed(self) -> str:
         """Return the labels as a text, the first ones of many."""
@@ -502,7 +558,9 @@ def _group_guides(
     for guide in guides:
         is_unique = names.count(guide.name) == 1
         name = guide.name if is_unique else f"{guide.name} ({guide.listed()})"
-        group = Group(name, "", guide.table(), is_guide=True, measures=measures)
+        group = Group(
+            name, "", guide.table(), is_guide=True, measures=measures, of_runs=guide.numbers()
+        )
         for label in guide.labels:
             groups.setdefault(label, []).append(group)
     return {
@@ -520,12 +578,12 @@ def _shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[_Guide]:
     guides: list[_Guide] = []
     for label, frame in labels.items():
         for name, rows in frame[_is_guide(frame)].groupby("driver", sort=False):
-            results = _different(each for _, each in rows.groupby("seed", sort=False))
-            same = _same_guide(guides, name, results)
+            of_seeds = dict(iter(rows.groupby("seed", sort=False)))
+            same = _same_guide(guides, name, list(of_seeds.values()))
             if same is None:
-                guides.append(_Guide(name, [label], results))
-            else:
-                same.add(label, results)
+                same = _Guide(name)
+                guides.append(same)
+            same.add(label, of_seeds)
     return guides
 
 
@@ -538,13 +596,23 @@ def _different(results: Iterable[pd.DataFrame]) -> list[pd.DataFrame]:
     return different
 
 
-def _contains(results: Iterable[pd.DataFrame], result: pd.DataFrame) -> bool:
+def _contains(results: Sequence[pd.DataFrame], result: pd.DataFrame) -> bool:
     """Return whether one of several evaluations has the cases and returns of another one."""
+    return _position(results, result) < len(results)
+
+
+def _position(results: Sequence[pd.DataFrame], result: pd.DataFrame) -> int:
+    """Return the first of several evaluations that is equal to another one; without, their number.
+
+    Equal are the cases and the returns.
+    """
     cases, returns = result["case"].tolist(), result["reward"].to_numpy(float)
-    return any(
-        other["case"].tolist() == cases and _same_returns(other["reward"].to_numpy(float), returns)
-        for other in results
-    )
+    for number, other in enumerate(results):
+        if other["case"].tolist() == cases and _same_returns(
+            other["reward"].to_numpy(float), returns
+        ):
+            return number
+    return len(results)
 
 
 def _same_returns(one: Array, other: Array) -> bool:
@@ -595,18 +663,19 @@ def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
 
     Args:
         group: the first policy.
-        other: the second policy; a guide with a single evaluation has one value for all seeds.
+        other: the second policy; a guide with a single evaluation has one value for all seeds, and
+            one with several that of the same run.
         measure: name of the measure to compare, "reward", or "score".
 
     Returns:
         None without common cases and seeds, if a seed has no such case, or a reward is no number.
     """
-    if group.cases != other.cases or (other.is_guide and other.seeds is not None):
+    if group.cases != other.cases:
         return None
     ours, theirs = group.by_seed(measure), other.by_seed(measure)
-    if not other.is_guide:
-        common = [number for number in ours.index if number in theirs.index]
-        ours, theirs = ours.loc[common], theirs.loc[common]
+    if not _is_shared(other):
+        seeds, of_other = group.beside(other)
+        ours, theirs = ours.loc[seeds], theirs.loc[of_other]
     x, y = ours.to_numpy(), theirs.to_numpy()
     counts = np.isfinite(x) & np.isfinite(y)
     if not x.size or not counts.any(axis=1).all():
@@ -615,3 +684,12 @@ def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
         return None
     differences = np.where(counts, x - y, 0).sum(axis=1) / counts.sum(axis=1)
     return Paired(estimate(differences), float(wins(x, y)[counts].mean()))
+
+
+def _is_shared(other: Group) -> bool:
+    """Return whether all seeds are compared with one value: that of a guide without random actions.
+
+    Args:
+        other: the policy they are compared with.
+    """
+    return other.is_guide and other.seeds is None

@@ -219,6 +219,26 @@ def test_guide_with_random_actions_has_an_interval_over_its_different_evaluation
     assert guide["low"] < guide["score"] < guide["high"]
 
 
+def test_guide_with_random_actions_is_paired_with_the_policy_of_its_run(tmp_path):
+    losses = {("coil", 3): -5.0, ("coil", 1): -7.0, ("coil", 2): -9.0, ("ppo", 1): 4.0}
+    for index, ((label, seed), gain) in enumerate(losses.items()):
+        guide = {case: -reward - 100 * seed for case, reward in CASES.items()}
+        agent = {case: reward + gain for case, reward in guide.items()}
+        rows = [*driven("guide", guide), *driven(label, agent), *driven(f"{label} or guide", agent)]
+        make_run(tmp_path / str(index), label, seed, rows)
+    make_run(tmp_path / "9", "ppo", 9, driven("ppo", CASES))
+    rows = table(tmp_path, against="guide")
+    for driver in ("coil", "coil or guide"):
+        found = rows[driver, ""]
+        assert found["difference"] == pytest.approx(-7)
+        assert found["p"] == pytest.approx(0.0523, abs=1e-4), "of a t test, for two rows"
+        assert (found["difference_seeds"], found["better"]) == (3, 0)
+    ppo = rows["ppo", ""]
+    assert ppo["difference"] == pytest.approx(4)
+    assert (ppo["seeds"], ppo["difference_seeds"]) == (2, 1), "seed 9 has no guide"
+    assert math.isnan(rows["guide", ""]["difference"])
+
+
 def test_agents_and_guides_may_be_alone(tmp_path):
     make_run(tmp_path / "agents" / "0", "alone", 0, driven("alone", CASES), needs_guide=False)
     guide = driven("guide", CASES)
