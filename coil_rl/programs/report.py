@@ -65,6 +65,7 @@ def report(config: DictConfig) -> None:
     ]
     notes = [
         page.notes(against, compared),
+        *page.unpaired(against, compared),
         *page.handed_over(finished),
         *page.begun(finished),
         *of_several_envs(finished),
