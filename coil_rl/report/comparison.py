@@ -6,7 +6,7 @@ pandas is imported where it is used, because a training does without it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
@@ -16,6 +16,7 @@ import numpy as np
 
 from coil_rl.errors import UserError
 from coil_rl.measures import Measure
+from coil_rl.report.guides import is_guide, shared_guides
 from coil_rl.report.runs import DRIVER, FALLBACK, GUIDE, Run
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
 from coil_rl.report.table import return_format
@@ -23,10 +24,8 @@ from coil_rl.report.table import return_format
 if TYPE_CHECKING:
     import pandas as pd
 
-SAME_RETURN = 1e-5  # of the range of the compared returns; the rest is rounding
 NEXT_TO_NOTHING = 0.01  # for a guide in a case, of its mean over the others
 EPISODES = "_episodes"  # suffix of the columns of `with_denominators`
-LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,7 +369,7 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     needs_guide = {run.label: run.needs_guide for run in reversed(finished)}
     agents: list[Group] = []
     for label, frame in labels.items():
-        rows = frame[~_is_guide(frame) & (frame["actions"] == actions)]
+        rows = frame[~is_guide(frame) & (frame["actions"] == actions)]
         best_guide = normalised[guides[label][0]] if label in guides else None
         variants = _variants(label, rows, references, measures, best_guide, needs_guide[label])
         agents += sorted(variants, key=lambda group: (group.advice != "", group.rank))
@@ -387,11 +386,6 @@ def _definitions(runs: Sequence[Run]) -> dict[str, Measure]:
     for run in reversed(runs):
         measures |= run.measures
     return measures
-
-
-def _is_guide(frame: pd.DataFrame) -> pd.Series:
-    """Return whether the policy of each row of an evaluation is a guide."""
-    return frame["driver"].str.split().str[0] == GUIDE
 
 
 def _variants(
@@ -497,52 +491,6 @@ def _index(name: str, rows: pd.DataFrame) -> pd.DataFrame:
     return rows.set_index(["seed", "case"]).drop(columns=list(DRIVER), errors="ignore")
 
 
-@dataclass(frozen=True, eq=False)
-class _Guide:
-    """A guide that some labels share.
-
-    Attributes:
-        name: "guide", or "guide NAME".
-        labels: which share the guide.
-        results: the different evaluations of the guide.
-        of_runs: the evaluation of each run, by label and seed.
-    """
-
-    name: str
-    labels: list[str] = field(default_factory=list)
-    results: list[pd.DataFrame] = field(default_factory=list)
-    of_runs: dict[tuple[str, int], pd.DataFrame] = field(default_factory=dict)
-
-    def add(self, label: str, of_seeds: Mapping[int, pd.DataFrame]) -> None:
-        """Let a label share the guide.
-
-        Args:
-            label: of the runs.
-            of_seeds: the evaluation in each of them by seed.
-        """
-        self.labels.append(label)
-        self.results[:] = _different([*self.results, *of_seeds.values()])
-        self.of_runs.update({(label, seed): rows for seed, rows in of_seeds.items()})
-
-    def numbers(self) -> dict[tuple[str, int], int]:
-        """Return the number of the evaluation of each run, by label and seed."""
-        return {run: _position(self.results, rows) for run, rows in self.of_runs.items()}
-
-    def listed(self) -> str:
-        """Return the labels as a text, the first ones of many."""
-        more = len(self.labels) - LABELS_IN_NAME
-        if more <= 1:
-            return ", ".join(self.labels)
-        return f"{', '.join(self.labels[:LABELS_IN_NAME])} and {more} more"
-
-    def table(self) -> pd.DataFrame:
-        """Return all different evaluations, numbered by the column of the seed."""
-        import pandas as pd
-
-        numbered = [rows.assign(seed=number) for number, rows in enumerate(self.results)]
-        return _index(f"the guide of {self.labels[0]}", pd.concat(numbered))
-
-
 def _group_guides(
     labels: Mapping[str, pd.DataFrame], measures: Mapping[str, Measure]
 ) -> dict[str, list[Group]]:
@@ -552,93 +500,19 @@ def _group_guides(
         labels: the evaluations by label.
         measures: definitions by name.
     """
-    guides = _shared_guides(labels)
+    guides = shared_guides(labels)
     names = [guide.name for guide in guides]
     groups: dict[str, list[Group]] = {}
     for guide in guides:
         is_unique = names.count(guide.name) == 1
         name = guide.name if is_unique else f"{guide.name} ({guide.listed()})"
-        group = Group(
-            name, "", guide.table(), is_guide=True, measures=measures, of_runs=guide.numbers()
-        )
+        table = _index(f"the guide of {guide.labels[0]}", guide.rows())
+        group = Group(name, "", table, is_guide=True, measures=measures, of_runs=guide.numbers())
         for label in guide.labels:
             groups.setdefault(label, []).append(group)
     return {
         label: sorted(of_label, key=lambda group: group.rank) for label, of_label in groups.items()
     }
-
-
-def _shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[_Guide]:
-    """Return the different guides of all labels.
-
-    Every run evaluates its guides: equal results of one guide count once, and labels share a guide
-    if the results of one contain those of the other. A guide with random actions has one result per
-    seed.
-    """
-    guides: list[_Guide] = []
-    for label, frame in labels.items():
-        for name, rows in frame[_is_guide(frame)].groupby("driver", sort=False):
-            of_seeds = dict(iter(rows.groupby("seed", sort=False)))
-            same = _same_guide(guides, name, list(of_seeds.values()))
-            if same is None:
-                same = _Guide(name)
-                guides.append(same)
-            same.add(label, of_seeds)
-    return guides
-
-
-def _different(results: Iterable[pd.DataFrame]) -> list[pd.DataFrame]:
-    """Return evaluations without duplicates."""
-    different: list[pd.DataFrame] = []
-    for result in results:
-        if not _contains(different, result):
-            different.append(result)
-    return different
-
-
-def _contains(results: Sequence[pd.DataFrame], result: pd.DataFrame) -> bool:
-    """Return whether one of several evaluations has the cases and returns of another one."""
-    return _position(results, result) < len(results)
-
-
-def _position(results: Sequence[pd.DataFrame], result: pd.DataFrame) -> int:
-    """Return the first of several evaluations that is equal to another one; without, their number.
-
-    Equal are the cases and the returns.
-    """
-    cases, returns = result["case"].tolist(), result["reward"].to_numpy(float)
-    for number, other in enumerate(results):
-        if other["case"].tolist() == cases and _same_returns(
-            other["reward"].to_numpy(float), returns
-        ):
-            return number
-    return len(results)
-
-
-def _same_returns(one: Array, other: Array) -> bool:
-    """Return whether two evaluations of guides in the same cases have the same returns.
-
-    The allowed difference is small beside the range of these returns, so that it fits any unit and
-    any centre, and large beside what the rounding of a batch of another size makes of one guide:
-    2e-6 of the range in the cone world. A single case has no range but its own return.
-    """
-    both = np.concatenate([one, other, [0.0]]) if len(one) == 1 else np.concatenate([one, other])
-    both = both[np.isfinite(both)]
-    tolerance = SAME_RETURN * float(np.ptp(both)) if both.size else 0.0
-    return np.allclose(one, other, rtol=1e-7, atol=tolerance, equal_nan=True)
-
-
-def _same_guide(
-    guides: Sequence[_Guide], name: str, results: Sequence[pd.DataFrame]
-) -> _Guide | None:
-    """Return the first guide with a name whose results contain the given ones, or the reverse."""
-    for guide in guides:
-        if guide.name != name:
-            continue
-        pairs = ((results, guide.results), (guide.results, results))
-        if any(all(_contains(ours, each) for each in theirs) for theirs, ours in pairs):
-            return guide
-    return None
 
 
 @dataclass(frozen=True)
