@@ -113,12 +113,7 @@ def of_changed_guides(runs: Sequence[Run]) -> list[str]:
         of_label = [run for run in runs if run.label == label]
         if guide_follows_seed(of_label):
             continue
-        of_guides: dict[str, dict[int, pd.DataFrame]] = {}
-        for run in of_label:
-            of_run = run.evaluation[is_guide(run.evaluation)]
-            for name, rows in of_run.groupby("driver", sort=False):
-                of_guides.setdefault(str(name), {})[run.seed] = rows
-        for name, of_seeds in of_guides.items():
+        for name, of_seeds in _by_seed(of_label).items():
             parts = _alike(of_seeds)
             if len(parts) > 1:
                 shown = [_some(list(map(str, seeds)), MOST_SEEDS) for seeds in parts]
@@ -130,6 +125,16 @@ def of_changed_guides(runs: Sequence[Run]) -> list[str]:
         "numbers of its own."
         for name, labels in found.items()
     ]
+
+
+def _by_seed(runs: Sequence[Run]) -> dict[str, dict[int, pd.DataFrame]]:
+    """Return the evaluations of each guide by the seed of the run."""
+    of_guides: dict[str, dict[int, pd.DataFrame]] = {}
+    for run in runs:
+        guides = run.evaluation[is_guide(run.evaluation)]
+        for name, rows in guides.groupby("driver", sort=False):
+            of_guides.setdefault(str(name), {})[run.seed] = rows
+    return of_guides
 
 
 def _alike(of_seeds: Mapping[int, pd.DataFrame]) -> list[list[int]]:
