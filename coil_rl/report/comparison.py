@@ -6,7 +6,7 @@ pandas is imported where it is used, because a training does without it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
@@ -16,6 +16,7 @@ import numpy as np
 
 from coil_rl.errors import UserError
 from coil_rl.measures import Measure
+from coil_rl.report.guides import is_guide, shared_guides
 from coil_rl.report.runs import DRIVER, FALLBACK, GUIDE, Run
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
 from coil_rl.report.table import return_format
@@ -23,10 +24,8 @@ from coil_rl.report.table import return_format
 if TYPE_CHECKING:
     import pandas as pd
 
-SAME_RETURN = 1e-5  # of the range of the compared returns; the rest is rounding
 NEXT_TO_NOTHING = 0.01  # for a guide in a case, of its mean over the others
 EPISODES = "_episodes"  # suffix of the columns of `with_denominators`
-LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +42,8 @@ class Group:
         needs_guide: whether the policy needs its guide during evaluation; None if that does not
             apply.
         measures: definitions of the measures in the table by name.
+        label: of the runs of an agent; empty for a guide.
+        of_runs: for a guide the number of its evaluation in the table, by label and seed of a run.
         reference: [cases], rewards that scores are divided by; None if scores are rewards.
     """
 
@@ -53,6 +54,8 @@ class Group:
     guide: Group | None = None
     needs_guide: bool | None = None
     measures: Mapping[str, Measure] = field(default_factory=dict, repr=False)
+    label: str = ""
+    of_runs: Mapping[tuple[str, int], int] = field(default_factory=dict, repr=False)
     reference: Array | None = None
 
     @property
@@ -89,6 +92,25 @@ class Group:
         if score and self.reference is not None:
             values = values / self.reference
         return pd.DataFrame(values, index, self.cases)
+
+    def beside(self, other: Group) -> tuple[list[int], list[int]]:
+        """Return the seeds that this policy has in common with another one.
+
+        Of a guide with several evaluations it is the one of the same run.
+
+        Args:
+            other: the other policy.
+
+        Returns:
+            The seeds here, and for each of them the seed in the table of the other policy.
+        """
+        seeds = self.table.index.unique("seed").tolist()
+        theirs = {seed: seed for seed in other.table.index.unique("seed")}
+        if other.is_guide:
+            numbers = {seed: other.of_runs.get((self.label, seed)) for seed in seeds}
+            theirs = {seed: number for seed, number in numbers.items() if number is not None}
+        common = [seed for seed in seeds if seed in theirs]
+        return common, [theirs[seed] for seed in common]
 
     @cached_property
     def score(self) -> Estimate:
@@ -296,16 +318,34 @@ class Comparison:
                 rows.append(about | {"case": case} | means | counts)
         return rows
 
+    def unpaired(self, against: str | None) -> list[str]:
+        """Return the agents without a seed in common with what they are compared with.
+
+        Args:
+            against: see `table`.
+        """
+        names = []
+        for group in self.agents:
+            other = self._other(group, against)
+            if other is None or group.advice or _is_shared(other):
+                continue
+            if not group.beside(other)[0]:
+                names.append(group.name)
+        return names
+
     def _pairs(self, group: Group, against: str | None) -> Paired | None:
         """Return the comparison of a policy with `against`; None if they cannot be compared."""
+        other = self._other(group, against)
+        return None if other is None else paired(group, other)
+
+    def _other(self, group: Group, against: str | None) -> Group | None:
+        """Return the policy that another one is compared with; None for no other one."""
         if against == GUIDE:
             other = group.guide
         else:
             agents = {agent.name: agent for agent in self.agents if not agent.advice}
             other = agents.get(against or "")
-        if other is None or other is group or group.is_guide:
-            return None
-        return paired(group, other)
+        return None if other is group or group.is_guide else other
 
 
 def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
@@ -329,9 +369,9 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     needs_guide = {run.label: run.needs_guide for run in reversed(finished)}
     agents: list[Group] = []
     for label, frame in labels.items():
-        rows = frame[~_is_guide(frame) & (frame["actions"] == actions)]
+        rows = frame[~is_guide(frame) & (frame["actions"] == actions)]
         best_guide = normalised[guides[label][0]] if label in guides else None
-        variants = _variants(rows, references, measures, best_guide, needs_guide[label])
+        variants = _variants(label, rows, references, measures, best_guide, needs_guide[label])
         agents += sorted(variants, key=lambda group: (group.advice != "", group.rank))
     # The first group of a name is the one with unaltered advice.
     best = {group.name: group.rank for group in reversed(agents)}
@@ -348,12 +388,8 @@ def _definitions(runs: Sequence[Run]) -> dict[str, Measure]:
     return measures
 
 
-def _is_guide(frame: pd.DataFrame) -> pd.Series:
-    """Return whether the policy of each row of an evaluation is a guide."""
-    return frame["driver"].str.split().str[0] == GUIDE
-
-
 def _variants(
+    label: str,
     rows: pd.DataFrame,
     references: Mapping[tuple[str, ...], Array],
     measures: Mapping[str, Measure],
@@ -363,7 +399,8 @@ def _variants(
     """Return the agent of a label, with each alteration of its advice, and with a fallback.
 
     Args:
-        rows: evaluations of the agent of a label.
+        label: of the runs.
+        rows: evaluations of the agent.
         references: the rewards that scores are divided by, by cases.
         measures: definitions by name.
         guide: its best guide.
@@ -378,6 +415,7 @@ def _variants(
             guide=guide,
             needs_guide=None if advice else needs_guide or driver.endswith(FALLBACK),
             measures=measures,
+            label=label,
         )
         variants.append(replace(variant, reference=references.get(variant.cases)))
     return variants
@@ -388,24 +426,41 @@ def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str,
 
     In a case where it crashes or earns nothing, or next to nothing, its mean over the other cases
     is taken: a ratio to such a reward would be all of a mean. The result is empty if a run was
-    evaluated in cases in which no guide earns anything: scores of all runs are to be alike.
+    evaluated in cases in which no guide earns anything, or in which each of them loses too much for
+    a ratio: scores of all runs are to be alike.
     """
     references: dict[tuple[str, ...], Array] = {}
     for guide in sorted(guides, key=lambda group: group.rank):
         rewards = guide.by_seed("reward").mean()
-        earned = rewards[rewards > 0]
+        earned, crashed = rewards[rewards > 0], rewards.iloc[:0]
         if guide.has("crashed"):
-            earned = earned[~(guide.by_seed("crashed") > 0).any()]
+            crashed = rewards[(guide.by_seed("crashed") > 0).any()]
+            earned = earned.drop(crashed.index, errors="ignore")
         if len(earned) > 1:
             others = (earned.sum() - earned) / (len(earned) - 1)
             earned = earned[earned >= NEXT_TO_NOTHING * others]
-        if len(earned):
+        if len(earned) and not _loses(rewards, crashed, earned.mean()):
             filled = rewards.where(rewards.index.isin(earned.index), earned.mean())
             references.setdefault(guide.cases, filled.values)
     for run in runs:
         if tuple(run.evaluation["case"].unique()) not in references:
             return {}
     return references
+
+
+def _loses(rewards: pd.Series, crashed: pd.Series, earned: float) -> bool:
+    """Return whether a guide loses so much in a case that its rewards have no zero to divide by.
+
+    That is more than next to nothing of what it earns, and in a crash, which may be punished, more
+    than all of it.
+
+    Args:
+        rewards: of the guide in each case.
+        crashed: those of the cases in which it crashes.
+        earned: its mean over the cases in which it earns something.
+    """
+    driven = rewards.drop(crashed.index)
+    return bool((driven < -NEXT_TO_NOTHING * earned).any() or (crashed < -earned).any())
 
 
 def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:
@@ -436,40 +491,6 @@ def _index(name: str, rows: pd.DataFrame) -> pd.DataFrame:
     return rows.set_index(["seed", "case"]).drop(columns=list(DRIVER), errors="ignore")
 
 
-@dataclass(frozen=True, eq=False)
-class _Guide:
-    """A guide that some labels share.
-
-    Attributes:
-        name: "guide", or "guide NAME".
-        labels: which share the guide.
-        results: the different evaluations of the guide.
-    """
-
-    name: str
-    labels: list[str]
-    results: list[pd.DataFrame]
-
-    def add(self, label: str, results: Iterable[pd.DataFrame]) -> None:
-        """Let another label share the guide."""
-        self.labels.append(label)
-        self.results[:] = _different([*self.results, *results])
-
-    def listed(self) -> str:
-        """Return the labels as a text, the first ones of many."""
-        more = len(self.labels) - LABELS_IN_NAME
-        if more <= 1:
-            return ", ".join(self.labels)
-        return f"{', '.join(self.labels[:LABELS_IN_NAME])} and {more} more"
-
-    def table(self) -> pd.DataFrame:
-        """Return all different evaluations, numbered by the column of the seed."""
-        import pandas as pd
-
-        numbered = [rows.assign(seed=number) for number, rows in enumerate(self.results)]
-        return _index(f"the guide of {self.labels[0]}", pd.concat(numbered))
-
-
 def _group_guides(
     labels: Mapping[str, pd.DataFrame], measures: Mapping[str, Measure]
 ) -> dict[str, list[Group]]:
@@ -479,81 +500,19 @@ def _group_guides(
         labels: the evaluations by label.
         measures: definitions by name.
     """
-    guides = _shared_guides(labels)
+    guides = shared_guides(labels)
     names = [guide.name for guide in guides]
     groups: dict[str, list[Group]] = {}
     for guide in guides:
         is_unique = names.count(guide.name) == 1
         name = guide.name if is_unique else f"{guide.name} ({guide.listed()})"
-        group = Group(name, "", guide.table(), is_guide=True, measures=measures)
+        table = _index(f"the guide of {guide.labels[0]}", guide.rows())
+        group = Group(name, "", table, is_guide=True, measures=measures, of_runs=guide.numbers())
         for label in guide.labels:
             groups.setdefault(label, []).append(group)
     return {
         label: sorted(of_label, key=lambda group: group.rank) for label, of_label in groups.items()
     }
-
-
-def _shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[_Guide]:
-    """Return the different guides of all labels.
-
-    Every run evaluates its guides: equal results of one guide count once, and labels share a guide
-    if the results of one contain those of the other. A guide with random actions has one result per
-    seed.
-    """
-    guides: list[_Guide] = []
-    for label, frame in labels.items():
-        for name, rows in frame[_is_guide(frame)].groupby("driver", sort=False):
-            results = _different(each for _, each in rows.groupby("seed", sort=False))
-            same = _same_guide(guides, name, results)
-            if same is None:
-                guides.append(_Guide(name, [label], results))
-            else:
-                same.add(label, results)
-    return guides
-
-
-def _different(results: Iterable[pd.DataFrame]) -> list[pd.DataFrame]:
-    """Return evaluations without duplicates."""
-    different: list[pd.DataFrame] = []
-    for result in results:
-        if not _contains(different, result):
-            different.append(result)
-    return different
-
-
-def _contains(results: Iterable[pd.DataFrame], result: pd.DataFrame) -> bool:
-    """Return whether one of several evaluations has the cases and returns of another one."""
-    cases, returns = result["case"].tolist(), result["reward"].to_numpy(float)
-    return any(
-        other["case"].tolist() == cases and _same_returns(other["reward"].to_numpy(float), returns)
-        for other in results
-    )
-
-
-def _same_returns(one: Array, other: Array) -> bool:
-    """Return whether two evaluations of guides in the same cases have the same returns.
-
-    The allowed difference is small beside the range of these returns, so that it fits any unit and
-    any centre, and large beside what the rounding of a batch of another size makes of one guide:
-    2e-6 of the range in the cone world. A single case has no range but its own return.
-    """
-    both = np.concatenate([one, other, [0.0]]) if len(one) == 1 else np.concatenate([one, other])
-    both = both[np.isfinite(both)]
-    tolerance = SAME_RETURN * float(np.ptp(both)) if both.size else 0.0
-    return np.allclose(one, other, rtol=1e-7, atol=tolerance, equal_nan=True)
-
-
-def _same_guide(
-    guides: Sequence[_Guide], name: str, results: Sequence[pd.DataFrame]
-) -> _Guide | None:
-    """Return the first guide with a name whose results contain the given ones, or the reverse."""
-    for guide in guides:
-        if guide.name != name:
-            continue
-        pairs = ((results, guide.results), (guide.results, results))
-        if any(all(_contains(ours, each) for each in theirs) for theirs, ours in pairs):
-            return guide
-    return None
 
 
 @dataclass(frozen=True)
@@ -578,18 +537,19 @@ def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
 
     Args:
         group: the first policy.
-        other: the second policy; a guide with a single evaluation has one value for all seeds.
+        other: the second policy; a guide with a single evaluation has one value for all seeds, and
+            one with several that of the same run.
         measure: name of the measure to compare, "reward", or "score".
 
     Returns:
         None without common cases and seeds, if a seed has no such case, or a reward is no number.
     """
-    if group.cases != other.cases or (other.is_guide and other.seeds is not None):
+    if group.cases != other.cases:
         return None
     ours, theirs = group.by_seed(measure), other.by_seed(measure)
-    if not other.is_guide:
-        common = [number for number in ours.index if number in theirs.index]
-        ours, theirs = ours.loc[common], theirs.loc[common]
+    if not _is_shared(other):
+        seeds, of_other = group.beside(other)
+        ours, theirs = ours.loc[seeds], theirs.loc[of_other]
     x, y = ours.to_numpy(), theirs.to_numpy()
     counts = np.isfinite(x) & np.isfinite(y)
     if not x.size or not counts.any(axis=1).all():
@@ -598,3 +558,12 @@ def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
         return None
     differences = np.where(counts, x - y, 0).sum(axis=1) / counts.sum(axis=1)
     return Paired(estimate(differences), float(wins(x, y)[counts].mean()))
+
+
+def _is_shared(other: Group) -> bool:
+    """Return whether all seeds are compared with one value: that of a guide without random actions.
+
+    Args:
+        other: the policy they are compared with.
+    """
+    return other.is_guide and other.seeds is None

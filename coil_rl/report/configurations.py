@@ -40,6 +40,10 @@ CONDITIONS = (
     "budget.frames",
 )
 BATCH = ("num_envs", "workers", "device")  # last parts of keys of an env that are no condition
+# Keys, or parents of keys, whose random numbers the drives of a guide depend on.
+OF_GUIDES = ("guide", "degrade", "disturb", "env", "evaluation")
+CASE_SEEDS = ("evaluation.env.first_seed", "evaluation.env.seed")  # instead of that of the env
+LEARNED_GUIDES = "guides"  # in method.learner, of a method whose guides learn
 LONGEST_VALUE = 40  # characters of a value in a label
 MOST_KEYS = 3  # in a label
 
@@ -127,8 +131,7 @@ def of_several_conditions(runs: Sequence[Run]) -> list[str]:
 
 def _is_condition(key: str) -> bool:
     """Return whether runs are compared only if they have the same value of a key."""
-    is_part = any(key == each or key.startswith(f"{each}.") for each in CONDITIONS)
-    return is_part and key.rpartition(".")[2] not in BATCH
+    return _is_part(key, CONDITIONS) and key.rpartition(".")[2] not in BATCH
 
 
 def of_several_definitions(runs: Sequence[Run]) -> list[str]:
@@ -202,6 +205,34 @@ def _follows_seed(key: str, values: Sequence[Any], runs: Sequence[Run]) -> bool:
         value == run.seed and not isinstance(value, bool)
         for value, run in zip(values, runs, strict=True)
     )
+
+
+def guide_follows_seed(runs: Sequence[Run]) -> bool:
+    """Return whether the guides of runs are known to have other drives with each seed.
+
+    So it is if they draw random numbers with the seed of the run, in an env that does so, if they
+    come from a folder of that seed, or if they learn.
+
+    Args:
+        runs: that differ by their seed.
+    """
+    if any((run.settings.get("method") or {}).get("learner") == LEARNED_GUIDES for run in runs):
+        return True
+    if all(re.search(rf"seed{run.seed}(?!\d)", str(run.settings.get("guide"))) for run in runs):
+        return True
+    configurations = [relevant(run) for run in runs]
+    keys = [key for key in configurations[0] if _is_part(key, OF_GUIDES)]
+    if any(configurations[0].get(key) is not None for key in CASE_SEEDS):
+        keys = [key for key in keys if key != "env.seed"]
+    return any(
+        _follows_seed(key, [configuration.get(key) for configuration in configurations], runs)
+        for key in keys
+    )
+
+
+def _is_part(key: str, of: Sequence[str]) -> bool:
+    """Return whether a key, or a parent of it, is one of some keys."""
+    return any(key == each or key.startswith(f"{each}.") for each in of)
 
 
 def relevant(run: Run) -> dict[str, Any]:

@@ -219,6 +219,24 @@ def notes(against: str | None, compared: Mapping[str, Comparison]) -> str:
     return text.format(other=_other(against), seeds=SIGN_FLIP_SEEDS)
 
 
+def unpaired(against: str | None, compared: Mapping[str, Comparison]) -> list[str]:
+    """Return a sentence on the policies that have no seed in common with the other one.
+
+    Args:
+        against: what the policies are compared with, see `Comparison.table`.
+        compared: the policies, by kind of actions.
+    """
+    names = dict.fromkeys(
+        chain.from_iterable(comparison.unpaired(against) for comparison in compared.values())
+    )
+    if not names:
+        return []
+    return [
+        f"No seed in common with {_other(against)}: {', '.join(names)}. Differences are between "
+        "runs of the same seed, so there is none."
+    ]
+
+
 def handed_over(runs: Sequence[Run]) -> list[str]:
     """Return sentences for each label whose runs test at their end what they hand over.
 

@@ -99,6 +99,17 @@ def test_several_folders_make_one_report_in_the_first(sweep):
     }
 
 
+def test_page_says_that_a_guide_changed_and_that_no_seed_is_in_common(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for label, seed, reward in (("ppo", 0, 5.0), ("ppo", 1, 7.0), ("coil", 2, 5.0)):
+        rows = driven("guide", {"a": reward}) + driven(label, {"a": 6.0})
+        make_run(Path("runs") / f"{label}{seed}", label, seed, rows)
+    out = report("folder=runs")[1]
+    assert "No seed in common with ppo: coil." in out
+    assert "runs of the same configuration (ppo seeds 0 / 1)" in out
+    assert "No seed in common" not in report("folder=runs", "against=guide")[1]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -80,6 +80,7 @@ def test_completion_ranks_before_the_mean(tmp_path):
         {"rewards": {"b": -1.0}},
         {"rewards": {"b": 9.0}, "crashed": 1.0},
         {"rewards": {"b": 1e-3}},
+        {"rewards": {"b": -100.0}, "crashed": 1.0},
     ],
 )
 def test_where_the_guide_fails_its_mean_over_the_other_cases_is_the_reference(failure, tmp_path):
@@ -97,6 +98,28 @@ def test_scores_are_rewards_if_no_guide_earns_anything(tmp_path):
     comparison = compare(read_runs([tmp_path]))
     assert not comparison.normalised
     assert comparison.agents[0].score.mean == 550
+
+
+@pytest.mark.parametrize(
+    ("returns", "crashed"),
+    [
+        ([0.01, -50.0, -60.0, -40.0, -55.0], [0, 0, 0, 0, 0]),
+        ([100.0, -2.0, 90.0], [0, 0, 0]),
+        ([10.0, -50.0, 12.0], [0, 1, 0]),
+    ],
+)
+def test_scores_are_rewards_if_the_guide_loses_in_a_case(returns, crashed, tmp_path):
+    guide = [
+        row
+        for case, reward, crash in zip("abcde", returns, crashed, strict=False)
+        for row in driven("guide", {case: reward}, crashed=float(crash))[:1]
+    ]
+    agent = driven("agent", {row["case"]: -40.0 for row in guide})
+    make_run(tmp_path / "0", "agent", 0, guide + agent)
+    comparison = compare(read_runs([tmp_path]))
+    assert not comparison.normalised
+    assert comparison.agents[0].score.mean == -40
+    assert comparison.guides[0].score.mean == pytest.approx(sum(returns) / len(returns))
 
 
 def test_every_case_counts_as_much_however_much_it_pays(tmp_path):
@@ -194,6 +217,26 @@ def test_guide_with_random_actions_has_an_interval_over_its_different_evaluation
     assert guide["seeds"] == 3, "ppo has two of the three evaluations"
     assert guide["reward"] == pytest.approx(560)
     assert guide["low"] < guide["score"] < guide["high"]
+
+
+def test_guide_with_random_actions_is_paired_with_the_policy_of_its_run(tmp_path):
+    losses = {("coil", 3): -5.0, ("coil", 1): -7.0, ("coil", 2): -9.0, ("ppo", 1): 4.0}
+    for index, ((label, seed), gain) in enumerate(losses.items()):
+        guide = {case: -reward - 100 * seed for case, reward in CASES.items()}
+        agent = {case: reward + gain for case, reward in guide.items()}
+        rows = [*driven("guide", guide), *driven(label, agent), *driven(f"{label} or guide", agent)]
+        make_run(tmp_path / str(index), label, seed, rows)
+    make_run(tmp_path / "9", "ppo", 9, driven("ppo", CASES))
+    rows = table(tmp_path, against="guide")
+    for driver in ("coil", "coil or guide"):
+        found = rows[driver, ""]
+        assert found["difference"] == pytest.approx(-7)
+        assert found["p"] == pytest.approx(0.0523, abs=1e-4), "of a t test, for two rows"
+        assert (found["difference_seeds"], found["better"]) == (3, 0)
+    ppo = rows["ppo", ""]
+    assert ppo["difference"] == pytest.approx(4)
+    assert (ppo["seeds"], ppo["difference_seeds"]) == (2, 1), "seed 9 has no guide"
+    assert math.isnan(rows["guide", ""]["difference"])
 
 
 def test_agents_and_guides_may_be_alone(tmp_path):

@@ -61,6 +61,19 @@ def test_section_has_a_table_of_drivers_and_one_of_cases(tmp_path):
     assert cells(rewards)[-1] == ["coil, zeroed", "-100.0 (0% completed)", "-201.0 (0% completed)"]
 
 
+def test_policies_without_a_common_seed_are_said(tmp_path):
+    seeds = {"ppo": (0, 1), "coil": (2, 3), "residual": (1, 2)}
+    for label, of_label in seeds.items():
+        for seed in of_label:
+            rows = driven("guide", {"a": 5.0}) + driven(label, {"a": 2.0 + seed})
+            make_run(tmp_path / f"{label}{seed}", label, seed, rows)
+    comparison = compare(read_runs([tmp_path]))
+    (sentence,) = page.unpaired("ppo", {"deterministic": comparison, "sampled": comparison})
+    assert sentence.startswith("No seed in common with ppo: coil.")
+    for against in ("residual", "guide", None):
+        assert page.unpaired(against, {"deterministic": comparison}) == []
+
+
 def test_terms_of_the_reward_are_beside_the_sum(tmp_path):
     rows = driven("guide", {"a": 1.0}, reward_cone=2.0, reward_smooth=-1.0)
     make_run(

@@ -1,0 +1,87 @@
+"""Test of guides whose returns differ between runs of one configuration."""
+
+import json
+
+import pytest
+from run_folders import driven, make_run
+
+from coil_rl.report.configurations import guide_follows_seed
+from coil_rl.report.guides import of_changed_guides
+from coil_rl.report.runs import read_runs
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Return what makes the runs of a label, by seed its guide's return and its settings."""
+
+    def make(of_seeds, label="coil", name="guide", settings=lambda _: {}):
+        for seed, reward in of_seeds.items():
+            rows = driven(name, {"a": reward, "b": -3.0}) + driven(label, {"a": 1.0, "b": 2.0})
+            folder = make_run(tmp_path / f"{label}_{seed}", label, seed, rows)
+            config = json.loads((folder / "config.yaml").read_text())
+            (folder / "config.yaml").write_text(json.dumps(config | settings(seed)))
+        return read_runs([tmp_path])
+
+    return make
+
+
+def test_guide_with_other_returns_in_runs_of_one_configuration_is_said(runs):
+    runs({0: -14.0, 1: -14.0, 2: -28.0, 3: -28.0})
+    (sentence,) = of_changed_guides(runs({0: -14.0, 1: -14.0}, "ppo"))
+    assert sentence.startswith(
+        "The guide has different returns in the same cases in runs of the same configuration "
+        "(coil seeds 0, 1 / 2, 3): "
+    )
+
+
+def test_each_guide_and_each_label_with_such_runs_is_named(runs):
+    runs({0: 1.0, 1: 2.0}, name="guide spline")
+    runs({0: 1.0, 1: 2.0, 3: 1.0}, "ppo", name="guide spline")
+    first, second = of_changed_guides(runs({4: 1.0, 5: 2.0}, "sac"))
+    assert "The guide spline has" in first
+    assert "(coil seeds 0 / 1; ppo seeds 0, 3 / 1)" in first
+    assert "The guide has" in second
+    assert "(sac seeds 4 / 5)" in second
+
+
+def test_many_seeds_are_shortened(runs):
+    (sentence,) = of_changed_guides(runs({seed: float(seed) for seed in range(20)}))
+    assert "(coil seeds 0 / 1 / 2 / ...)" in sentence
+
+
+def test_equal_guides_and_those_of_other_labels_are_not_accused(runs):
+    runs({0: -14.0, 1: -14.000001, 2: -14.0})
+    assert of_changed_guides(runs({0: -28.0, 1: -28.0}, "ppo")) == []
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        lambda seed: {"guide": {"random": {"_target_": "any.Random", "seed": seed}}},
+        lambda seed: {"guide": {"learned": {"run": f"sweep/ppo_seed{seed}"}}},
+        lambda seed: {"degrade": {"noisy": {"sigma": 0.3, "seed": seed}}},
+        lambda seed: {"disturb": {"observation_noise": {"seed": seed}}},
+        lambda seed: {"env": {"id": "any", "seed": seed}},
+        lambda seed: {"env": {"id": "any"}, "evaluation": {"env": {"seed": seed}}},
+        lambda _: {"method": {"name": "any", "needs_guide": True, "learner": "guides"}},
+    ],
+)
+def test_guide_that_depends_on_the_seed_is_not_accused(runs, settings):
+    found = runs({0: 1.0, 1: 2.0, 2: 3.0}, settings=settings)
+    assert guide_follows_seed(found)
+    assert of_changed_guides(found) == []
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        lambda _: {"guide": {"mine": {"_target_": "any.Mine", "gain": 3.0, "seed": 5}}},
+        lambda seed: {"env": {"seed": seed}, "evaluation": {"env": {"first_seed": 1_000_000}}},
+        lambda seed: {"env": {"seed": seed}, "evaluation": {"env": {"seed": 0}}},
+        lambda seed: {"learner": {"seed": seed}, "training": {"disturb": {"seed": seed}}},
+    ],
+)
+def test_seed_of_the_training_is_none_of_the_guide(runs, settings):
+    found = runs({0: 1.0, 1: 2.0}, settings=settings)
+    assert not guide_follows_seed(found)
+    assert len(of_changed_guides(found)) == 1
