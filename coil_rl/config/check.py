@@ -227,7 +227,8 @@ def _check_repeats(env: EnvBase) -> None:
 def check_measures(config: DictConfig, env: EnvBase) -> None:
     """Raise a `UserError` for a measure of an entry that is missing or not one number a row.
 
-    So it is for a `where` that is not true or false in each row.
+    So it is for a `where` that is neither true or false in each row nor a number of Gymnasium's
+    info.
     """
     for name, measure in measures_of(config.evaluation.measures).items():
         place = f"evaluation.measures.{name}"
@@ -254,14 +255,20 @@ def _check_number(env: EnvBase, key: NestedKey, name: str) -> None:
 
 
 def _check_flag(env: EnvBase, key: NestedKey, name: str) -> None:
-    """Raise a `UserError` if an entry is not a boolean with one value per row."""
+    """Raise a `UserError` if an entry is not a flag with one value per row.
+
+    It is a boolean, or a number of Gymnasium's info, where flags are numbers too.
+    """
     _check_entry(env, key, name)
     found = [group[key] for group in _groups(env, key)]
     rows = env.batch_size.numel()
-    if not any(spec.dtype == torch.bool and spec.shape.numel() == rows for spec in found):
+    of_info = key in getattr(env, "optional", ())  # of an env of Gymnasium
+    if not any(
+        (of_info or spec.dtype == torch.bool) and spec.shape.numel() == rows for spec in found
+    ):
         raise UserError(
-            f"{name}.where={_dotted(key)} must be a flag, true or false once a row; name "
-            "another entry, or leave it out"
+            f"{name}.where={_dotted(key)} must be a flag, true or false once a row, or a number of "
+            "Gymnasium's info (env.info); name another entry, or leave it out"
         )
 
 
