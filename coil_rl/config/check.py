@@ -30,6 +30,7 @@ from coil_rl.config.nodes import build as build_node
 from coil_rl.config.nodes import build_all, check_node
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
 from coil_rl.config.pretrained import run_folder
+from coil_rl.config.repeats import draws_unseeded
 from coil_rl.config.replay import check_recordings_to_leave_out, check_replay
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.values import check_values
@@ -200,6 +201,7 @@ def _check_env(
     for name, guide in guides.items():
         its_env = make_env.bare(1, TRAIN, None) if name in demonstrations else env
         check_guide_in_env(guide, its_env, f"guide.{name}")
+        _check_draws(guide, its_env)
     build_all(config.degrade, "degrade")
     if build.build_disturbances(config, TEST):
         transformed(env, make_env.disturb(TEST), "disturb")
@@ -220,6 +222,19 @@ def _check_repeats(env: EnvBase) -> None:
             f"the env does not obey its seed: {_dotted(key)} differs when an episode is repeated, "
             "so the cases of an evaluation are not the same for each policy; draw random numbers "
             "from self.np_random, or give env.fresh=true if a reset leaves something of the past",
+            stacklevel=2,
+        )
+
+
+def _check_draws(guide: TensorDictModuleBase, env: EnvBase) -> None:
+    """Warn if a controller acts by random numbers that no seed of the run reaches."""
+    title = draws_unseeded(guide, env)
+    if title:
+        warnings.warn(
+            f"the controller {title} gives other actions for the same observations from the same "
+            "start: it draws random numbers that no seed of the run reaches, from np.random, "
+            "random or a generator without a seed, so the run cannot be repeated or resumed to the "
+            "bit; give it a generator of its own with a seed, such as np.random.default_rng(0)",
             stacklevel=2,
         )
 
