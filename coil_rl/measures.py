@@ -31,7 +31,8 @@ class Measure:
             (`mean_nonzero`). Without a number, a mean is NaN. A NaN in a step makes means and sums
             NaN, but in `info` it is a number without a value, and its step does not count; for the
             others it is no number.
-        where: key of a flag; only the steps with it count.
+        where: key of a flag; only the steps with it count. A number, such as one of `info`, is set
+            where it is neither 0 nor NaN.
         at_least: makes the measure a flag: whether the number is at least this. An episode without
             a number is within no bound; a mean or sum of steps with a NaN is undecided, NaN.
         at_most: makes the measure a flag: whether the number is at most this.

@@ -30,6 +30,7 @@ from coil_rl.config.nodes import build as build_node
 from coil_rl.config.nodes import build_all, check_node
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
 from coil_rl.config.pretrained import run_folder
+from coil_rl.config.repeats import draws_unseeded
 from coil_rl.config.replay import check_recordings_to_leave_out, check_replay
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.values import check_values
@@ -200,6 +201,7 @@ def _check_env(
     for name, guide in guides.items():
         its_env = make_env.bare(1, TRAIN, None) if name in demonstrations else env
         check_guide_in_env(guide, its_env, f"guide.{name}")
+        _check_draws(guide, its_env)
     build_all(config.degrade, "degrade")
     if build.build_disturbances(config, TEST):
         transformed(env, make_env.disturb(TEST), "disturb")
@@ -224,10 +226,24 @@ def _check_repeats(env: EnvBase) -> None:
         )
 
 
+def _check_draws(guide: TensorDictModuleBase, env: EnvBase) -> None:
+    """Warn if a controller acts by random numbers that no seed of the run reaches."""
+    title = draws_unseeded(guide, env)
+    if title:
+        warnings.warn(
+            f"the controller {title} gives other actions for the same observations from the same "
+            "start: it draws random numbers that no seed of the run reaches, from np.random, "
+            "random or a generator without a seed, so the run cannot be repeated or resumed to the "
+            "bit; give it a generator of its own with a seed, such as np.random.default_rng(0)",
+            stacklevel=2,
+        )
+
+
 def check_measures(config: DictConfig, env: EnvBase) -> None:
     """Raise a `UserError` for a measure of an entry that is missing or not one number a row.
 
-    So it is for a `where` that is not true or false in each row.
+    So it is for a `where` that is neither true or false in each row nor a number of Gymnasium's
+    info.
     """
     for name, measure in measures_of(config.evaluation.measures).items():
         place = f"evaluation.measures.{name}"
@@ -254,14 +270,20 @@ def _check_number(env: EnvBase, key: NestedKey, name: str) -> None:
 
 
 def _check_flag(env: EnvBase, key: NestedKey, name: str) -> None:
-    """Raise a `UserError` if an entry is not a boolean with one value per row."""
+    """Raise a `UserError` if an entry is not a flag with one value per row.
+
+    It is a boolean, or a number of Gymnasium's info, where flags are numbers too.
+    """
     _check_entry(env, key, name)
     found = [group[key] for group in _groups(env, key)]
     rows = env.batch_size.numel()
-    if not any(spec.dtype == torch.bool and spec.shape.numel() == rows for spec in found):
+    of_info = key in getattr(env, "optional", ())  # of an env of Gymnasium
+    if not any(
+        (of_info or spec.dtype == torch.bool) and spec.shape.numel() == rows for spec in found
+    ):
         raise UserError(
-            f"{name}.where={_dotted(key)} must be a flag, true or false once a row; name "
-            "another entry, or leave it out"
+            f"{name}.where={_dotted(key)} must be a flag, true or false once a row, or a number of "
+            "Gymnasium's info (env.info); name another entry, or leave it out"
         )
 
 

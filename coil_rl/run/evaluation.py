@@ -139,7 +139,7 @@ class Totals:
             mask = running.expand_as(values)
             if any(measure.where for measure in group):
                 mask = mask & torch.stack(
-                    [running if m.where is None else after[m.where].reshape(-1) for m in group]
+                    [running if m.where is None else _flags(after[m.where]) for m in group]
                 )
             if reduction in ("any", "count"):
                 mask = mask & (values.nan_to_num() != 0)  # nothing happens where no number is
@@ -177,6 +177,11 @@ class Totals:
                     number = count > 0
                 results[name] = _within(measure, number, count)
         return results
+
+
+def _flags(entry: Tensor) -> Tensor:
+    """Return an entry as flags of the rows: a number is one if it is neither 0 nor NaN."""
+    return entry.reshape(-1).nan_to_num() != 0
 
 
 def _within(measure: Measure, numbers: Tensor, counts: Tensor) -> Tensor:

@@ -26,9 +26,11 @@ from coil_rl.run.parts import TEST, EnvMaker
 from coil_rl.run.weights import put_weights
 from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.worth.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, ZERO
+from coil_rl.worth.entry import FIRST_CHOICE, MIDDLE, ZERO_ACTIONS
 
 FILE = "baselines.csv"
 NAME = "baseline"  # column with the name
+ACTION = "baseline_action"  # column with the words for the action of `zero`
 REVERSED = {"_target_": "coil_rl.transforms.ScaledAdvice", "gain": -1.0}
 # Beside the delays of the env, which are kept: so names and memories are of their own.
 ONE = {"min_lag": 1, "max_lag": 1}  # steps
@@ -78,12 +80,19 @@ class Acting(TensorDictModuleBase):
 
     @classmethod
     def zero(cls, env: EnvBase) -> "Acting":
-        """Return a policy with the neutral action.
+        """Return a policy with the neutral action, see `words`.
 
         Args:
             env: the env.
         """
         return cls(env, _neutral)
+
+    @property
+    def words(self) -> str:
+        """What the neutral action is: 0 in each number only where each range is around 0."""
+        if self.space.units is None:
+            return FIRST_CHOICE
+        return ZERO_ACTIONS if (self.space.units.centre == 0).all() else MIDDLE
 
 
 def _random(generator: torch.Generator, space: ActionSpace, batch: torch.Size) -> Tensor:
@@ -120,7 +129,9 @@ def measure_baselines(config: DictConfig, folder: Path) -> None:
     }.items():
         rows += _rows(name, evaluation.run(env, policy))
     env = make_env.plain(cases, TEST)
-    rows += _rows(ZERO, evaluation.run(env, Acting.zero(env)))
+    neutral = Acting.zero(env)
+    found = _rows(ZERO, evaluation.run(env, neutral))
+    rows += [row | {ACTION: neutral.words} for row in found]
     env = make_env.plain(cases, TEST)
     rows += _rows(RANDOM, evaluation.run(env, Acting.random(env, config.seed)))
     write_csv(rows, folder / FILE)
@@ -184,6 +195,15 @@ def read_baselines(folder: Path) -> pd.DataFrame:
                 table = pd.read_csv(file)
                 tables.append(table.astype({NAME: str, "reward": float, "steps": int}))
     return pd.concat(tables, ignore_index=True)
+
+
+def action_words(table: pd.DataFrame) -> str:
+    """Return what the action of `zero` is, in words; a file without them has zero actions.
+
+    Args:
+        table: its rows.
+    """
+    return str(table[ACTION].iloc[0]) if ACTION in table else ZERO_ACTIONS
 
 
 def _rows(name: str, result: EvaluationResult) -> list[dict[str, Any]]:

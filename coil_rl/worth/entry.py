@@ -12,6 +12,9 @@ from coil_rl.worth.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, TUNE, ZERO
 
 Array = NDArray[np.float64]
 IDLE = (ZERO, NETWORK)  # neither a guide nor trained
+# What the action of `zero` is.
+ZERO_ACTIONS, MIDDLE = "zero actions", "the middle of the action's range"
+FIRST_CHOICE = "the first choice"
 
 
 @dataclass(frozen=True)
@@ -22,11 +25,13 @@ class Entry:
         name: of the policy or arm.
         returns: [seeds, cases]; one seed for what does not learn.
         rising: whether its learning curve was still rising at the end.
+        action: what the action of `zero` is, in words.
     """
 
     name: str
     returns: Array
     rising: bool = False
+    action: str = ZERO_ACTIONS
 
     @property
     def mean(self) -> float:

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,9 @@ from coil_rl.report.runs import RETURN, Run, read_runs
 from coil_rl.run.next_step import still_rising
 from coil_rl.run.reasons import POLICIES
 from coil_rl.run.tuned_run import TUNED
-from coil_rl.worth.arms import GUIDE, OPPOSITE, TUNE
-from coil_rl.worth.baselines import NAME, read_baselines
-from coil_rl.worth.entry import Entry
+from coil_rl.worth.arms import GUIDE, OPPOSITE, TUNE, ZERO
+from coil_rl.worth.baselines import NAME, action_words, read_baselines
+from coil_rl.worth.entry import ZERO_ACTIONS, Entry
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,8 @@ def read_outcome(folder: Path, arms: Sequence[str], failed: Mapping[str, str]) -
     """
     entries: dict[str, Entry] = {}
     rows: list[dict[str, Any]] = []
-    baselines = read_baselines(folder)
-    for name, table in baselines.groupby(NAME, sort=False):
-        entries[str(name)] = Entry(str(name), table["reward"].to_numpy()[None])
+    for name, table in read_baselines(folder).groupby(NAME, sort=False):
+        entries[str(name)] = _baseline(str(name), table)
         asked = int(table["steps"].sum()) if name in (GUIDE, OPPOSITE) else 0
         rows.append(_row(entries[str(name)], [table], calls=asked))
     runs: dict[str, list[Run]] = {name: [] for name in arms}
@@ -71,6 +70,12 @@ def read_outcome(folder: Path, arms: Sequence[str], failed: Mapping[str, str]) -
     return Outcome(entries, rows, {name: each for name, each in runs.items() if each})
 
 
+def _baseline(name: str, table: pd.DataFrame) -> Entry:
+    """Return what acts without learning, from its episodes."""
+    entry = Entry(name, table["reward"].to_numpy()[None])
+    return replace(entry, action=action_words(table)) if name == ZERO else entry
+
+
 def _own(run: Run) -> pd.DataFrame:
     """Return the deterministic episodes of the policy of a run."""
     table = run.evaluation
@@ -90,7 +95,7 @@ def _row(entry: Entry, tables: Sequence[pd.DataFrame], calls: float = 0) -> dict
         "seconds": 0.0,
         "calls": calls,
         "cases": entry.returns.shape[1],
-        "note": "",
+        "note": "" if entry.action == ZERO_ACTIONS else entry.action,
     }
 
 

@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from coil_rl.report.table import return_format
-from coil_rl.worth.arms import GUIDE, NETWORK, OPPOSITE, PPO, RANDOM, TUNE, ZERO
-from coil_rl.worth.entry import IDLE, Entry, difference
+from coil_rl.worth.arms import GUIDE, OPPOSITE, PPO, RANDOM, TUNE, ZERO
+from coil_rl.worth.entry import IDLE, ZERO_ACTIONS, Entry, difference
 
 AT_BEST = 0.99  # of the scale: a guide that may be left as it is
-WORDS = {ZERO: "Doing nothing (zero actions", NETWORK: "The untrained policy (first network"}
 
 
 def nothing(best: Entry, entries: Mapping[str, Entry]) -> tuple[str, ...]:
@@ -26,8 +25,8 @@ def nothing(best: Entry, entries: Mapping[str, Entry]) -> tuple[str, ...]:
         remedy = "give more cases than one"
     return (
         f"Nothing here is clearly better than random actions ({random.shown}): neither the guide "
-        f"({named[GUIDE]}), nor its opposite ({named[OPPOSITE]}), nor zero actions "
-        f"({named[ZERO]}), {learned}.",
+        f"({named[GUIDE]}), nor its opposite ({named[OPPOSITE]}), nor "
+        f"{entries[ZERO].action} ({named[ZERO]}), {learned}.",
         f"The best is {best.name} with {best.shown}, {found} against random actions.",
         f"Undecided is everything: {remedy}, or look at the reward and at the guide.",
     )
@@ -61,10 +60,10 @@ def what(use: Entry, entries: Mapping[str, Entry], score: float, wrong: bool) ->
 
 
 def idle(use: Entry, kept: Entry, entries: Mapping[str, Entry]) -> str:
-    """Return the sentence where zero actions or the untrained policy are clearly better.
+    """Return the sentence where the neutral action or the untrained policy is clearly better.
 
     Args:
-        use: zero actions or the untrained policy.
+        use: the neutral action or the untrained policy.
         kept: what to use without them.
         entries: by name.
     """
@@ -77,9 +76,18 @@ def idle(use: Entry, kept: Entry, entries: Mapping[str, Entry]) -> str:
     elif not difference(kept, random).above(0):
         than = f"random actions ({random.shown}), which no guide and no trained policy here is"
     return (
-        f"{WORDS[use.name]}, {use.shown}) is clearly better than {than}; your guide has "
+        f"{_idle_words(use)}, {use.shown}) is clearly better than {than}; your guide has "
         f"{guide.shown}, at {_share(guide, use, random):.2f} of it."
     )
+
+
+def _idle_words(use: Entry) -> str:
+    """Return the beginning of `idle`: what is used, and in brackets what it is."""
+    if use.name != ZERO:
+        return f"The untrained policy ({use.name}"
+    if use.action == ZERO_ACTIONS:
+        return f"Doing nothing ({use.action}"
+    return f"{use.action.capitalize()} ({use.name}"
 
 
 def _share(entry: Entry, other: Entry, random: Entry) -> float:

@@ -8,7 +8,7 @@ The rule is simple. What costs nothing wins, unless something is clearly better:
    Then the opposite takes its place.
 3. A tuned guide takes the place of the guide where it is clearly better.
 4. Of what learned and is clearly better than that guide, the best is recommended.
-5. Zero actions, or the untrained policy, are recommended where they are clearly better than that.
+5. The neutral action, or the untrained policy, is recommended where it is clearly better than that.
 
 What is not clearly better than random actions loses its place to anything that is.
 
@@ -109,7 +109,7 @@ def _leading(entries: Sequence[Entry], sure: Collection[str]) -> str:
 def _chosen(
     entries: Mapping[str, Entry], sure: Collection[str], scale: float
 ) -> tuple[Entry, Entry]:
-    """Return what is recommended, and what is without zero actions and the untrained policy.
+    """Return what is recommended, and what is without neutral action and untrained policy.
 
     Args:
         entries: by name.

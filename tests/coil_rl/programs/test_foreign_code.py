@@ -1,5 +1,6 @@
 """A fault in an env or controller of somebody else ends every program with one sentence."""
 
+import csv
 import textwrap
 import warnings
 
@@ -37,6 +38,13 @@ class Plant(gymnasium.Env):
 
     def render(self):
         return np.zeros((4, 4, 3))  # not uint8
+
+
+class Told(Plant):
+    def step(self, action):
+        *rest, _ = super().step(action)
+        info = {"time": self.time}
+        return *rest, info | {"late": self.time > 5} if self.time > 1 else info
 
 
 class NoReward(Plant):
@@ -159,6 +167,17 @@ def test_env_that_ignores_its_seed_and_cannot_draw_is_trained_with_warnings(tmp_
     assert "does not obey its seed: observation differs" in said
     assert "no pictures of the env: render returned" in said
     assert (tmp_path / "run" / "evaluation.csv").exists()
+
+
+def test_flag_of_info_says_which_steps_count(tmp_path):
+    words = [*TINY, "method=ppo", "env.id=odd_plants:Told", "env.info=[late,time]"]
+    measure = "evaluation.measures.after"
+    words += [f"{measure}.entry=[info,time]", f"{measure}.reduction=count"]
+    words += [f"{measure}.where=[info,late]", "evaluation.gif=false"]
+    called("train", *words, cwd=tmp_path)
+    with (tmp_path / "run" / "episodes.csv").open(newline="") as file:
+        found = {row["after"] for row in csv.DictReader(file)}
+    assert found == {"7.0"}, "steps 6 to 12"
 
 
 class Model:

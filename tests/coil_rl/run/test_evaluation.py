@@ -182,6 +182,20 @@ def test_steps_without_a_number_of_info_do_not_count(reduction):
     assert found["none"] == pytest.approx(OF_NOTHING[reduction], nan_ok=True)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int64, torch.bool])
+def test_number_is_a_flag_where_it_is_neither_zero_nor_missing(dtype):
+    measures = {"sum": Measure("x", "sum", ("info", "on")), "count": Measure("x", "count")}
+    totals = Totals(measures)
+    steps = [(1.0, 1.0), (2.0, 0.0), (4.0, -1.0)]
+    if dtype.is_floating_point:
+        steps.append((8.0, math.nan))
+    for number, flag in steps:
+        entries = {"x": torch.tensor([[number]]), "info": {"on": torch.tensor([[flag]]).to(dtype)}}
+        totals.add(TensorDict(entries, [1]), torch.ones(1, 1, dtype=torch.bool))
+    found = {name: value.item() for name, value in totals.results().items()}
+    assert found == {"sum": 5.0, "count": len(steps)}
+
+
 def test_last_number_is_that_of_the_last_step_that_has_one():
     totals = Totals({"last": Measure("number", "last")})
     for step in ([0.0, math.nan], [2.0, math.nan], [math.nan, math.nan]):

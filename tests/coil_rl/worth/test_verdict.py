@@ -1,5 +1,7 @@
 """The rule of the recommendation, on tables that were made up."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -126,6 +128,24 @@ def test_doing_nothing_is_used_where_it_is_clearly_better_than_everything_else(n
     assert "40.0) is clearly better than everything else here; your guide" in found.sentences[0]
     assert "your guide has -40.0, at 0.60 of it" in found.sentences[0]
     assert "+80.0" in found.sentences[1]
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        ("zero actions", "Doing nothing (zero actions, 40.0) is"),
+        ("the middle of the action's range", "The middle of the action's range (zero, 40.0) is"),
+        ("the first choice", "The first choice (zero, 40.0) is"),
+    ],
+)
+def test_only_zero_actions_are_called_doing_nothing(action, words):
+    def said(**means):
+        made = entries(**means)
+        made["zero"] = replace(made["zero"], action=action)
+        return verdict(made).sentences
+
+    assert said(zero=40.0, guide=-40.0, random=-160.0, ppo=-90.0)[0].startswith(words)
+    assert f"nor {action} (-7.00), nor what was" in said(zero=-7.0, guide=-5.0, ppo=-2.0)[0]
 
 
 def test_guide_is_not_called_the_best_where_doing_nothing_is_as_good():

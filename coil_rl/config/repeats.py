@@ -1,0 +1,117 @@
+"""Check of a controller: whether it acts the same again on what it saw before."""
+
+import random
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase, TransformedEnv
+
+from coil_rl.envs.gate import action_array
+from coil_rl.guides.controllers import PerRow
+from coil_rl.guides.simple import FollowAdvice
+from coil_rl.transforms import GuideActions
+
+STEPS = 10
+LONGEST = 0.1  # s, after which the check ends with the step that it is in
+
+
+class Twins:
+    """Two objects of a controller that are asked the same, with other global random numbers.
+
+    It acts as the first of them. Those of torch are the same for both: a run seeds and saves them.
+
+    Args:
+        make: makes an object; called without arguments.
+
+    Attributes:
+        differ: whether the two gave different actions.
+    """
+
+    def __init__(self, make: Callable[[], Any]) -> None:
+        self.calls, self.differ = 0, False
+        self.objects = [self._answer(number, partial(_started, make)) for number in range(2)]
+
+    def act(self, *observed: NDArray[Any]) -> Any:
+        """Return the action of the first object.
+
+        Args:
+            observed: what the controller reads.
+        """
+        self.calls += 1
+        answers = [
+            self._answer(number, partial(thing.act, *(each.copy() for each in observed)))
+            for number, thing in enumerate(self.objects)
+        ]
+        first, other = map(action_array, answers)
+        if first.shape != other.shape or not np.allclose(first, other, equal_nan=True):
+            self.differ = self.objects[0] is not self.objects[1]
+        return answers[0]
+
+    def _answer(self, number: int, ask: Callable[[], Any]) -> Any:
+        """Return what an object gives with the global random numbers of its own."""
+        torch.manual_seed(self.calls)
+        random.seed(2 * self.calls + number)
+        np.random.seed(2 * self.calls + number)
+        return ask()
+
+
+def _started(make: Callable[[], Any]) -> Any:
+    """Return an object at the start of an episode."""
+    thing = make()
+    if hasattr(thing, "reset"):
+        thing.reset()
+    return thing
+
+
+def draws_unseeded(guide: TensorDictModuleBase, env: EnvBase) -> str:
+    """Return the name of a controller that does not act the same again; empty for any other guide.
+
+    Two new objects of it act side by side in a few steps of the env. What either of them raises
+    ends the check: it is said where the controller acts for the run.
+
+    Args:
+        guide: the guide; one that has no object for each row is not asked.
+        env: of one row, in which the guide can act; its running episode is lost.
+    """
+    own = getattr(guide, "guide", guide)
+    if not isinstance(own, PerRow):
+        return ""
+    twins: list[Twins] = []
+
+    def make() -> Twins:
+        twins.append(Twins(own.make))
+        return twins[-1]
+
+    probe = PerRow(make, own.read, own.out_keys[0], own.title)
+    advised = TransformedEnv(env, GuideActions({"guide": probe}))
+    policy, end = FollowAdvice(advised), time.perf_counter() + LONGEST
+    try:
+        with _global_numbers_kept():
+            data = advised.reset()
+            for _ in range(STEPS):
+                after = advised.step(policy(data))
+                data = advised.step_mdp(after)
+                if time.perf_counter() > end or data["done"].any():
+                    break
+    except Exception:
+        return ""
+    return own.title if any(each.differ for each in twins) else ""
+
+
+@contextmanager
+def _global_numbers_kept() -> Iterator[None]:
+    """Put the global random generators back at the end."""
+    states = random.getstate(), np.random.get_state()
+    try:
+        with torch.random.fork_rng():
+            yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])
