@@ -118,13 +118,15 @@ def of_changed_guides(runs: Sequence[Run]) -> list[str]:
             if len(parts) > 1:
                 shown = [_some(list(map(str, seeds)), MOST_SEEDS) for seeds in parts]
                 found.setdefault(name, []).append(f"{label} seeds {_some(shown, joint=' / ')}")
-    return [
-        f"The {name} has different returns in the same cases in runs of the same configuration "
-        f"({_some(labels, joint='; ')}): either the env, the guide or what they use changed "
-        "between these runs, and they are not to be pooled, or the guide or the env draws random "
-        "numbers of its own."
-        for name, labels in found.items()
-    ]
+    warnings = []
+    for name, labels in found.items():
+        warnings.append(
+            f"The {name} has different returns in the same cases in runs of the same configuration "
+            f"({_some(labels, joint='; ')}): either the env, the guide or what they use changed "
+            "between these runs, and they are not to be pooled, or the guide or the env draws "
+            "random numbers of its own."
+        )
+    return warnings
 
 
 def _by_seed(runs: Sequence[Run]) -> dict[str, dict[int, pd.DataFrame]]:
