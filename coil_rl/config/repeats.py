@@ -19,7 +19,7 @@ from coil_rl.guides.simple import FollowAdvice
 from coil_rl.transforms import GuideActions
 
 STEPS = 10
-LONGEST = 0.1  # s, after which the check ends with the step that it is in
+LONGEST = 0.1  # s, after which the check takes no further step
 
 
 class Twins:
@@ -96,10 +96,9 @@ def draws_unseeded(guide: TensorDictModuleBase, env: EnvBase) -> str:
         with _global_numbers_kept():
             data = advised.reset()
             for _ in range(STEPS):
-                after = advised.step(policy(data))
-                data = advised.step_mdp(after)
                 if time.perf_counter() > end or data["done"].any():
                     break
+                data = advised.step_mdp(advised.step(policy(data)))
     except Exception:
         return ""
     return own.title if any(each.differ for each in twins) else ""
