@@ -21,6 +21,8 @@ def learned(folder, method, *overrides, guide="thermostat.control:PI", env="ther
     words, frames = [*TINY, *OPTIONS.get(method, ON_POLICY)], 32
     if method == "guide":  # it learns nothing
         words, frames = SHORT, None
+    elif method == "tune":  # it has no learner
+        words = [*SHORT, "logger=none"]
     if method.startswith("dynamic_coil"):
         words += [*PROXY, f"proxy.folder={folder}_proxies"]
         frames += 192  # those of its proxies

@@ -219,13 +219,13 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
         "method=dynamic_coil_sequential",
         "guide=[spline,zero]",
         f"proxy.folder={proxies}",
-        "budget.frames=192",
+        "budget.frames=576",
         "learner.epochs=1",
         "learner.minibatches=2",
         f"run_dir={tmp_path / 'run'}",
     ]
-    with pytest.raises(UserError, match="as the proxies of its guides take 128 frames"):
-        check(composed(*overrides, "budget.frames=128"))
+    with pytest.raises(UserError, match="as the proxies of its guides take 512 frames"):
+        check(composed(*overrides, "budget.frames=512"))
     config = composed(*overrides)
     check(config)
     train(config)
