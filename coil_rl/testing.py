@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs, step_mdp
 
+from coil_rl.envs.env_batch import optional_entries
 from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.transforms import GuideActions, set_progress
 from coil_rl.transforms.action_space import first_choices, nested_key, own_shape, space_of
@@ -63,9 +64,7 @@ def _check_rollouts(env: EnvBase, steps: int) -> None:
         torch.manual_seed(0)  # of the actions
         rollouts.append(env.rollout(steps, break_when_any_done=False))
     rollout, again = rollouts
-    base = env.base_env if isinstance(env, TransformedEnv) else env
-    given = base.optional if isinstance(base, GymnasiumEnv) else []
-    optional = {part for key in given for part in (key, ("next", *key))}
+    optional = {part for key in optional_entries(env) for part in (key, ("next", *key))}
     for key, value in rollout.items(True, True):
         numbers = value.nan_to_num() if key in optional else value
         if value.is_floating_point() and not numbers.isfinite().all():

@@ -84,6 +84,7 @@ class SeededRows(RowsInTurn, SeededEnv):
     """
 
     remedy: ClassVar[str] = ""  # what may help if running episodes cannot be repeated
+    optional: Sequence[tuple[str, ...]] = ()  # entries in which NaN is a number without a value
 
     def __init__(
         self,
@@ -355,3 +356,13 @@ class EnvBatch(SeededRows):
             specs.append(self.full_reward_spec)
         keys = [key for spec in specs for key in spec.keys(True, True)]
         return torch.stack([row.after.select(*keys) for row in self.rows]).to(self.device)
+
+
+def optional_entries(env: EnvBase) -> Sequence[tuple[str, ...]]:
+    """Return the entries in which NaN is a number without a value; none in an env of another kind.
+
+    Args:
+        env: an env, with or without transforms.
+    """
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    return base.optional if isinstance(base, SeededRows) else ()

@@ -67,7 +67,7 @@ class ObservationNoise(Disturbance):
         return self._declared(env) | bounds
 
     def _declared(self, env: EnvBase) -> dict[NestedKey, tuple[Tensor, Tensor]]:
-        """Return what an env declares of the entries that no transform in front has changed."""
+        """Return the bounds that an env declares for the entries that no other transform writes."""
         found = getattr(env, "observation_bounds", {})
         found = found[0] if isinstance(found, list) else found  # of several envs in one
         changed: list[NestedKey] = []

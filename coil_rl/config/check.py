@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from coil_rl.config import build
 from coil_rl.config.choices import about_choices, needs_numbers
 from coil_rl.config.distillation import (
-    frames_of,
+    frames_of_proxies,
     guides_with_untrained_proxies,
     guides_without_parameters,
     proxy_config,
@@ -34,7 +34,7 @@ from coil_rl.config.repeats import draws_unseeded
 from coil_rl.config.replay import check_recordings_to_leave_out, check_replay
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.values import check_values
-from coil_rl.envs.env_batch import SeededRows
+from coil_rl.envs.env_batch import SeededRows, optional_entries
 from coil_rl.envs.gate import ForeignError
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.guides.simple import FollowAdvice
@@ -240,7 +240,7 @@ def _check_draws(guide: TensorDictModuleBase, env: EnvBase) -> None:
 
 
 def check_measures(config: DictConfig, env: EnvBase) -> None:
-    """Raise a `UserError` for a measure of an entry that is missing or not one number a row.
+    """Raise a `UserError` for a measure of an entry that is missing or not one number per row.
 
     So it is for a `where` that is neither true or false in each row nor a number of Gymnasium's
     info.
@@ -277,7 +277,7 @@ def _check_flag(env: EnvBase, key: NestedKey, name: str) -> None:
     _check_entry(env, key, name)
     found = [group[key] for group in _groups(env, key)]
     rows = env.batch_size.numel()
-    of_info = key in getattr(env, "optional", ())  # of an env of Gymnasium
+    of_info = key in optional_entries(env)
     if not any(
         (of_info or spec.dtype == torch.bool) and spec.shape.numel() == rows for spec in found
     ):
@@ -476,8 +476,7 @@ def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
 
 def _check_frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> None:
     """Raise a `UserError` if the proxies of guides take all frames of a run."""
-    taken = sum(frames_of(proxy_config(config, name).budget) for name in guides)
-    budget = config.budget
+    taken, budget = frames_of_proxies(config, guides), config.budget
     if taken >= budget.frames:
         raise UserError(
             f"budget.frames={budget.frames} leaves nothing to the run, as the proxies of its "

@@ -9,7 +9,7 @@ its proxies into its own folder.
 import hashlib
 import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +104,17 @@ def distil(config: DictConfig, folder: Path) -> int:
         for proxy in proxies.values():
             run_configured(proxy, wait=True)
         copy_proxies({name: Path(proxy.run_dir) for name, proxy in proxies.items()}, folder)
-    return sum(frames_of(proxy.budget) for proxy in proxies.values())
+    return frames_of_proxies(config, names)
+
+
+def frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> int:
+    """Return the frames that the proxies of the guides of a run take.
+
+    Args:
+        config: of the run.
+        guides: names of the guides that get a proxy.
+    """
+    return sum(frames_of(config.proxy.budget) for _ in guides)
 
 
 def frames_of(budget: DictConfig) -> int:

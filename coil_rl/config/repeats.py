@@ -1,4 +1,4 @@
-"""Check of a controller: whether it acts the same again on what it saw before."""
+"""Check whether a controller gives the same actions for the same observations again."""
 
 import random
 import time
@@ -23,7 +23,7 @@ LONGEST = 0.1  # s, after which the check takes no further step
 
 
 class Twins:
-    """Two objects of a controller that are asked the same, with other global random numbers.
+    """Two objects of a controller that get the same observations, but other global random numbers.
 
     It acts as the first of them. Those of torch are the same for both: a run seeds and saves them.
 
@@ -106,7 +106,7 @@ def draws_unseeded(guide: TensorDictModuleBase, env: EnvBase) -> str:
 
 @contextmanager
 def _global_numbers_kept() -> Iterator[None]:
-    """Put the global random generators back at the end."""
+    """Restore the states of the global random generators after the block."""
     states = random.getstate(), np.random.get_state()
     try:
         with torch.random.fork_rng():

@@ -99,7 +99,7 @@ def trust_own(config: DictConfig) -> None:
 
 
 def import_paths(config: DictConfig) -> frozenset[str]:
-    """Return what the entries of a configuration name to be imported, written with points only.
+    """Return the import paths in the entries of a configuration, written with points only.
 
     Args:
         config: the configuration, or a part of it.

@@ -62,7 +62,7 @@ def acts(thing: Any) -> bool:
 
 
 def maker_of_rows(thing: Any) -> partial[Any]:
-    """Return what makes a copy of an object with `act` for a row.
+    """Return a function that makes a copy of an object with `act`, for one row of the env.
 
     Copies of a network share its weights, and are in evaluation mode.
 

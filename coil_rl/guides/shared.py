@@ -120,7 +120,7 @@ def _near(one: Tensor, other: Tensor, tolerance: float, actions: Tensor) -> bool
 
 
 def _alike(earlier: Sequence[Tensor], first: Sequence[Tensor]) -> bool:
-    """Return whether an earlier row can be asked for again, as of an env like the present one."""
+    """Return whether two rows have entries of the same shapes, dtypes and devices."""
     return len(earlier) == len(first) and all(
         (one.shape, one.dtype, one.device) == (other.shape, other.dtype, other.device)
         for one, other in zip(earlier, first, strict=True)

@@ -118,7 +118,7 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
 
 
 def _check_advice(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> None:
-    """Raise a `UserError` for further advice where the policy has none that could be degraded."""
+    """Raise a `UserError` if degraded advice is asked for, but the policy has no advice."""
     from coil_rl.config.build import advises
 
     if advises(config) and not resolved.get("exported"):

@@ -339,7 +339,7 @@ class Comparison:
         return None if other is None else paired(group, other)
 
     def _other(self, group: Group, against: str | None) -> Group | None:
-        """Return the policy that another one is compared with; None for no other one."""
+        """Return the policy that a group is compared with; None if there is none."""
         if against == GUIDE:
             other = group.guide
         else:
