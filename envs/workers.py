@@ -23,6 +23,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from multiprocessing.connection import Connection, wait
+from multiprocessing.util import Finalize
 from typing import Any, Protocol
 
 import torch
@@ -33,6 +34,7 @@ from coil_rl.envs.gate import ForeignError
 AUTO = "auto"
 SAVED = 2e-3  # seconds; a batched step of this length pays for the messages
 LEAST_STEPS, MOST_STEPS, LONGEST = 5, 30, 0.05  # of a timing, in steps and seconds
+FIRST = 10  # priority of what ends the processes, at the end of the program
 PATIENCE = 5.0  # seconds between two messages while processes start, and until one must have ended
 # Signals that are meant for the program: it saves its state, and then ends its processes itself.
 IGNORED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
@@ -124,7 +126,9 @@ class Workers:
             self.pipes.append(pipe)
             self.processes.append(process)
         _spread([process.pid for process in self.processes])
-        self._end = weakref.finalize(self, _ended, os.getpid(), self.pipes, self.processes)
+        # At the end of the program this runs before multiprocessing waits for its processes, which
+        # do not end while their pipes are open.
+        self._end = Finalize(self, _ended, (self.pipes, self.processes), exitpriority=FIRST)
         try:
             self._wait_until_ready()
         except BaseException:
@@ -277,7 +281,7 @@ def timed(make: Callable[[range], Shard], draw: Callable[[], Any]) -> float | No
         seconds: float | None = pipe.recv()
     except (EOFError, OSError):
         seconds = None
-    _ended(os.getpid(), [pipe], [process])
+    _ended([pipe], [process])
     return seconds
 
 
@@ -377,10 +381,8 @@ def _time(pipe: Connection, make: Callable[[range], Shard], draw: Callable[[], A
         pipe.send(seconds)
 
 
-def _ended(owner: int, pipes: Sequence[Connection], processes: Sequence[Any]) -> None:
+def _ended(pipes: Sequence[Connection], processes: Sequence[Any]) -> None:
     """Close pipes, which ends their processes; kill one that does not end."""
-    if os.getpid() != owner:
-        return
     for pipe in pipes:
         pipe.close()
     latest = time.monotonic() + PATIENCE  # of all together

@@ -304,3 +304,31 @@ def test_env_with_processes_gives_the_same_pictures() -> None:
         drive(env, 3)
         pictures.append(np.stack([env.render(row) for row in (0, 2)]))
     assert np.array_equal(*pictures)
+
+
+# An object with a finalizer of its own, made before anything else, changes the order of the end.
+OPEN_AT_THE_END = """
+import sys, weakref
+class Tool: pass
+tool = Tool()
+weakref.finalize(tool, print, "ended")
+sys.path.insert(0, {tests!r})
+from test_workers import plants
+env = plants(2)
+env.reset()
+"""
+
+
+@pytest.mark.slow
+def test_program_ends_while_an_env_is_open() -> None:
+    program = OPEN_AT_THE_END.format(tests=os.path.dirname(__file__))
+    paths = os.pathsep.join(path for path in sys.path if path)
+    ended = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert ended.stdout == "ended\n"
