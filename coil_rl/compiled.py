@@ -48,8 +48,8 @@ class Compiled:
             for others.
 
     Raises:
-        UserError: at a call, if there is no C++ compiler or no place for the library, or if the
-            shape of a tensor depends on values.
+        UserError: at a call, if a tensor is on a GPU, if there is no C++ compiler or no place for
+            the library, or if the shape of a tensor depends on values.
     """
 
     def __init__(self, function: Callable[..., Sequence[Tensor]], once: bool = False) -> None:
@@ -78,16 +78,17 @@ def library(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tenso
     Args:
         function: of tensors, see `Compiled`.
         arguments: of the shapes for which the library is needed; they keep their values.
+
+    Raises:
+        UserError: see `Compiled`.
     """
+    if any(argument.device.type != "cpu" for argument in arguments):
+        raise UserError("code is compiled for the CPU only; on a GPU take compile=false")
     graph = record(function, arguments)
-    device = arguments[0].device
     path = cache_folder() / f"{fingerprint(graph, arguments)}.so"
     if not path.is_file():
         compile_graph(graph, arguments, path)
-    runners = torch._C._aoti
-    if device.type == "cpu":
-        return runners.AOTIModelContainerRunnerCpu(str(path), 1)
-    return runners.AOTIModelContainerRunnerCuda(str(path), 1, str(device))
+    return torch._C._aoti.AOTIModelContainerRunnerCpu(str(path), 1)
 
 
 def compile_steps(env: nn.Module) -> None:

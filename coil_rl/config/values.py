@@ -46,17 +46,23 @@ def check_values(config: DictConfig) -> None:
                 f"{name}.num_envs x {name}.steps={frames} must be at most {LARGEST_BATCH}"
             )
     for name in ("device", "env.device"):
-        if not isinstance(device := OmegaConf.select(config, name), str):
-            continue
-        if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
-            raise UserError(f"{name}={device} must be cpu, cuda, or one GPU such as cuda:0")
-        try:
-            torch.empty(0, device=device)
-        except (AssertionError, RuntimeError) as error:
-            problem = str(error).splitlines()[0]
-            raise UserError(
-                f"{name}={device} cannot be used ({problem}); take {name}=cpu"
-            ) from error
+        if isinstance(device := OmegaConf.select(config, name), str):
+            _check_device(config, name, device)
+
+
+def _check_device(config: DictConfig, name: str, device: str) -> None:
+    """Raise a `UserError` for a device that is unknown, is not there or cannot do what is asked."""
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+        raise UserError(f"{name}={device} must be cpu, cuda, or one GPU such as cuda:0")
+    if device != "cpu" and OmegaConf.select(config, "compile"):
+        raise UserError(
+            f"compile=true is for the CPU only, not for {name}={device}; take compile=false"
+        )
+    try:
+        torch.empty(0, device=device)
+    except (AssertionError, RuntimeError) as error:
+        problem = str(error).splitlines()[0]
+        raise UserError(f"{name}={device} cannot be used ({problem}); take {name}=cpu") from error
 
 
 @cache

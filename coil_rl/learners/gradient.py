@@ -22,7 +22,8 @@ ENOUGH = 4_000  # steps of a run, for which compilation pays in the second run o
 class GradientStep(Stateful):
     """One step of Adam on the weighted losses of a minibatch.
 
-    Another value of `compile`, or true if the step cannot be compiled, is a `ValueError`.
+    Another value of `compile`, or true if the step cannot be compiled, is a `ValueError`. No step can
+    be compiled on a GPU.
 
     Args:
         losses: returns scalars by name for a minibatch.
@@ -58,8 +59,11 @@ class GradientStep(Stateful):
                 "compile=true: this learner's update depends on data in its shapes; take "
                 "compile=auto"
             )
-        self.compile = self.compile if self.compilable else False
         self.parameters = [parameter for group in self.groups for parameter in group]
+        on_cpu = all(parameter.device.type == "cpu" for parameter in self.parameters)
+        if self.required and not on_cpu:
+            raise ValueError("compile=true: code is compiled for the CPU only; take compile=auto")
+        self.compile = self.compile if self.compilable and on_cpu else False
         self.adam = torch.optim.Adam(
             [{"params": group} for group in self.groups], eps=self.eps, fused=True
         )

@@ -118,3 +118,9 @@ def test_missing_compiler_is_named(monkeypatch, tmp_path):
     ):
         Compiled(lambda x: [x.sin()])(torch.ones(3))
     assert not list((tmp_path / "coil-rl").iterdir())
+
+
+def test_function_of_tensors_on_a_gpu_is_refused():
+    # No memory is behind this device, and no GPU is needed for it.
+    with pytest.raises(UserError, match="on a GPU take compile=false"):
+        Compiled(walk)(torch.ones(4, device="meta"), torch.ones(4, device="meta"))

@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModule
 
 from coil_rl.errors import UserError
 from coil_rl.learners import A2C, DQN, PPO, SAC, DynamicCoil, gradient
+from coil_rl.learners.gradient import GradientStep
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import DiscreteActions
 
@@ -125,3 +126,18 @@ def test_update_with_shapes_from_data_is_not_compiled():
         ValueError, match="compile=true: this learner's update depends on data in its shapes"
     ):
         make(DynamicCoil, True, guides={"driver": driver})
+
+
+def test_update_on_a_gpu_is_not_compiled():
+    # No memory is behind this device, and no GPU is needed for it.
+    weight = torch.nn.Parameter(torch.ones(1, device="meta"))
+    with pytest.raises(ValueError, match="compile=true: code is compiled for the CPU only"):
+        GradientStep(
+            lambda _: {"loss": weight.sum()},
+            [[weight]],
+            [],
+            lambda _: [1e-3],
+            eps=1e-5,
+            max_grad_norm=1.0,
+            compile=True,
+        )

@@ -44,7 +44,6 @@ def test_method_is_trained_and_evaluated(method, tmp_path):
         ["delivery=tested", "training.tests.time_limit=0.5"],
         ["training.normalise=true", "training.scale_rewards=true"],
         ["training.noise_correlation=0.7"],
-        ["compile=true"],
     ],
     ids=lambda settings: settings[0],
 )

@@ -117,6 +117,10 @@ def refusal(name, *arguments):
             "budget.num_envs x budget.steps=1000000000 must be at most",
         ),
         ("device=tpu", "device=tpu must be cpu, cuda, or one GPU such as cuda:0"),
+        (
+            "device=cuda compile=true",
+            "compile=true is for the CPU only, not for device=cuda; take compile=false",
+        ),
         ("preset.rate=1e23", "env: rate=1e+23 must be more than 0 and at most 1000"),
         ("env.time_limit=1e300", "env: time_limit=1e+300 must be more than 0 and at most 1000000"),
         (
