@@ -22,8 +22,8 @@ ENOUGH = 4_000  # steps of a run, for which compilation pays in the second run o
 class GradientStep(Stateful):
     """One step of Adam on the weighted losses of a minibatch.
 
-    Another value of `compile`, or true if the step cannot be compiled, is a `ValueError`. No step can
-    be compiled on a GPU.
+    Another value of `compile`, or true if the step cannot be compiled, is a `ValueError`. On a GPU
+    no step can be compiled.
 
     Args:
         losses: returns scalars by name for a minibatch.
