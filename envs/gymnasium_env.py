@@ -30,6 +30,7 @@ from coil_rl.envs.gymnasium_makers import (
 )
 from coil_rl.envs.gymnasium_rows import Row, Rows, resolved_controller
 from coil_rl.envs.gymnasium_spaces import (
+    Choices,
     action_spec,
     check_action_space,
     has_whole_numbers,
@@ -96,6 +97,7 @@ class GymnasiumEnv(SeededRows):
 
     Attributes:
         observation_bounds: declared bounds of the entries that have any, which they may leave.
+        observed_choices: what converts an entry to its choices as the env gives them, by entry.
         optional: entries in which NaN is a number without a value, not a fault: those of `info`.
 
     Raises:
@@ -178,6 +180,7 @@ class GymnasiumEnv(SeededRows):
         action, number = action_spec(id, self.space, dtype), Unbounded(1, dtype=dtype)
         observation = Composite()
         self.observation_bounds: dict[Any, tuple[torch.Tensor, torch.Tensor]] = {}
+        self.observed_choices: dict[Any, Choices] = {}
         for entry in self.entries:
             name = entry.key[0]
             if name in RESERVED:
@@ -185,8 +188,10 @@ class GymnasiumEnv(SeededRows):
                     f"the observation of {id} has an entry {name!r}: rename it with a wrapper"
                 )
             observation[entry.key] = entry.spec
+            key = entry.key if len(entry.key) > 1 else name
+            if entry.choices:
+                self.observed_choices[key] = Choices(entry.space)
             if (bounds := entry.bounds) is not None:
-                key = entry.key if len(entry.key) > 1 else name
                 low, high = (bound.to(self.device) for bound in bounds)
                 self.observation_bounds[key] = low, high
         for name in self.info:

@@ -70,6 +70,29 @@ class Fineness:
             )
 
 
+class Choices:
+    """Conversion of one-hot vectors side by side to the choices of a space, in its numbering.
+
+    Args:
+        space: a Discrete or MultiDiscrete space.
+    """
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        self.sizes, self.shape = _choices(space), tuple(space.shape or ())
+        self.first = torch.as_tensor(np.ravel(start(space)).astype(np.int64))
+
+    def __call__(self, vectors: torch.Tensor) -> torch.Tensor:
+        """Return the choices, [*batch, *shape] with the shape of the space, as whole numbers.
+
+        Args:
+            vectors: [*batch, n].
+        """
+        parts = vectors.split(self.sizes, -1)
+        indices = torch.stack([part.argmax(-1) for part in parts], -1)
+        own = indices + self.first.to(indices.device)
+        return own.reshape((*vectors.shape[:-1], *self.shape))
+
+
 class Entry:
     """One entry of the observation: where it is found, its spec, and its conversion to numbers.
 

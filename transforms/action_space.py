@@ -8,9 +8,9 @@ these kinds of actions.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -31,6 +31,8 @@ from torchrl.envs import EnvBase, Transform
 from coil_rl.transforms.normalised_action import ActionUnits, given_units, units_of
 
 Key = TypeVar("Key", NestedKey, NestedKey | None)
+# What converts one-hot entries of an env to its own numbering, by entry.
+OwnChoices: TypeAlias = Mapping[NestedKey, Callable[[Tensor], Tensor]]
 
 
 def nested_key(key: Key) -> Key:
@@ -388,6 +390,11 @@ def first_choices(env: EnvBase) -> Tensor | None:
 def own_shape(env: EnvBase) -> Sequence[int] | None:
     """Return the shape of an action as controllers give it; None: that of the env's spec."""
     return getattr(env, "own_shape", None)
+
+
+def observed_choices(env: EnvBase) -> OwnChoices:
+    """Return what converts one-hot entries of an env to its own numbering, by entry."""
+    return getattr(env, "observed_choices", {})
 
 
 def space_of(env: EnvBase, action_key: NestedKey) -> ActionSpace:

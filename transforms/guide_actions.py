@@ -22,7 +22,9 @@ from torchrl.envs import EnvBase, Transform
 from coil_rl.transforms.action_space import (
     ActionSpace,
     ActionTransform,
+    OwnChoices,
     nested_key,
+    observed_choices,
     space_of,
 )
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
@@ -200,15 +202,21 @@ class Guides(TensorDictModuleBase):
         action: Tensor = data[self.action_key]
         return action if convert is None else convert(name, action, tensordict.batch_size)
 
-    def tell(self, space: ActionSpace) -> None:
-        """Tell the guides that ask for it, by a method `in_space`, which actions there are.
+    def tell(self, space: ActionSpace, choices: OwnChoices) -> None:
+        """Tell the guides that ask for it about their env.
+
+        A guide asks by a method `in_space`, which actions there are, or `reads_choices`, how to
+        read choices as the env gives them.
 
         Args:
             space: of the actions of the guides.
+            choices: what converts one-hot entries to the numbering of the env, by entry.
         """
         for guide in self.guides.values():
             if hasattr(guide, "in_space"):
                 guide.in_space(space)  # type: ignore[operator]
+            if hasattr(guide, "reads_choices"):
+                guide.reads_choices(choices)  # type: ignore[operator]
 
     def match_dtypes(self, tensordict: TensorDictBase) -> None:
         """Convert from here on what a guide reads to the dtype of its parameters.
@@ -480,7 +488,7 @@ class GuideActions(ActionTransform):
         """Return the advice within the bounds of the action; the memory is replaced by the next."""
         if not self._checked:
             self.guides.match_dtypes(tensordict)
-            self.guides.tell(self.guide_space)
+            self.guides.tell(self.guide_space, observed_choices(self.parent.base_env))
         return self.guides.advice(tensordict, self._fitted, memory, ended)
 
     def _advice_with_past(

@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.transforms.action_space import ActionSpace, OwnChoices
 
 
 class Candidates(TensorDictModuleBase):
@@ -26,6 +26,7 @@ class Candidates(TensorDictModuleBase):
         super().__init__()
         self.foreign = getattr(first, "foreign", False)
         self.space: ActionSpace | None = None
+        self.choices: OwnChoices = {}
         self.guides = nn.ModuleList(guides)
 
     def replace(self, guides: Sequence[TensorDictModuleBase]) -> None:
@@ -37,6 +38,7 @@ class Candidates(TensorDictModuleBase):
         self.guides = nn.ModuleList(guides)
         if self.space is not None:
             self.in_space(self.space)
+        self.reads_choices(self.choices)
 
     def in_space(self, space: ActionSpace) -> None:
         """Tell the guides that ask for it which actions there are.
@@ -48,6 +50,17 @@ class Candidates(TensorDictModuleBase):
         for guide in self.guides:
             if hasattr(guide, "in_space"):
                 guide.in_space(space)  # type: ignore[operator]
+
+    def reads_choices(self, choices: OwnChoices) -> None:
+        """Tell the guides that ask for it how to read choices as the env gives them.
+
+        Args:
+            choices: what converts an entry, by entry.
+        """
+        self.choices = choices
+        for guide in self.guides:
+            if hasattr(guide, "reads_choices"):
+                guide.reads_choices(choices)  # type: ignore[operator]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the actions, and what the guides remember for their next step."""

@@ -32,7 +32,7 @@ from coil_rl.errors import did_you_mean
 from coil_rl.files import LARGEST_TABLE, read_text
 from coil_rl.guides.functions import FunctionGuide
 from coil_rl.guides.networks import NetworkGuide, acts, maker_of_rows
-from coil_rl.transforms.action_space import ActionSpace, nested_key, written_key
+from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key, written_key
 
 # Other minus signs, as text programs write them: hyphens, the sign itself, and dashes.
 MINUS = str.maketrans(dict.fromkeys("\u2010\u2011\u2212\u2013\u2014\ufe63\uff0d", "-"))
@@ -42,12 +42,12 @@ class PerRow(TensorDictModuleBase):
     """Python controllers as a guide, one object for each row of the env.
 
     An object is made when its row first acts, and is not asked after the end of an episode, see
-    `Guides`. `act(observation)` gets one NumPy array for each of
-    `in_keys` and returns an action: numbers, an index or a one-hot vector. `reset()`, if there is
-    one, is called at the start of each episode; without it each episode gets a new object. Objects
-    with `state_dict()` and `load_state_dict(state)` are part of a checkpoint; without these, new
-    episodes begin when a run is resumed. They are called one after the other: a batched guide is
-    many times faster.
+    `Guides`. `act(observation)` gets one NumPy array for each of `in_keys`, or choices in the
+    numbering of the env, as a Gymnasium env gives them. It returns an action: numbers, an index or
+    a one-hot vector. `reset()`, if there is one, is called at the start of each episode; without it
+    each episode gets a new object. Objects with `state_dict()` and `load_state_dict(state)` are
+    part of a checkpoint; without these, new episodes begin when a run is resumed. They are called
+    one after the other: a batched guide is many times faster.
 
     What an object raises, or returns that is no action, is a `ForeignError` with its row and step.
 
@@ -82,10 +82,19 @@ class PerRow(TensorDictModuleBase):
         super().__init__()
         self.make, self.objects = make, dict[int, Any]()
         self.title = title or getattr(getattr(make, "func", make), "__name__", repr(make))
+        self.choices: OwnChoices = {}
         self.steps = dict[int, int]()  # of the running episode, by row
         self.asked: list[int] = []  # rows of the last call
         # whether the last restored state held those of the objects; else new episodes begin
         self.continues = True
+
+    def reads_choices(self, choices: OwnChoices) -> None:
+        """Read choices as the env gives them from here on, not as one-hot vectors.
+
+        Args:
+            choices: what converts an entry, by entry.
+        """
+        self.choices = choices
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
@@ -97,6 +106,7 @@ class PerRow(TensorDictModuleBase):
             entry = flat[key]
             if is_tensor_collection(entry):
                 raise ForeignError(_parts_of(key, entry))
+            entry = self.choices[key](entry) if key in self.choices else entry
             columns.append(entry.cpu().numpy().copy())
         observations = zip(*columns, strict=True)
         actions: list[NDArray[Any]] = []
@@ -248,6 +258,15 @@ class ControllerGuide(TensorDictModuleBase):
         if hasattr(self.guide, "in_space"):
             self.guide.in_space(space)
 
+    def reads_choices(self, choices: OwnChoices) -> None:
+        """Let the controller read choices as the env gives them, unless it is a module.
+
+        Args:
+            choices: what converts an entry, by entry.
+        """
+        if isinstance(self.guide, (PerRow, FunctionGuide)):
+            self.guide.reads_choices(choices)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action; what the controller raises is a `ForeignError`."""
         with foreign(f"the controller {self.title}", "it"):
@@ -387,6 +406,8 @@ def _parts_of(key: NestedKey, entry: TensorDictBase) -> str:
 
 def _in_space(entry: NDArray[Any], space: Any) -> Any:
     """Return an entry as an observation of a Gymnasium space: choices are indices there."""
+    if space is not None and entry.shape == space.shape:
+        return entry
     if isinstance(space, spaces.Discrete):
         return int(entry.argmax()) + int(space.start)
     if isinstance(space, spaces.MultiDiscrete):

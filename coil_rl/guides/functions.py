@@ -13,7 +13,7 @@ from torch import Tensor
 
 from coil_rl.envs.gate import ForeignError, action_array, foreign, shown
 from coil_rl.guides.shared import SharedCheck
-from coil_rl.transforms.action_space import ActionSpace, nested_key
+from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key
 
 # Factor and offset of a row, and of two others that a function for a batch must not mix with it:
 # one of its size, and one beyond all limits of a sum or a maximum.
@@ -27,10 +27,11 @@ class FunctionGuide(TensorDictModuleBase):
     It gets the observations of all rows at once, or of one row after the other.
 
     A function for a batch gets tensors [B, N] and returns actions [B, A]. One for a single
-    observation gets NumPy arrays [N] and returns an action [A], a number or an index. Which of the
-    two it is, is found out at its first call: it is for a batch if it gives the same for a row
-    beside quite other ones as for the row alone, in the form of actions, or if it cannot take a row
-    alone. A function that remembers something would mix the rows: `SharedCheck` finds it.
+    observation gets NumPy arrays [N] and returns an action [A], a number or an index. Choices are
+    in the numbering of the env, as a Gymnasium env gives them. Which of the two it is, is found out
+    at its first call: it is for a batch if it gives the same for a row beside quite other ones as
+    for the row alone, in the form of actions, or if it cannot take a row alone. A function that
+    remembers something would mix the rows: `SharedCheck` finds it.
 
     Args:
         function: takes one value for each of `in_keys`; it must give the same action for the same
@@ -58,11 +59,20 @@ class FunctionGuide(TensorDictModuleBase):
         self.title = title or getattr(function, "__name__", type(function).__name__)
         self.for_batch: bool | None = None  # unknown before the first call
         self.space: ActionSpace | None = None  # unknown outside of an env
+        self.choices: OwnChoices = {}
         self.shared = SharedCheck(self.title)
 
     def in_space(self, space: ActionSpace) -> None:
         """Take the space of the actions of an env, which decides what has the form of actions."""
         self.space = space
+
+    def reads_choices(self, choices: OwnChoices) -> None:
+        """Read choices as the env gives them from here on, not as one-hot vectors.
+
+        Args:
+            choices: what converts an entry, by entry.
+        """
+        self.choices = choices
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
@@ -91,10 +101,15 @@ class FunctionGuide(TensorDictModuleBase):
         flat = tensordict.select(*self.in_keys).reshape(-1)
         return [flat[key] for key in self.in_keys]
 
+    def _as_given(self, entries: Sequence[Tensor]) -> list[Tensor]:
+        """Return entries as the env gives them, [*batch, ...]."""
+        named = zip(self.in_keys, entries, strict=True)
+        return [self.choices[key](entry) if key in self.choices else entry for key, entry in named]
+
     def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
         """Return the actions for all rows."""
         with foreign(f"the controller {self.title}", "it"):
-            action = self.function(*(entry.clone() for entry in entries))
+            action = self.function(*(entry.clone() for entry in self._as_given(entries)))
         if isinstance(action, Tensor):
             return action  # checked on its device by `GuideActions`
         try:
@@ -115,7 +130,8 @@ class FunctionGuide(TensorDictModuleBase):
     def _alone(self, entries: Sequence[Tensor], row: int) -> NDArray[Any]:
         """Return the action for one row, as an array of at least one dimension."""
         with foreign(f"the controller {self.title} (row {row})", "it"):
-            action = self.function(*(entry[row].cpu().numpy().copy() for entry in entries))
+            alone = self._as_given([entry[row] for entry in entries])
+            action = self.function(*(entry.cpu().numpy().copy()[()] for entry in alone))
         try:
             return action_array(action)
         except ForeignError as error:
@@ -145,7 +161,8 @@ class FunctionGuide(TensorDictModuleBase):
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of NumPy, which gets tensors here
-            together = torch.as_tensor(self.function(*(entry[order] for entry in rows)))
+            entries = self._as_given([entry[order] for entry in rows])
+            together = torch.as_tensor(self.function(*entries))
         if together.numel() != alone.numel() or not self._has_form(together, alone):
             return False
         difference = (together.cpu().reshape(alone.shape) - alone[order]).abs()

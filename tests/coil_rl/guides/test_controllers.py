@@ -380,3 +380,73 @@ def test_file_without_actions_is_refused(text, message, tmp_path):
         file.write_text(text)
     with pytest.raises(ValueError, match=message):
         RecordedGuide(file)
+
+
+class Shelf(gymnasium.Env):
+    """Choices to observe, numbered as the env numbers them."""
+
+    action_space = spaces.Box(-9.0, 9.0, (2,))
+
+    def __init__(self, observation_space):
+        self.observation_space = observation_space
+        self.seen = []  # what it returned
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observe(), {}
+
+    def step(self, action):
+        return self.observe(), 0.0, False, False, {}
+
+    def observe(self):
+        self.seen.append(self.observation_space.sample())
+        return self.seen[-1]
+
+
+def first_two(numbers):
+    """Return two of the numbers of an observation, as an action."""
+    return np.resize(np.ravel(numbers), 2)
+
+
+class Reader:
+    def act(self, observation):
+        assert isinstance(observation, (np.ndarray, np.int64))
+        return first_two(observation)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Discrete(5, start=-2),
+        spaces.MultiDiscrete([7, 4], start=[-3, 1]),
+        spaces.MultiDiscrete([[3, 2], [2, 4]]),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize(
+    "controller",
+    [Reader, Reader(), first_two, lambda batch: batch.view(len(batch), -1)[:, [0, -1]]],
+    ids=["class", "object", "function", "batch"],
+)
+def test_controller_reads_choices_as_the_env_numbers_them(space, controller):
+    made = []
+
+    def make():
+        made.append(Shelf(space))
+        return made[-1]
+
+    env = GymnasiumEnv(make, num_envs=1)
+    advised = TransformedEnv(env, GuideActions({"reader": ControllerGuide(controller)}))
+    advice = advised.rollout(5)["guide_action"].reshape(-1, 2)
+    batched = not isinstance(controller, (type, Reader)) and controller is not first_two
+    seen = [np.ravel(each) for each in made[0].seen[-6:-1]]
+    expected = [each[[0, -1]] if batched else first_two(each) for each in seen]
+    assert np.array_equal(advice.numpy(), np.array(expected, np.float32))
+
+
+def test_network_reads_choices_as_one_hot_vectors():
+    env = GymnasiumEnv(partial(Shelf, spaces.MultiDiscrete([2, 3])), num_envs=2)
+    advised = TransformedEnv(env, GuideActions({"net": ControllerGuide(torch.nn.Linear(5, 2))}))
+    data = advised.rollout(3)
+    assert torch.equal(data["observation"].sum(-1), torch.full((2, 3), 2.0))
