@@ -1,10 +1,11 @@
 """Words of the command line that nothing reads: they would have no effect, and are refused."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.config.build import advises, env_maker, learner_kind, trains_guides
 from coil_rl.config.written import REFERENCE, covers, key_of, leaves
@@ -41,22 +42,82 @@ OF_A_TRAINING = (
 )
 
 
-def check_read(config: DictConfig, task: Iterable[str], *, shared: bool = False) -> None:
+class Job(NamedTuple):
+    """A run of a sweep, and all that differ from it by their seed only."""
+
+    words: Sequence[str]  # for the program, also those of the sweep
+    config: DictConfig  # composed
+
+
+def check_read(config: DictConfig, task: Iterable[str]) -> None:
     """Refuse a word of the command line that a run does not read.
 
     Args:
         config: of the run, composed and checked.
         task: words for the program.
-        shared: whether they may be meant for other runs too, as in a sweep over methods or envs:
-            what another one of these would read is accepted then.
 
     Raises:
         UserError: for the first word without an effect.
     """
-    reasons = Reasons(config, shared=shared)
+    for sentence in unread(config, task):
+        raise UserError(sentence)
+
+
+def unread(config: DictConfig, task: Iterable[str]) -> Iterator[str]:
+    """Yield a sentence for each word of the command line that a run does not read.
+
+    Args:
+        config: of the run, composed and checked.
+        task: words for the program.
+    """
+    reasons = Reasons(config)
     for text in task:
         if reason := reasons.of(key_of(text)):
-            raise UserError(f"{text} has no effect: {reason}")
+            yield f"{text} has no effect: {reason}"
+
+
+def check_sweep(task: Iterable[str], jobs: Sequence[Job]) -> list[str]:
+    """Refuse a word that no run of a sweep reads.
+
+    Args:
+        task: words for the program, those of the sweep as they were given.
+        jobs: all runs of the sweep.
+
+    Returns:
+        a sentence for each word that only some of the runs read.
+
+    Raises:
+        UserError: for the first word that none of them reads.
+    """
+    rules = [Reasons(job.config) for job in jobs]
+    sentences = []
+    for text in task:
+        reasons = [rule.of_unchecked(key_of(text)) for rule in rules]
+        unread = [job for job, reason in zip(jobs, reasons, strict=True) if reason]
+        if unread and len(unread) == len(jobs):
+            raise UserError(f"{text} has no effect in any run of this sweep: {reasons[0]}")
+        if unread:
+            read = [job for job, reason in zip(jobs, reasons, strict=True) if not reason]
+            sentences.append(
+                f"{text} has no effect in the runs with {_told_apart(unread, read)}; the others "
+                "read it"
+            )
+    return sentences
+
+
+def _told_apart(some: Sequence[Job], others: Sequence[Job]) -> str:
+    """Return the words by which some runs of a sweep differ from the others, in short."""
+    sets, other_sets = [
+        [{key_of(word): word for word in job.words} for job in group] for group in (some, others)
+    ]
+    for key in sets[0]:
+        words = list(dict.fromkeys(each[key] for each in sets))
+        if not {*words} & {each[key] for each in other_sets}:
+            values = [word.partition("=")[2] for word in words]
+            return f"{words[0].partition('=')[0]}={','.join(values)}"
+    common = {*some[0].words}.intersection(*(job.words for job in (*some, *others)))
+    each = [" ".join(word for word in job.words if word not in common) for job in some]
+    return "; ".join(each)
 
 
 class Reasons:
@@ -64,14 +125,17 @@ class Reasons:
 
     Args:
         config: of the run, composed and checked.
-        shared: as for `check_read`.
     """
 
-    def __init__(self, config: DictConfig, *, shared: bool) -> None:
+    def __init__(self, config: DictConfig) -> None:
         self.config, self.method = config, f"method={config.method.name}"
-        always = (self._of_proxies, self._of_tests, self._of_references)
         self.rules = (
-            always if shared else (*always, self._of_method, self._of_advice, self._of_noise)
+            self._of_proxies,
+            self._of_tests,
+            self._of_references,
+            self._of_method,
+            self._of_advice,
+            self._of_noise,
         )
 
     def of(self, key: str) -> str:
@@ -81,6 +145,17 @@ class Reasons:
             key: full key of a word.
         """
         return next(filter(None, (rule(key) for rule in self.rules)), "")
+
+    def of_unchecked(self, key: str) -> str:
+        """Return the same of a configuration that may be wrong; empty if its check refuses it.
+
+        Args:
+            key: full key of a word.
+        """
+        try:
+            return self.of(key)
+        except (UserError, OmegaConfBaseException):
+            return ""
 
     def _of_proxies(self, key: str) -> str:
         if not key.startswith("proxy.") or trains_guides(self.config):
