@@ -235,6 +235,7 @@ class ControllerGuide(TensorDictModuleBase):
         super().__init__()
         self.guide, self.pure = guide, getattr(_called(thing), "pure", False)
         self.title = title
+        self.space: ActionSpace | None = None  # unknown outside of an env
 
     @property
     def by_row(self) -> bool:
@@ -242,18 +243,26 @@ class ControllerGuide(TensorDictModuleBase):
         return isinstance(self.guide, PerRow)
 
     def in_space(self, space: ActionSpace) -> None:
-        """Tell the controller which actions the env has, if it asks for that.
+        """Take the space of the actions of an env, and tell the controller if it asks for that.
 
         Args:
             space: of the actions.
         """
+        self.space = space
         if hasattr(self.guide, "in_space"):
             self.guide.in_space(space)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action; what the controller raises is a `ForeignError`."""
+        """Write the action; what the controller raises is a `ForeignError`.
+
+        A function or a network may give one number for each row, as regressors predict it.
+        """
         with foreign(f"the controller {self.title}", "it"):
-            return self.guide(tensordict)
+            tensordict = self.guide(tensordict)
+        if self.space is not None and isinstance(self.guide, (FunctionGuide, NetworkGuide)):
+            action = self.space.as_column(tensordict["action"], tensordict.batch_size)
+            tensordict.set("action", action)
+        return tensordict
 
     def unfit(
         self, action: torch.Tensor, batch: torch.Size, space: ActionSpace, problem: str
