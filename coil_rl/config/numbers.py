@@ -29,8 +29,8 @@ from coil_rl.run.tuning import Number
 OTHERS = ("seed", "size")
 # Words of the annotation of a whole number, or of a list of such, besides int.
 AROUND_INT = frozenset(
-    "None Optional Union list List tuple Tuple Sequence typing collections abc".split()
-)
+    ["None", "Optional", "Union", "Sequence", "list", "List", "tuple", "Tuple"],
+).union(["typing", "collections", "abc"])
 
 
 def tuned_guide(config: DictConfig) -> tuple[str, dict[str, Any]]:

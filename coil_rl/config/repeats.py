@@ -2,9 +2,11 @@
 
 import random
 import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
+from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -20,12 +22,15 @@ from coil_rl.transforms import GuideActions
 
 STEPS = 10
 LONGEST = 0.1  # s, after which the check takes no further step
+LARGEST_SEED = 2**64  # of a person
 
 
 class Twins:
-    """Two objects of a controller that get the same observations, but other global random numbers.
+    """Two objects of a controller that get the same observations, but other random numbers.
 
-    It acts as the first of them. Those of torch are the same for both: a run seeds and saves them.
+    It acts as the first of them. Other are the global numbers, and those of NumPy's generators
+    without a seed in copies of one object, which would be as alike as the copies. Those of torch
+    are the same for both: a run seeds and saves them.
 
     Args:
         make: makes an object; called without arguments.
@@ -36,7 +41,13 @@ class Twins:
 
     def __init__(self, make: Callable[[], Any]) -> None:
         self.calls, self.differ = 0, False
-        self.objects = [self._answer(number, partial(_started, make)) for number in range(2)]
+        self.objects = [self._answer(number, make) for number in range(2)]
+        first, second = (dict(_unseeded(thing)) for thing in self.objects)
+        for number in second.keys() - first.keys():  # what both hold is no copy
+            second[number].state = type(second[number])().state
+        for number, thing in enumerate(self.objects):
+            if hasattr(thing, "reset"):
+                self._answer(number, thing.reset)
 
     def act(self, *observed: NDArray[Any]) -> Any:
         """Return the action of the first object.
@@ -62,12 +73,28 @@ class Twins:
         return ask()
 
 
-def _started(make: Callable[[], Any]) -> Any:
-    """Return an object at the start of an episode."""
-    thing = make()
-    if hasattr(thing, "reset"):
-        thing.reset()
-    return thing
+def _unseeded(thing: Any) -> Iterator[tuple[int, Any]]:
+    """Yield NumPy's generators in an object that were made without a seed, by their id.
+
+    Such a generator has 128 bits of the operating system for a seed.
+    """
+    seen, waiting = set[int](), [thing]
+    while waiting:
+        value = waiting.pop()
+        if id(value) in seen or isinstance(value, (type, ModuleType, FunctionType, float, str)):
+            continue
+        seen.add(id(value))
+        if isinstance(value, (np.random.Generator, np.random.RandomState)):
+            bits = getattr(value, "bit_generator", None) or value._bit_generator
+            entropy = getattr(bits.seed_seq, "entropy", None)
+            if isinstance(entropy, int) and entropy >= LARGEST_SEED:
+                yield id(bits), bits
+        elif isinstance(value, Mapping):
+            waiting.extend(value.values())
+        elif isinstance(value, (list, tuple, set, deque)):
+            waiting.extend(value)
+        elif hasattr(value, "__dict__"):
+            waiting.extend(vars(value).values())
 
 
 def draws_unseeded(guide: TensorDictModuleBase, env: EnvBase) -> str:

@@ -68,6 +68,32 @@ class Unseeded(Seeded):
         super().__init__(None)
 
 
+class Inside(Still):
+    """Controller whose generator is in a part of it, of the older kind."""
+
+    def __init__(self, seed=None):
+        super().__init__()
+        self.parts = {"noise": [np.random.RandomState(seed)]}
+
+    def draw(self):
+        return self.parts["noise"][0].randn()
+
+
+class OwnAtReset(Inside):
+    def reset(self):
+        self.past = super().draw()
+
+    def draw(self):
+        return 0.0
+
+
+class Unused(Unseeded):
+    """Controller with a generator that it does not use."""
+
+    def draw(self):
+        return 0.0
+
+
 class OfTorch(Still):
     def draw(self):
         return torch.randn(()).item()
@@ -82,13 +108,18 @@ def pendulum():
     return GymnasiumEnv("Pendulum-v1", first_seed=0)
 
 
-@pytest.mark.parametrize("of", [Global, Global(), Python, Late, AtReset, Unseeded])
+@pytest.mark.parametrize(
+    "of",
+    [Global, Global(), Python, Late, AtReset, Unseeded, Unseeded(), Inside, Inside(), OwnAtReset()],
+)
 def test_controller_that_draws_what_no_seed_reaches_is_found(of):
-    title = of.__name__ if isinstance(of, type) else "Global"
+    title = of.__name__ if isinstance(of, type) else type(of).__name__
     assert draws_unseeded(ControllerGuide(of), pendulum()) == title
 
 
-@pytest.mark.parametrize("of", [Still, Still(), Seeded, Seeded(3), OfTorch, Fails])
+@pytest.mark.parametrize(
+    "of", [Still, Still(), Seeded, Seeded(3), Inside(3), OwnAtReset(3), Unused(), OfTorch, Fails]
+)
 def test_controller_that_a_run_repeats_is_not_found(of):
     assert not draws_unseeded(ControllerGuide(of), pendulum())
 
@@ -130,3 +161,16 @@ def test_run_warns_once_of_a_controller_by_its_name(of, count, tmp_path):
     said = [str(each.message) for each in caught if "no seed of the run" in str(each.message)]
     assert len(said) == count
     assert all(f":{of.__name__} gives other actions" in text for text in said)
+
+
+def test_generator_that_all_objects_share_is_left_alone():
+    shared = np.random.default_rng()
+    before = shared.bit_generator.state
+
+    class Shares(Still):
+        def __init__(self):
+            super().__init__()
+            self.generator = shared
+
+    draws_unseeded(ControllerGuide(Shares), pendulum())
+    assert shared.bit_generator.state == before
