@@ -1,4 +1,5 @@
 import csv
+import math
 import re
 
 import pytest
@@ -277,6 +278,20 @@ def test_nan_in_a_loss_or_a_weight_stops_the_run_and_keeps_the_checkpoint(tmp_pa
         run.run()
     assert checkpoint.load(tmp_path / "run" / "checkpoint.pt")["updates"] == 2
     assert not (tmp_path / "run" / "policy_last.pt").exists()
+
+
+def test_update_without_a_minibatch_may_have_no_loss(tmp_path):
+    run = experiment(tmp_path / "run")
+    update = run.learner.update
+
+    def without_first(batch, progress):
+        loss = {"loss_critic": float("nan")} if run.updates == 0 else {}
+        return update(batch, progress) | loss | {"minibatches": float(run.updates)}
+
+    run.learner.update = without_first
+    rows = run.run()
+    known = [math.isfinite(row["learner/loss_critic"]) for row in rows[1:]]
+    assert known == [False] + [True] * (len(rows) - 2)
 
 
 ROWS = [
