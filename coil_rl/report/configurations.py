@@ -28,8 +28,8 @@ IRRELEVANT = (
     "evaluation.gif",
     "evaluation.pictures",
 )
-# Keys, or parents of keys, that runs have to share to be compared: task, test and frames.
-CONDITIONS = (
+# Keys, or parents of keys, of the test that a run ends with.
+TEST = (
     "env",
     "track",
     "disturb",
@@ -37,8 +37,9 @@ CONDITIONS = (
     "evaluation.env",
     "evaluation.disturb",
     "evaluation.first_seed",
-    "budget.frames",
 )
+# Those that runs have to share to be compared: task, test, what is observed, and frames.
+CONDITIONS = (*TEST, "evaluation.repeats", "observes", "budget.frames")
 BATCH = ("num_envs", "workers", "device")  # last parts of keys of an env that are no condition
 # Keys, or parents of keys, whose random numbers the drives of a guide depend on.
 OF_GUIDES = ("guide", "degrade", "disturb", "env", "evaluation")
@@ -228,6 +229,20 @@ def guide_follows_seed(runs: Sequence[Run]) -> bool:
         _follows_seed(key, [configuration.get(key) for configuration in configurations], runs)
         for key in keys
     )
+
+
+def of_guide(run: Run) -> dict[str, Any]:
+    """Return the values on which the returns of the guides of a run depend, by their full keys.
+
+    Args:
+        run: the run.
+    """
+    parts = ("guide", "degrade", *TEST)
+    return {
+        key: value
+        for key, value in relevant(run).items()
+        if _is_part(key, parts) and key.rpartition(".")[2] not in BATCH
+    }
 
 
 def _is_part(key: str, of: Sequence[str]) -> bool:
