@@ -10,6 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 from coil_rl.config.build import advises, env_maker, learner_kind, trains_guides
 from coil_rl.config.written import REFERENCE, covers, key_of, leaves
 from coil_rl.errors import UserError
+from coil_rl.report.configurations import is_part
 
 # Keys that other values refer to, and that nothing else reads.
 REFERRED = (
@@ -168,14 +169,14 @@ class Reasons:
     def _of_tests(self, key: str) -> str:
         anchored = OmegaConf.select(self.config, "learner.anchor") is not None
         tests = anchored or self.config.method.search or self.config.delivery == "tested"
-        if tests or not _inside(key, ["training.tests"]):
+        if tests or not is_part(key, ["training.tests"]):
             return ""
         return (
             "this run compares no policies while it trains; leave it out, or give delivery=tested"
         )
 
     def _of_references(self, key: str) -> str:
-        if not _inside(key, REFERRED) or _touches(key, self.references):
+        if not is_part(key, REFERRED) or _touches(key, self.references):
             return ""
         return f"nothing in this run reads {key}; leave it out"
 
@@ -184,13 +185,13 @@ class Reasons:
         if has_agent and not self.config.method.search:
             return ""
         unread = OF_A_LEARNER if has_agent else OF_A_TRAINING
-        if not _inside(key, unread) or _touches(key, self._references_beside(unread)):
+        if not is_part(key, unread) or _touches(key, self._references_beside(unread)):
             return ""
         what = "tunes its guide and has no learner" if has_agent else "trains nothing"
         return f"{self.method} {what}; leave it out"
 
     def _of_advice(self, key: str) -> str:
-        if not _inside(key, ["evaluation.advice"]) or advises(self.config):
+        if not is_part(key, ["evaluation.advice"]) or advises(self.config):
             return ""
         return f"{self.method} gives the agent no advice that could be degraded; leave it out"
 
@@ -217,16 +218,11 @@ class Reasons:
         values: Any = OmegaConf.to_container(self.config, resolve=False)
         found: set[str] = set()
         for key, value in leaves(values, ""):
-            if unread and (_inside(key, unread) or key == "env.num_envs"):
+            if unread and (is_part(key, unread) or key == "env.num_envs"):
                 continue
             if isinstance(value, (str, list)):
                 found |= {name for name in REFERENCE.findall(str(value)) if name != key}
         return found
-
-
-def _inside(key: str, others: Iterable[str]) -> bool:
-    """Return whether a key is one of some others, or inside one."""
-    return any(f"{key}.".startswith(f"{other}.") for other in others)
 
 
 def _touches(key: str, others: Iterable[str]) -> bool:
