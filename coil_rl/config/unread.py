@@ -2,13 +2,13 @@
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.config.build import advises, env_maker, learner_kind, trains_guides
-from coil_rl.config.written import REFERENCE, covers, key_of, leaves
+from coil_rl.config.written import REFERENCE, Job, covers, key_of, leaves
 from coil_rl.errors import UserError
 from coil_rl.report.configurations import is_part
 
@@ -41,13 +41,6 @@ OF_A_TRAINING = (
     *("observes", "action", "compile", "evaluation.curve", "evaluation.guides"),
     *("evaluation.repeats", "evaluation.policy"),
 )
-
-
-class Job(NamedTuple):
-    """A run of a sweep, and all that differ from it by their seed only."""
-
-    words: Sequence[str]  # for the program, also those of the sweep
-    config: DictConfig  # composed
 
 
 def check_read(config: DictConfig, task: Iterable[str]) -> None:

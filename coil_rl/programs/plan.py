@@ -4,7 +4,7 @@ import contextlib
 import statistics
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
@@ -17,13 +17,10 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.written import keep_written
+from coil_rl.config.written import Job, keep_written
 from coil_rl.errors import UserError
 from coil_rl.output import say
 from coil_rl.programs.app import refuse
-
-if TYPE_CHECKING:
-    from coil_rl.config.unread import Job  # which imports torch
 
 TIMED = 5.0  # s of training, at least, from which the time of a sweep is estimated
 UPDATES = 8  # at least
@@ -117,13 +114,11 @@ def knows_all_runs(sweeper: DictConfig) -> bool:
     return str(sweeper.get("_target_")).endswith(BasicSweeper.__name__)
 
 
-def _planned(config: DictConfig) -> "Iterator[Job]":
+def _planned(config: DictConfig) -> Iterator[Job]:
     """Yield each run of a sweep, if Hydra's own sweeper makes it.
 
     Runs that differ by their seed only are composed once.
     """
-    from coil_rl.config.unread import Job
-
     if not knows_all_runs(config.hydra.sweeper):
         return
     loader: Any = GlobalHydra.instance().config_loader()
@@ -151,14 +146,14 @@ def _composed(loader: Any, config: DictConfig, job: Sequence[str]) -> DictConfig
     return composed
 
 
-def _frames_of(job: "Job") -> int:
+def _frames_of(job: Job) -> int:
     """Return the frames of training of a run, 0 for a method without an agent."""
     return 0 if job.config.method.observes is None else int(job.config.budget.frames)
 
 
-def _check_words(config: DictConfig, runs: "Sequence[Job]") -> None:
+def _check_words(config: DictConfig, runs: Sequence[Job]) -> None:
     """Refuse a word that no run of a sweep reads, and say which ones only some of them read."""
-    from coil_rl.config.unread import check_sweep
+    from coil_rl.config.unread import check_sweep  # imports torch
 
     # A run that differs from another one by its seed only is the same object.
     different = list({id(run): run for run in runs}.values())

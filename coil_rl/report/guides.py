@@ -152,13 +152,15 @@ def of_guides_of_labels(runs: Sequence[Run]) -> list[str]:
             if others and not any(_share(results, theirs) for _, _, theirs in others):
                 differ.setdefault(name, []).append(f"{others[0][0]} / {label}")
             known.append((label, settings, results))
-    return [
-        f"The {name} has different returns in the same cases in runs of different labels, whose "
-        f"guide, env and cases have one configuration ({_some(labels, joint='; ')}): either the "
-        "env, the guide or what they use changed between these runs, and they are not to be "
-        "compared, or the guide or the env draws random numbers of its own."
-        for name, labels in differ.items()
-    ]
+    warnings = []
+    for name, labels in differ.items():
+        warnings.append(
+            f"The {name} has different returns in the same cases in runs of different labels, "
+            f"whose guide, env and cases have one configuration ({_some(labels, joint='; ')}): "
+            "either the env, the guide or what they use changed between these runs, and they are "
+            "not to be compared, or the guide or the env draws random numbers of its own."
+        )
+    return warnings
 
 
 def _in_same(results: Sequence[pd.DataFrame], others: Sequence[pd.DataFrame]) -> bool:
