@@ -249,6 +249,18 @@ class ActionSpace:
             return False
         return True
 
+    def as_column(self, action: Tensor, batch: torch.Size) -> Tensor:
+        """Return an action [*batch, 1] where a controller gave one number for each row, [*batch].
+
+        Anything else is returned as it is, and so is it where an action is more than one number.
+
+        Args:
+            action: of the controller.
+            batch: of the rows.
+        """
+        is_number = self.continuous and self.event.numel() == 1
+        return action.reshape(*batch, 1) if is_number and action.shape == batch else action
+
     def _check_one_hot(self, vectors: Tensor) -> None:
         """Raise a `ValueError` for vectors [..., A] without exactly one 1 for each choice."""
         chosen = torch.stack([part.sum(-1) for part in vectors.split(self.choices, -1)], -1)

@@ -3,6 +3,7 @@
 A mistake is found in seconds. Nothing is written except the folder of the run, as the last step.
 """
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterable
@@ -30,7 +31,7 @@ from coil_rl.config.nodes import build as build_node
 from coil_rl.config.nodes import build_all, check_node
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
 from coil_rl.config.pretrained import run_folder
-from coil_rl.config.repeats import draws_unseeded
+from coil_rl.config.repeats import Tried, tried
 from coil_rl.config.replay import check_recordings_to_leave_out, check_replay
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.values import check_values
@@ -41,6 +42,7 @@ from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.measures import measures_of
+from coil_rl.output import say
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
 from coil_rl.run.fallback import check_cases_of_guide, critic_beside_guide, no_effect
@@ -61,6 +63,9 @@ KINDS = {
 }
 EPISODE_REWARD = "episode_reward"  # written by a transform of every env
 WATCHED = ("episode", "step")  # groups of `watch`
+# What is said of a slow controller is about so many steps of an episode, and a curve of so many
+# policies at least.
+STEPS_SAID, POINTS_SAID = 100, 8
 
 
 def check(config: DictConfig) -> None:
@@ -201,7 +206,10 @@ def _check_env(
     for name, guide in guides.items():
         its_env = make_env.bare(1, TRAIN, None) if name in demonstrations else env
         check_guide_in_env(guide, its_env, f"guide.{name}")
-        _check_draws(guide, its_env)
+        found = tried(guide, its_env)
+        _check_draws(found)
+        if OmegaConf.get_type(config) is TrainConfig:
+            _say_cost_of_curve(config, found)
     build_all(config.degrade, "degrade")
     if build.build_disturbances(config, TEST):
         transformed(env, make_env.disturb(TEST), "disturb")
@@ -226,16 +234,36 @@ def _check_repeats(env: EnvBase) -> None:
         )
 
 
-def _check_draws(guide: TensorDictModuleBase, env: EnvBase) -> None:
+def _check_draws(found: Tried) -> None:
     """Warn if a controller acts by random numbers that no seed of the run reaches."""
-    title = draws_unseeded(guide, env)
-    if title:
+    if found.unseeded:
         warnings.warn(
-            f"the controller {title} gives other actions for the same observations from the same "
-            "start: it draws random numbers that no seed of the run reaches, from np.random, "
+            f"the controller {found.title} gives other actions for the same observations from the "
+            "same start: it draws random numbers that no seed of the run reaches, from np.random, "
             "random or a generator without a seed, so the run cannot be repeated or resumed to the "
             "bit; give it a generator of its own with a seed, such as np.random.default_rng(0)",
             stacklevel=2,
+        )
+
+
+def _say_cost_of_curve(config: DictConfig, found: Tried) -> None:
+    """Say how long the evaluation curve asks a slow controller, and how it takes less.
+
+    The number of policies in it is left to the user: if it followed a measured time, the same
+    command would make another run on a busier machine.
+    """
+    curve = config.evaluation.curve
+    asks = config.method.observes is not None and (config.method.search or build.advises(config))
+    sets = 1 if config.delivery == "tested" else len(curve.cases)
+    episodes = (curve.points + 1) * curve.num_envs * sets
+    minutes = STEPS_SAID * episodes * found.seconds / 60
+    if asks and curve.points >= POINTS_SAID and 1 <= minutes < math.inf:
+        say(
+            f"an action of the controller {found.title} takes {1000 * found.seconds:.1f} ms, so "
+            f"the evaluation curve takes {minutes:.0f} min for each {STEPS_SAID} steps of its "
+            f"{episodes} episodes ({curve.points + 1} policies); "
+            f"evaluation.curve.points={curve.points // 4} keeps fewer policies",
+            error=True,
         )
 
 

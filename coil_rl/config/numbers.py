@@ -8,6 +8,7 @@ arguments are those of that class or function.
 import copy
 import inspect
 import math
+import re
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,10 @@ from coil_rl.run.tuning import Number
 
 # Arguments of the parts of this project that are no numbers of a controller.
 OTHERS = ("seed", "size")
+# Words of the annotation of a whole number, or of a list of such, besides int.
+AROUND_INT = frozenset(
+    ["None", "Optional", "Union", "Sequence", "list", "List", "tuple", "Tuple"],
+).union(["typing", "collections", "abc"])
 
 
 def tuned_guide(config: DictConfig) -> tuple[str, dict[str, Any]]:
@@ -132,11 +137,11 @@ def numbers_of(node: Mapping[str, Any], name: str) -> dict[str, tuple[float, boo
         if key in OTHERS and not is_foreign(target):
             continue
         value = arguments.get(key, parameter.default)
-        whole = parameter.annotation in (int, "int")
+        whole = _is_whole(parameter.annotation)
         if _is_number(value):
             found[key] = float(value), whole
         elif isinstance(value, (list, tuple)) and value and all(map(_is_number, value)):
-            found |= {f"{key}.{index}": (float(each), False) for index, each in enumerate(value)}
+            found |= {f"{key}.{index}": (float(each), whole) for index, each in enumerate(value)}
     return found
 
 
@@ -153,8 +158,7 @@ def with_numbers(node: Mapping[str, Any], name: str, values: Mapping[str, float]
     parameters = _parameters(target)
     for key, value in values.items():
         argument, _, index = key.partition(".")
-        whole = parameters[argument].annotation in (int, "int")
-        number = round(value) if whole else value
+        number = round(value) if _is_whole(parameters[argument].annotation) else value
         if not index:
             arguments[argument] = number
             continue
@@ -198,6 +202,12 @@ def _parameters(target: Any) -> Mapping[str, inspect.Parameter]:
         return inspect.signature(target).parameters
     except (TypeError, ValueError):
         return {}
+
+
+def _is_whole(annotation: Any) -> bool:
+    """Return whether an annotation is of whole numbers, such as `int | None` or `list[int]`."""
+    text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    return {*re.findall(r"\w+", text)} - AROUND_INT == {"int"}
 
 
 def _is_number(value: Any) -> bool:

@@ -9,7 +9,7 @@ somebody else than coil-rl is put into its place again, unless the command line 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
@@ -38,6 +38,13 @@ class Written:
     value: Any
     file: str
     files: frozenset[str]
+
+
+class Job(NamedTuple):
+    """A run of a sweep, and all that differ from it by their seed only."""
+
+    words: Sequence[str]  # for the program, also those of the sweep
+    config: DictConfig  # composed
 
 
 def keep_written(

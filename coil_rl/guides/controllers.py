@@ -31,7 +31,7 @@ from coil_rl.envs.gate import ForeignError, Predictor, action_array, foreign, pr
 from coil_rl.errors import did_you_mean
 from coil_rl.files import LARGEST_TABLE, read_text
 from coil_rl.guides.functions import FunctionGuide
-from coil_rl.guides.networks import NetworkGuide, acts, maker_of_rows
+from coil_rl.guides.networks import NetworkGuide, acts, maker_of_rows, restore, state_of
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key, written_key
 
 # Other minus signs, as text programs write them: hyphens, the sign itself, and dashes.
@@ -46,8 +46,9 @@ class PerRow(TensorDictModuleBase):
     numbering of the env, as a Gymnasium env gives them. It returns an action: numbers, an index or
     a one-hot vector. `reset()`, if there is one, is called at the start of each episode; without it
     each episode gets a new object. Objects with `state_dict()` and `load_state_dict(state)` are
-    part of a checkpoint; without these, new episodes begin when a run is resumed. They are called
-    one after the other: a batched guide is many times faster.
+    part of a checkpoint, networks with their plain attributes; without these, new episodes begin
+    when a run is resumed. They are called one after the other: a batched guide is many times
+    faster.
 
     What an object raises, or returns that is no action, is a `ForeignError` with its row and step.
 
@@ -159,17 +160,19 @@ class PerRow(TensorDictModuleBase):
         return self.objects[row]
 
     def get_extra_state(self) -> dict[int, Any] | None:
-        """Return the states by row; None if an object has none.
+        """Return the states by row; None if an object has none, or one that cannot be saved.
 
         A state that cannot be saved is a `ValueError`.
         """
         names = ("state_dict", "load_state_dict")
         if not all(hasattr(thing, name) for thing in self.objects.values() for name in names):
             return None
-        states = {}
+        states: dict[int, Any] = {}
         for row, thing in self.objects.items():
             with foreign(self._place(row), "state_dict"):
-                states[row] = thing.state_dict()
+                states[row] = state_of(thing, self.make)
+        if None in states.values():
+            return None
         file = io.BytesIO()
         torch.save(states, file)
         file.seek(0)
@@ -186,8 +189,8 @@ class PerRow(TensorDictModuleBase):
         self.continues = state is not None
         if state is None:
             warnings.warn(
-                f"the controller {self.title} has no state_dict() and load_state_dict(state), so "
-                "new episodes begin",
+                f"the controller {self.title} has no state_dict() and load_state_dict(state) for "
+                "all that it remembers, so new episodes begin",
                 stacklevel=2,
             )
             state = {}
@@ -195,7 +198,7 @@ class PerRow(TensorDictModuleBase):
         self.objects = {row: self.make() for row in state}
         for row, thing in self.objects.items():
             with foreign(self._place(row), "load_state_dict"):
-                thing.load_state_dict(state[row])
+                restore(thing, state[row])
 
 
 class ControllerGuide(TensorDictModuleBase):
@@ -243,6 +246,7 @@ class ControllerGuide(TensorDictModuleBase):
         super().__init__()
         self.guide, self.pure = guide, getattr(_called(thing), "pure", False)
         self.title = title
+        self.space: ActionSpace | None = None  # unknown outside of an env
 
     @property
     def by_row(self) -> bool:
@@ -250,11 +254,12 @@ class ControllerGuide(TensorDictModuleBase):
         return isinstance(self.guide, PerRow)
 
     def in_space(self, space: ActionSpace) -> None:
-        """Tell the controller which actions the env has, if it asks for that.
+        """Take the space of the actions of an env, and tell the controller if it asks for that.
 
         Args:
             space: of the actions.
         """
+        self.space = space
         if hasattr(self.guide, "in_space"):
             self.guide.in_space(space)
 
@@ -268,9 +273,16 @@ class ControllerGuide(TensorDictModuleBase):
             self.guide.reads_choices(choices)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action; what the controller raises is a `ForeignError`."""
+        """Write the action; what the controller raises is a `ForeignError`.
+
+        A function or a network may give one number for each row, as regressors predict it.
+        """
         with foreign(f"the controller {self.title}", "it"):
-            return self.guide(tensordict)
+            tensordict = self.guide(tensordict)
+        if self.space is not None and isinstance(self.guide, (FunctionGuide, NetworkGuide)):
+            action = self.space.as_column(tensordict["action"], tensordict.batch_size)
+            tensordict.set("action", action)
+        return tensordict
 
     def unfit(
         self, action: torch.Tensor, batch: torch.Size, space: ActionSpace, problem: str

@@ -5,6 +5,7 @@ Q(s, a) is moved towards y = r + gamma * Q'(s', argmax_b Q(s', b)), or y = r whe
 terminated. Q' is a target network that follows Q slowly. The policy is epsilon-greedy.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -167,7 +168,7 @@ class DQN(OffPolicy):
 
         Returns:
             The metrics of `OffPolicy`; `value`, the mean value of the best action in the last
-            minibatch, 0 before learning starts; and `epsilon`.
+            minibatch, NaN without one; and `epsilon`.
         """
         metrics = super().update(batch, progress)
         epsilon = self.epsilon(progress)
@@ -179,9 +180,9 @@ class DQN(OffPolicy):
 
     @torch.no_grad()
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
-        """Return the mean value of the best action, 0 before learning starts."""
+        """Return the mean value of the best action in the last minibatch, NaN without one."""
         if minibatch is None:
-            return {"value": 0.0}
+            return {"value": math.nan}
         return {"value": float(self.network(minibatch)["chosen_action_value"].mean())}
 
 

@@ -1,5 +1,6 @@
 """Off-policy learning with a replay buffer, the base class of `DQN` and `SAC`."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
@@ -207,9 +208,9 @@ class OffPolicy(Stateful, Learner):
             progress: of the run, in [0, 1], for the schedules.
 
         Returns:
-            Means over the minibatches of the `reported` values, 0 before learning starts; the
-            number of `minibatches`; the number of stored steps (`kept`); the learning rate; the
-            values of `describe`; and the metrics of the extensions.
+            Means over the minibatches of the `reported` values, NaN without any, as before learning
+            starts; the number of `minibatches`; the number of stored steps (`kept`); the learning
+            rate; the values of `describe`; and the metrics of the extensions.
         """
         self.store(batch)
         self.gradient.begin(progress)
@@ -217,7 +218,7 @@ class OffPolicy(Stateful, Learner):
         for minibatch in self.samples():
             reports.append(self.gradient(minibatch, weights))
         means = self.gradient.means(reports) if reports else {}
-        metrics = {name: means.get(name, 0.0) for name in self.reported}
+        metrics = {name: means.get(name, math.nan) for name in self.reported}
         metrics |= self.describe(minibatch) | {
             "minibatches": float(len(reports)),
             "compiled": float(self.gradient.compile is True),
@@ -301,7 +302,7 @@ class OffPolicy(Stateful, Learner):
         return start_tests(self.anchor, self.policy, cases)
 
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
-        """Return further metrics of the last minibatch, which is None before learning starts."""
+        """Return further metrics of the last minibatch, which is None if there is none."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:

@@ -11,6 +11,7 @@ With many critics, y has the minimum over a random few of them, and the policy m
 minibatch (Ball et al. 2023).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -230,9 +231,9 @@ class SAC(OffPolicy):
 
     @torch.no_grad()
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
-        """Return the mean uncertainty about the last minibatch, 0 before learning starts."""
+        """Return the mean uncertainty about the last minibatch, NaN without one."""
         if not self.writes_uncertainty:
             return {}
         if minibatch is None:
-            return {"uncertainty": 0.0}
+            return {"uncertainty": math.nan}
         return {"uncertainty": float(self.critics.values(minibatch).std(0).mean())}

@@ -1,4 +1,4 @@
-"""What a sweep is going to do: the number of its runs, their frames, and the time they take."""
+"""What a sweep is going to do: its runs, their frames and time, and the words that they read."""
 
 import contextlib
 import statistics
@@ -17,7 +17,7 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.written import keep_written
+from coil_rl.config.written import Job, keep_written
 from coil_rl.errors import UserError
 from coil_rl.output import say
 from coil_rl.programs.app import refuse
@@ -47,17 +47,21 @@ class Plan(Callback):
         self._check(config)
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Refuse an env that the experiment is not made for, and say how many runs there are."""
+        """Refuse what the runs cannot use, and say how many there are and what some do not read."""
         _frames.clear()
         _said.clear()
         if "existing" not in config:  # the jobs are no runs
             return
         self._check(config)
+        runs: list[Job] = []
         # Hydra raises the errors of the composition next.
         with contextlib.suppress(HydraException, OmegaConfBaseException, UserError):
-            _frames.extend(_planned(config))
+            runs.extend(_planned(config))
+        _frames.extend(map(_frames_of, runs))
         if len(_frames) > 1:
             say(described(_frames), error=True)
+        if runs:
+            _check_words(config, runs)
 
     def _check(self, config: DictConfig) -> None:
         target = OmegaConf.select(config, "env._target_", throw_on_missing=False)
@@ -101,33 +105,64 @@ def described(frames: Sequence[int]) -> str:
     )
 
 
-def _planned(config: DictConfig) -> Iterator[int]:
-    """Yield the frames of training of each run of a sweep, if Hydra's own sweeper makes it.
+def knows_all_runs(sweeper: DictConfig) -> bool:
+    """Return whether a sweeper makes all combinations, so that the runs of a sweep are known.
+
+    Args:
+        sweeper: the node of Hydra.
+    """
+    return str(sweeper.get("_target_")).endswith(BasicSweeper.__name__)
+
+
+def _planned(config: DictConfig) -> Iterator[Job]:
+    """Yield each run of a sweep, if Hydra's own sweeper makes it.
 
     Runs that differ by their seed only are composed once.
     """
-    sweeper = config.hydra.sweeper
-    if not str(sweeper.get("_target_")).endswith(BasicSweeper.__name__):
+    if not knows_all_runs(config.hydra.sweeper):
         return
     loader: Any = GlobalHydra.instance().config_loader()
-    words = [f"{key}={value}" for key, value in (sweeper.get("params") or {}).items()]
     parser = OverridesParser.create(config_loader=loader)
-    overrides = parser.parse_overrides([*words, *_plain(config, "task")])
-    [jobs] = BasicSweeper.split_arguments(overrides, None)
-    known: dict[tuple[str, ...], int] = {}
+    [jobs] = BasicSweeper.split_arguments(parser.parse_overrides(_words(config)), None)
+    known: dict[tuple[str, ...], Job] = {}
     for job in jobs:
         key = tuple(word for word in job if not word.startswith("seed="))
         if key not in known:
-            known[key] = _frames_of(loader, config, job)
+            known[key] = Job(key, _composed(loader, config, job))
         yield known[key]
 
 
-def _frames_of(loader: Any, config: DictConfig, job: Sequence[str]) -> int:
-    """Return the frames of training of a job of a sweep, 0 for a method without an agent."""
-    composed = loader.load_sweep_config(config, list(job))
+def _words(config: DictConfig) -> list[str]:
+    """Return the words of a sweep for the program, those of its experiment first."""
+    params = config.hydra.sweeper.get("params") or {}
+    return [*(f"{key}={value}" for key, value in params.items()), *_plain(config, "task")]
+
+
+def _composed(loader: Any, config: DictConfig, job: Sequence[str]) -> DictConfig:
+    """Return the configuration of a job of a sweep."""
+    composed: DictConfig = loader.load_sweep_config(config, list(job))
     name = str(config.hydra.job.config_name)
     keep_written(composed, name, job, _plain(config, "hydra"))
-    return 0 if composed.method.observes is None else int(composed.budget.frames)
+    return composed
+
+
+def _frames_of(job: Job) -> int:
+    """Return the frames of training of a run, 0 for a method without an agent."""
+    return 0 if job.config.method.observes is None else int(job.config.budget.frames)
+
+
+def _check_words(config: DictConfig, runs: Sequence[Job]) -> None:
+    """Refuse a word that no run of a sweep reads, and say which ones only some of them read."""
+    from coil_rl.config.unread import check_sweep  # imports torch
+
+    # A run that differs from another one by its seed only is the same object.
+    different = list({id(run): run for run in runs}.values())
+    try:
+        sentences = check_sweep(_words(config), different)
+    except UserError as error:
+        refuse(str(config.hydra.job.name), error)
+    for sentence in sentences:
+        say(sentence, error=True)
 
 
 def _plain(config: DictConfig, kind: str) -> list[str]:

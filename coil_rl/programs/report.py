@@ -42,7 +42,7 @@ def report(config: DictConfig) -> None:
         of_several_envs,
     )
     from coil_rl.report.figures import draw_report
-    from coil_rl.report.guides import of_changed_guides
+    from coil_rl.report.guides import of_changed_guides, of_guides_of_labels
     from coil_rl.report.html import Section, html_page
     from coil_rl.report.runs import failed_jobs, read_runs
     from coil_rl.run.stopping import resume_command
@@ -74,6 +74,7 @@ def report(config: DictConfig) -> None:
         *of_several_definitions(finished),
         *differences,
         *of_changed_guides(finished),
+        *of_guides_of_labels(finished),
         page.progress(len(finished), len(runs), failed_jobs(folders)),
     ]
     training = [*page.training(finished), *page.guide_training(finished)]

@@ -5,12 +5,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.config.pretrained import PREFIX
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
+from coil_rl.output import say
 from coil_rl.programs import app, folders, imported, plan
 
 # What may be given beside resume=FOLDER.
@@ -29,11 +31,20 @@ def train(config: DictConfig) -> float:
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in the configuration, or for what nothing reads."""
-    from coil_rl.config.unread import check_read
+    """Raise a `UserError` for the first mistake in the configuration, or for what nothing reads.
+
+    In a sweep a word may be meant for other runs. They are known to Hydra's own sweeper only, for
+    which `coil_rl.programs.plan` has compared them; for another one each run says what it ignores.
+    """
+    from coil_rl.config.unread import check_read, unread
 
     app.check_run(config)
-    check_read(config, app.typed().task, shared=app.Jobs.is_sweep())
+    words = app.typed().task
+    if not app.Jobs.is_sweep():
+        check_read(config, words)
+    elif not plan.knows_all_runs(HydraConfig.get().sweeper):
+        for sentence in unread(config, words):
+            say(f"{sentence}, if no other run of this sweep reads it", error=True)
 
 
 def resume(folder: Path, frames: int | None = None) -> float:

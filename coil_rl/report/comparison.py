@@ -223,10 +223,12 @@ class Comparison:
     Attributes:
         guides: the guides, best first.
         agents: the agents, best first, each followed by its variants with altered advice.
+        plain_because: why scores are rewards, not fractions of a guide's; empty if they are.
     """
 
     guides: tuple[Group, ...]
     agents: tuple[Group, ...]
+    plain_because: str = ""
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -359,12 +361,14 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
         UserError: if two runs have the same label and seed, or the same label and other cases.
     """
     finished = [run for run in runs if run.finished]
-    names = dict.fromkeys(run.label for run in finished)
-    labels = {label: _join_runs([run for run in finished if run.label == label]) for label in names}
+    labels = {
+        label: _join_runs([run for run in finished if run.label == label])
+        for label in dict.fromkeys(run.label for run in finished)
+    }
     measures = _definitions(finished)
     guides = _group_guides(labels, measures)
     unique = dict.fromkeys(chain.from_iterable(guides.values()))
-    references = _references(list(unique), finished)
+    references, plain_because = _references(list(unique), finished)
     normalised = {group: replace(group, reference=references.get(group.cases)) for group in unique}
     needs_guide = {run.label: run.needs_guide for run in reversed(finished)}
     agents: list[Group] = []
@@ -376,8 +380,8 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     # The first group of a name is the one with unaltered advice.
     best = {group.name: group.rank for group in reversed(agents)}
     agents.sort(key=lambda group: (best[group.name], group.name))
-    ranked = sorted(normalised.values(), key=lambda group: group.rank)
-    return Comparison(tuple(ranked), tuple(agents))
+    ranked = tuple(sorted(normalised.values(), key=lambda group: group.rank))
+    return Comparison(ranked, tuple(agents), plain_because)
 
 
 def _definitions(runs: Sequence[Run]) -> dict[str, Measure]:
@@ -421,31 +425,52 @@ def _variants(
     return variants
 
 
-def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str, ...], Array]:
-    """Return by cases the rewards of the best guide in each case.
+def _references(
+    guides: Sequence[Group], runs: Sequence[Run]
+) -> tuple[dict[tuple[str, ...], Array], str]:
+    """Return by cases the rewards of the best guide in each case that has such, see `_reference`.
 
-    In a case where it crashes or earns nothing, or next to nothing, its mean over the other cases
-    is taken: a ratio to such a reward would be all of a mean. The result is empty if a run was
-    evaluated in cases in which no guide earns anything, or in which each of them loses too much for
-    a ratio: scores of all runs are to be alike.
+    There are none if a run was evaluated in cases for which no guide has them: scores of all runs
+    are to be alike. The text says why, and is empty otherwise.
     """
     references: dict[tuple[str, ...], Array] = {}
+    reasons: dict[tuple[str, ...], str] = {}
     for guide in sorted(guides, key=lambda group: group.rank):
-        rewards = guide.by_seed("reward").mean()
-        earned, crashed = rewards[rewards > 0], rewards.iloc[:0]
-        if guide.has("crashed"):
-            crashed = rewards[(guide.by_seed("crashed") > 0).any()]
-            earned = earned.drop(crashed.index, errors="ignore")
-        if len(earned) > 1:
-            others = (earned.sum() - earned) / (len(earned) - 1)
-            earned = earned[earned >= NEXT_TO_NOTHING * others]
-        if len(earned) and not _loses(rewards, crashed, earned.mean()):
-            filled = rewards.where(rewards.index.isin(earned.index), earned.mean())
-            references.setdefault(guide.cases, filled.values)
+        reference = _reference(guide)
+        if isinstance(reference, str):
+            reasons.setdefault(guide.cases, reference)
+        else:
+            references.setdefault(guide.cases, reference)
     for run in runs:
-        if tuple(run.evaluation["case"].unique()) not in references:
-            return {}
-    return references
+        cases = tuple(run.evaluation["case"].unique())
+        if cases not in references:
+            no_guide = f"no guide was evaluated in the cases of {run.label}"
+            return {}, reasons.get(cases, no_guide)
+    return references, ""
+
+
+def _reference(guide: Group) -> Array | str:
+    """Return the rewards of a guide in each case that others are divided by, or why not.
+
+    In a case where it crashes or earns nothing, or next to nothing, its mean over the other cases
+    is taken: a ratio to such a reward would be all of a mean. There is none for a guide that earns
+    nothing in any case, or loses too much in one for a ratio.
+    """
+    rewards = guide.by_seed("reward").mean()
+    earned, crashed = rewards[rewards > 0], rewards.iloc[:0]
+    if guide.has("crashed"):
+        crashed = rewards[(guide.by_seed("crashed") > 0).any()]
+        earned = earned.drop(crashed.index, errors="ignore")
+    if len(earned) > 1:
+        others = (earned.sum() - earned) / (len(earned) - 1)
+        earned = earned[earned >= NEXT_TO_NOTHING * others]
+    if not len(earned):
+        return f"the {guide.name} earns nothing in any case"
+    if _loses(rewards, crashed, earned.mean()):
+        lost = f"{rewards.min():{return_format([rewards.min()])}} in {rewards.idxmin()}"
+        return f"the {guide.name} loses too much for a ratio, {lost}"
+    filled: Array = rewards.where(rewards.index.isin(earned.index), earned.mean()).to_numpy()
+    return filled
 
 
 def _loses(rewards: pd.Series, crashed: pd.Series, earned: float) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -28,8 +28,8 @@ IRRELEVANT = (
     "evaluation.gif",
     "evaluation.pictures",
 )
-# Keys, or parents of keys, that runs have to share to be compared: task, test and frames.
-CONDITIONS = (
+# Keys, or parents of keys, of the test that a run ends with.
+TEST = (
     "env",
     "track",
     "disturb",
@@ -37,8 +37,9 @@ CONDITIONS = (
     "evaluation.env",
     "evaluation.disturb",
     "evaluation.first_seed",
-    "budget.frames",
 )
+# Those that runs have to share to be compared: task, test, what is observed, and frames.
+CONDITIONS = (*TEST, "evaluation.repeats", "observes", "budget.frames")
 BATCH = ("num_envs", "workers", "device")  # last parts of keys of an env that are no condition
 # Keys, or parents of keys, whose random numbers the drives of a guide depend on.
 OF_GUIDES = ("guide", "degrade", "disturb", "env", "evaluation")
@@ -131,7 +132,7 @@ def of_several_conditions(runs: Sequence[Run]) -> list[str]:
 
 def _is_condition(key: str) -> bool:
     """Return whether runs are compared only if they have the same value of a key."""
-    return _is_part(key, CONDITIONS) and key.rpartition(".")[2] not in BATCH
+    return is_part(key, CONDITIONS) and key.rpartition(".")[2] not in BATCH
 
 
 def of_several_definitions(runs: Sequence[Run]) -> list[str]:
@@ -221,7 +222,7 @@ def guide_follows_seed(runs: Sequence[Run]) -> bool:
     if all(re.search(rf"seed{run.seed}(?!\d)", str(run.settings.get("guide"))) for run in runs):
         return True
     configurations = [relevant(run) for run in runs]
-    keys = [key for key in configurations[0] if _is_part(key, OF_GUIDES)]
+    keys = [key for key in configurations[0] if is_part(key, OF_GUIDES)]
     if any(configurations[0].get(key) is not None for key in CASE_SEEDS):
         keys = [key for key in keys if key != "env.seed"]
     return any(
@@ -230,9 +231,28 @@ def guide_follows_seed(runs: Sequence[Run]) -> bool:
     )
 
 
-def _is_part(key: str, of: Sequence[str]) -> bool:
-    """Return whether a key, or a parent of it, is one of some keys."""
-    return any(key == each or key.startswith(f"{each}.") for each in of)
+def of_guide(run: Run) -> dict[str, Any]:
+    """Return the values on which the returns of the guides of a run depend, by their full keys.
+
+    Args:
+        run: the run.
+    """
+    parts = ("guide", "degrade", *TEST)
+    return {
+        key: value
+        for key, value in relevant(run).items()
+        if is_part(key, parts) and key.rpartition(".")[2] not in BATCH
+    }
+
+
+def is_part(key: str, of: Iterable[str]) -> bool:
+    """Return whether a key, or a parent of it, is one of some keys.
+
+    Args:
+        key: full key of a value.
+        of: full keys of values or groups.
+    """
+    return any(f"{key}.".startswith(f"{each}.") for each in of)
 
 
 def relevant(run: Run) -> dict[str, Any]:

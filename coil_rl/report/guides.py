@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coil_rl.report.configurations import guide_follows_seed
+from coil_rl.report.configurations import guide_follows_seed, of_guide
 from coil_rl.report.runs import GUIDE, Run
 from coil_rl.report.statistics import Array
 
@@ -129,6 +129,51 @@ def of_changed_guides(runs: Sequence[Run]) -> list[str]:
     return warnings
 
 
+def of_guides_of_labels(runs: Sequence[Run]) -> list[str]:
+    """Return a warning for each guide that has other returns in runs of another label.
+
+    It is about guides with one configuration in the same cases. One that is known to depend on the
+    seed of the run is left out.
+
+    Args:
+        runs: finished runs; those of one label have one configuration.
+    """
+    first: dict[str, list[tuple[str, dict[str, Any], list[pd.DataFrame]]]] = {}
+    differ: dict[str, list[str]] = {}
+    for label in dict.fromkeys(run.label for run in runs):
+        of_label = [run for run in runs if run.label == label]
+        if guide_follows_seed(of_label):
+            continue
+        settings = of_guide(of_label[0])
+        for name, of_seeds in _by_seed(of_label).items():
+            results = _different(of_seeds.values())
+            known = first.setdefault(name, [])
+            others = [each for each in known if each[1] == settings and _in_same(results, each[2])]
+            if others and not any(_share(results, theirs) for _, _, theirs in others):
+                differ.setdefault(name, []).append(f"{others[0][0]} / {label}")
+            known.append((label, settings, results))
+    warnings = []
+    for name, labels in differ.items():
+        warnings.append(
+            f"The {name} has different returns in the same cases in runs of different labels, "
+            f"whose guide, env and cases have one configuration ({_some(labels, joint='; ')}): "
+            "either the env, the guide or what they use changed between these runs, and they are "
+            "not to be compared, or the guide or the env draws random numbers of its own."
+        )
+    return warnings
+
+
+def _in_same(results: Sequence[pd.DataFrame], others: Sequence[pd.DataFrame]) -> bool:
+    """Return whether evaluations of two labels are in the same cases."""
+    return results[0]["case"].tolist() == others[0]["case"].tolist()
+
+
+def _share(results: Sequence[pd.DataFrame], others: Sequence[pd.DataFrame]) -> bool:
+    """Return whether the evaluations of one of two labels contain those of the other."""
+    pairs = ((results, others), (others, results))
+    return any(all(_contains(ours, each) for each in theirs) for theirs, ours in pairs)
+
+
 def _by_seed(runs: Sequence[Run]) -> dict[str, dict[int, pd.DataFrame]]:
     """Return the evaluations of each guide by the seed of the run."""
     of_guides: dict[str, dict[int, pd.DataFrame]] = {}
@@ -209,9 +254,6 @@ def _same_guide(
 ) -> Guide | None:
     """Return the first guide with a name whose results contain the given ones, or the reverse."""
     for guide in guides:
-        if guide.name != name:
-            continue
-        pairs = ((results, guide.results), (guide.results, results))
-        if any(all(_contains(ours, each) for each in theirs) for theirs, ours in pairs):
+        if guide.name == name and _share(results, guide.results):
             return guide
     return None

@@ -209,14 +209,17 @@ def notes(against: str | None, compared: Mapping[str, Comparison]) -> str:
         against: what the policies are compared with, see `Comparison.table`.
         compared: the policies, by kind of actions, such as "sampled".
     """
+    reasons = [comparison.plain_because for comparison in compared.values()]
     used = {
         "order": True,
         "normalised": any(comparison.normalised for comparison in compared.values()),
+        "plain": any(reasons),
         "against": against is not None,
         "sampled": "sampled" in compared,
     }
     text = " ".join(TABLES["drivers"]["notes"][key] for key in used if used[key])
-    return text.format(other=_other(against), seeds=SIGN_FLIP_SEEDS)
+    because = next(filter(None, reasons), "")
+    return text.format(other=_other(against), seeds=SIGN_FLIP_SEEDS, because=because)
 
 
 def unpaired(against: str | None, compared: Mapping[str, Comparison]) -> list[str]:

@@ -206,9 +206,11 @@ class Experiment:
             f"learner/{name}": value for name, value in self.learner.update(batch, progress).items()
         }
         self.updates += 1
+        # What is a mean over the minibatches has no number where there are none.
+        without = learned.get("learner/minibatches") == 0
         with self.resume_hint():
             for name, value in learned.items():
-                if not math.isfinite(value):
+                if not math.isfinite(value) and not (without and math.isnan(value)):
                     raise UserError(f"{name} is {value} in update {self.updates}")
         return {**row, **learned}
 

@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import resources
 
+import yaml
 from omegaconf import DictConfig
 from torchrl.envs import EnvBase
 
@@ -14,7 +16,6 @@ GUIDE, OPPOSITE, ZERO, RANDOM, NETWORK = "guide", "opposite", "zero", "random", 
 PPO, ANCHORED, RESIDUAL, SAC, TUNE = "ppo", "coil_anchored", "residual", "sac", "tune"
 SLOW_STEP = 1e-3  # s of an env step, from which SAC, which needs fewer steps, is tried too
 SHARE = 0.1  # of the budget, for each job
-STARTS = 5_000  # stored steps before SAC learns, if that is not more than half of the frames
 POINTS = 4  # kept policies of a training, besides the first one
 MOST_CURVE_CASES = 8
 # What a comparison decides itself, and the reason.
@@ -132,9 +133,15 @@ def job_of(given: Named, arm: Arm, seed: int, frames: int | None, short: Sequenc
         words = [word for word in words if key_of(word) != "budget.frames"]
         words.append(f"budget.frames={frames}")
         if arm.name == SAC and not any(key_of(word) == "learner.starts" for word in words):
-            words.append(f"learner.starts={min(STARTS, frames // 2)}")
+            words.append(f"learner.starts={min(_starts_of_sac(), frames // 2)}")
     words += [*short, *arm.words, f"label='{arm.name}'", f"seed={seed}"]
     nodes = dict(given.nodes)
     if arm.name != TUNE:
         nodes.pop("tune", None)
     return Named(words, nodes, shared=True)
+
+
+def _starts_of_sac() -> int:
+    """Return the number of stored steps before SAC learns, in its file."""
+    file = resources.files("coil_rl.conf") / "learner" / "sac.yaml"
+    return int(yaml.safe_load(file.read_text("utf-8"))["learner"]["starts"])

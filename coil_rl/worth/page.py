@@ -15,15 +15,17 @@ from matplotlib.ticker import EngFormatter
 
 from coil_rl.config.python import Named
 from coil_rl.config.written import key_of
+from coil_rl.learners.anchor import StartTest
 from coil_rl.report import markdown_table, style
 from coil_rl.report.curves import RETURNS, draw_guides, mean_curve, points
 from coil_rl.report.runs import RETURN, Run
 from coil_rl.report.table import AUTO_FORMAT, return_format
-from coil_rl.worth.arms import ARMS, TUNE
+from coil_rl.worth.arms import ANCHORED, ARMS, TUNE
 from coil_rl.worth.entry import Entry, difference
 from coil_rl.worth.outcome import Outcome
 from coil_rl.worth.verdict import Verdict
 
+FEW = 4  # cases of a start test, below which only a very large difference is certain
 COLUMNS = {
     "policy": ("policy", ""),
     "return": ("return", AUTO_FORMAT),
@@ -61,6 +63,8 @@ def page_of(verdict: Verdict, outcome: Outcome, delayed: str, measured: int, com
         f"opposite are those of their episodes here. {measured:,} further env steps measured these "
         "cases.",
     ]
+    if few := few_cases(outcome.runs.get(ANCHORED, ())):
+        parts += ["", few]
     if delayed:
         parts += ["", delayed]
     if command:
@@ -69,6 +73,25 @@ def page_of(verdict: Verdict, outcome: Outcome, delayed: str, measured: int, com
             lead = "To see whether a whole training changes that"
         parts += ["", f"{lead}: {command}"]
     return "\n".join(parts)
+
+
+def few_cases(runs: Sequence[Run]) -> str:
+    """Return the sentence about start tests that held no guide after few cases; empty for none.
+
+    Args:
+        runs: of anchored COIL.
+    """
+    *_, cases, weight = StartTest.names
+    firsts = [run.curve[0] for run in runs if run.curve]
+    few = [row[cases] for row in firsts if row.get(cases, np.nan) < FEW and not row[weight]]
+    if not few:
+        return ""
+    return (
+        f"The start test of {ANCHORED}, which decides whether a guide is held, had only "
+        f"{max(few):.0f} cases in the frames of a training here, and held none in {len(few)} of "
+        f"{len(runs)} seeds. So few cases do not show for sure that a guide is good, so that "
+        f"{ANCHORED} may be better in a whole training, whose test has more of them."
+    )
 
 
 def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> str:

@@ -1,5 +1,6 @@
 """The numbers of guides that `tune` names: which there are, and what is refused."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import pytest
@@ -61,6 +62,35 @@ def test_numbers_of_a_function_are_its_arguments_and_the_items_of_lists():
         "weights.2": (1.0, False),
         "weights.3": (0.5, False),
     }
+
+
+class Whole:
+    def __init__(
+        self,
+        window: int | None = 4,
+        delay: "Optional[int]" = 2,  # noqa: F821  as with annotations that are not evaluated
+        orders: list[int] = (1, 2),
+        lags: Sequence[int] | None = (3,),
+        gains: list[float] = (1, 2),
+        either: int | float = 1,
+        pair: tuple[int, float] = (1, 2.0),
+    ):
+        self.given = window, delay, orders, lags
+
+    def act(self, observation):
+        return [0.0]
+
+
+def test_whole_numbers_are_those_annotated_as_such_also_in_lists_and_unions():
+    node = CONTROLLER | {"of": f"{__name__}:Whole", "options": {}}
+    whole = ("window", "delay", "orders.0", "orders.1", "lags.0")
+    found = numbers_of(node, "guide.controller")
+    assert {name for name, (_, is_whole) in found.items() if is_whole} == {*whole}
+    assert found.keys() - whole == {"gains.0", "gains.1", "either", "pair.0", "pair.1"}
+    values = {"window": 5.6, "delay": 1.4, "orders.1": 6.7, "lags.0": 2.2}
+    tuned = build(with_numbers(node, "guide.controller", values), "guide.controller")
+    window, delay, orders, lags = tuned.guide.make().given
+    assert (window, delay, list(orders), list(lags)) == (6, 1, [1, 7], [2])
 
 
 def test_numbers_of_the_spline_guide_are_the_arguments_of_its_class():

@@ -1,6 +1,7 @@
 """Controllers that draw random numbers which no seed of a run reaches."""
 
 import random
+import time
 import warnings
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 
 from coil_rl.config.check import check_parts
 from coil_rl.config.python import composed, named
-from coil_rl.config.repeats import STEPS, draws_unseeded
+from coil_rl.config.repeats import STEPS, tried
 from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.guides.controllers import ControllerGuide
 
@@ -68,6 +69,32 @@ class Unseeded(Seeded):
         super().__init__(None)
 
 
+class Inside(Still):
+    """Controller whose generator is in a part of it, of the older kind."""
+
+    def __init__(self, seed=None):
+        super().__init__()
+        self.parts = {"noise": [np.random.RandomState(seed)]}
+
+    def draw(self):
+        return self.parts["noise"][0].randn()
+
+
+class OwnAtReset(Inside):
+    def reset(self):
+        self.past = super().draw()
+
+    def draw(self):
+        return 0.0
+
+
+class Unused(Unseeded):
+    """Controller with a generator that it does not use."""
+
+    def draw(self):
+        return 0.0
+
+
 class OfTorch(Still):
     def draw(self):
         return torch.randn(()).item()
@@ -82,22 +109,28 @@ def pendulum():
     return GymnasiumEnv("Pendulum-v1", first_seed=0)
 
 
-@pytest.mark.parametrize("of", [Global, Global(), Python, Late, AtReset, Unseeded])
+@pytest.mark.parametrize(
+    "of",
+    [Global, Global(), Python, Late, AtReset, Unseeded, Unseeded(), Inside, Inside(), OwnAtReset()],
+)
 def test_controller_that_draws_what_no_seed_reaches_is_found(of):
-    title = of.__name__ if isinstance(of, type) else "Global"
-    assert draws_unseeded(ControllerGuide(of), pendulum()) == title
+    found = tried(ControllerGuide(of), pendulum())
+    assert found.title == (of.__name__ if isinstance(of, type) else type(of).__name__)
+    assert found.unseeded
 
 
-@pytest.mark.parametrize("of", [Still, Still(), Seeded, Seeded(3), OfTorch, Fails])
+@pytest.mark.parametrize(
+    "of", [Still, Still(), Seeded, Seeded(3), Inside(3), OwnAtReset(3), Unused(), OfTorch, Fails]
+)
 def test_controller_that_a_run_repeats_is_not_found(of):
-    assert not draws_unseeded(ControllerGuide(of), pendulum())
+    assert not tried(ControllerGuide(of), pendulum()).unseeded
 
 
 def test_function_is_not_asked():
     def function(observation):
         raise AssertionError
 
-    assert not draws_unseeded(ControllerGuide(function), pendulum())
+    assert not tried(ControllerGuide(function), pendulum()).unseeded
 
 
 def test_global_random_numbers_go_on_as_without_the_check():
@@ -110,13 +143,13 @@ def test_global_random_numbers_go_on_as_without_the_check():
     seed()
     expected = drawn()
     seed()
-    assert draws_unseeded(ControllerGuide(Global), pendulum())
+    assert tried(ControllerGuide(Global), pendulum()).unseeded
     assert drawn() == expected
 
 
 def test_controller_is_asked_in_few_steps():
     Still.calls = 0
-    draws_unseeded(ControllerGuide(Still), pendulum())
+    tried(ControllerGuide(Still), pendulum())
     assert 0 < Still.calls <= 2 * (STEPS + 1)
 
 
@@ -130,3 +163,42 @@ def test_run_warns_once_of_a_controller_by_its_name(of, count, tmp_path):
     said = [str(each.message) for each in caught if "no seed of the run" in str(each.message)]
     assert len(said) == count
     assert all(f":{of.__name__} gives other actions" in text for text in said)
+
+
+def test_generator_that_all_objects_share_is_left_alone():
+    shared = np.random.default_rng()
+    before = shared.bit_generator.state
+
+    class Shares(Still):
+        def __init__(self):
+            super().__init__()
+            self.generator = shared
+
+    tried(ControllerGuide(Shares), pendulum())
+    assert shared.bit_generator.state == before
+
+
+class Slow(Still):
+    def draw(self):
+        time.sleep(0.005)
+        return 0.0
+
+
+@pytest.mark.parametrize(
+    ("of", "words", "said"),
+    [
+        (Slow, [], "so the evaluation curve takes"),
+        (Slow, ["evaluation.curve.points=4"], ""),
+        (Slow, ["method=ppo"], ""),
+        (Still, [], ""),
+    ],
+)
+def test_cost_of_a_slow_controller_in_the_curve_is_said(of, words, said, tmp_path, capsys):
+    given = named("Pendulum-v1", of, str(tmp_path))
+    given.words.extend(words)
+    check_parts(composed(given, tmp_path))
+    lines = [line for line in capsys.readouterr().err.splitlines() if "evaluation curve" in line]
+    assert len(lines) == bool(said)
+    for line in lines:
+        assert said in line
+        assert "340 episodes (17 policies); evaluation.curve.points=4 keeps fewer" in line

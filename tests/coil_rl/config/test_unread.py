@@ -5,7 +5,8 @@ from programs import called
 
 import coil_rl
 from coil_rl import UserError, compose_train
-from coil_rl.config.unread import check_read
+from coil_rl.config.unread import check_read, check_sweep
+from coil_rl.config.written import Job
 
 GUIDE = "method=guide trains nothing; leave it out"
 
@@ -49,10 +50,10 @@ def test_cases_of_comparisons_are_read_where_policies_are_compared(word):
     check_read(compose_train([word]), ["training.tests.starts=5"])
 
 
-def unread(*words, shared=False):
+def unread(*words):
     """Return the reason why the last of some words is not read; empty if it is."""
     try:
-        check_read(compose_train(list(words)), words[-1:], shared=shared)
+        check_read(compose_train(list(words)), words[-1:])
     except UserError as error:
         return str(error)
     return ""
@@ -101,13 +102,70 @@ def test_value_that_an_env_refers_to_is_read_by_a_guide_alone():
     assert "method=guide trains nothing" in unread("method=guide", "budget.steps=3")
 
 
+def swept(word, *runs):
+    """Return what is said before a sweep about a word that all of its runs get."""
+    jobs = [
+        Job((*run.split(), word), compose_train([*run.split(), word, "run_dir=run"]))
+        for run in runs
+    ]
+    return check_sweep([word], jobs)
+
+
 @pytest.mark.parametrize(
-    "word", ["budget.frames=100", "learner.gamma=0.9", "+degrade@evaluation.advice.zeroed=zeroed"]
+    ("word", "others", "readers"),
+    [
+        ("budget.frames=100", "guide", "coil"),
+        ("learner.gamma=0.9", "tune,guide", "ppo"),
+        ("training.tests.starts=5", "ppo,coil", "coil_anchored"),
+        ("proxy.seed=3", "ppo", "dynamic_coil_sequential"),
+        ("+degrade@evaluation.advice.zeroed=zeroed", "ppo,guide", "coil"),
+    ],
 )
-def test_word_that_another_method_of_a_sweep_reads_is_accepted(word):
-    assert unread("method=guide", word)
-    assert unread("method=guide", word, shared=True) == ""
-    assert unread("method=coil", word) == ""
+def test_word_that_some_runs_of_a_sweep_read_is_accepted_and_said_once(word, others, readers):
+    runs = [f"method={name}" for name in f"{others},{readers}".split(",")]
+    [said] = swept(word, *runs)
+    assert said == f"{word} has no effect in the runs with method={others}; the others read it"
+    assert swept(word, f"method={readers}") == []
+
+
+@pytest.mark.parametrize(
+    ("word", "runs"),
+    [
+        ("proxy.seed=3", ("method=ppo", "method=coil")),
+        ("learner.gamma=0.9", ("method=guide", "method=guide guide=zero")),
+        ("learner.gamma=0.9", ("method=guide", "method=tune")),
+        ("training.learning_rate=1", ("learner=sac", "learner=dqn action=choices")),
+    ],
+)
+def test_word_that_no_run_of_a_sweep_reads_is_refused(word, runs):
+    with pytest.raises(UserError, match="has no effect in any run of this sweep: ") as caught:
+        swept(word, *runs)
+    assert str(caught.value).startswith(f"{word} has no effect in any run")
+
+
+def test_runs_that_do_not_read_a_word_are_told_apart_by_all_that_differs_if_need_be():
+    word = "training.learning_rate=1"
+    assert swept(word, "learner=sac method=ppo", "learner=ppo method=ppo") == [
+        f"{word} has no effect in the runs with learner=sac; the others read it"
+    ]
+    runs = ["learner=sac method=ppo", "learner=ppo method=ppo", "learner=ppo method=guide"]
+    [said] = swept(word, *runs)
+    assert "in the runs with learner=sac method=ppo; learner=ppo method=guide; the" in said
+
+
+def test_sweep_says_before_its_first_run_what_runs_do_not_read(tmp_path):
+    words = ["-m", "method=guide,guide", "+experiment=placebo", "budget.frames=100"]
+    refused = called("train", *words, cwd=tmp_path, code=2)
+    sentence = "budget.frames=100 has no effect in any run of this sweep: method=guide trains noth"
+    assert sentence in refused.stderr
+    assert "#0" not in refused.stdout
+    assert not (tmp_path / "outputs").exists()
+    words = ["-m", "method=guide,ppo", "proxy.seed=3,4", "env.rate=0"]
+    refused = called("train", *words, cwd=tmp_path, code=2)
+    assert "proxy.seed=3,4 has no effect in any run of this sweep: method=guide" in refused.stderr
+    words = ["-m", "method=guide,ppo", "learner.gamma=0.9", "env.rate=0"]  # each run is refused
+    said = called("train", *words, cwd=tmp_path, code=2).stderr
+    assert said.count("learner.gamma=0.9 has no effect in the runs with method=guide; the oth") == 1
 
 
 def test_noise_is_read_where_actions_are_numbers():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from sklearn.linear_model import LinearRegression
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import TransformedEnv
@@ -96,6 +97,37 @@ def test_fault_of_a_function_is_one_sentence(id, answer, message):
         driven(ControllerGuide(answer), id)
     assert str(caught.value).startswith("the controller <lambda>")
     assert "\n" not in str(caught.value)
+
+
+class Squeezed(nn.Module):
+    def forward(self, observation):
+        return 2.0 * observation[..., 0]
+
+
+def predictor(targets):
+    x = np.eye(3)
+    return LinearRegression(fit_intercept=False).fit(x, 2.0 * x[:, :1].repeat(targets, 1)).predict
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [
+        LinearRegression(fit_intercept=False).fit(np.eye(3), [2.0, 0.0, 0.0]).predict,  # gives [B]
+        predictor(1),  # gives [B, 1]
+        Squeezed(),
+        lambda x: 2.0 * x[..., 0],
+    ],
+)
+def test_one_number_for_each_row_is_an_action_of_one_number(controller):
+    data = driven(ControllerGuide(controller), "Pendulum-v1")
+    expected = (2.0 * data["observation"][..., :1]).clamp(-2.0, 2.0)
+    torch.testing.assert_close(data["guide_action"][..., 0, :], expected)
+
+
+def test_numbers_that_are_not_one_for_each_row_are_refused():
+    for controller in (predictor(2), predictor(3)):
+        with pytest.raises(ForeignError, match="but must have"):
+            driven(ControllerGuide(controller), "Pendulum-v1")
 
 
 def test_action_is_checked_at_every_step():

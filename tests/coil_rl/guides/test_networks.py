@@ -1,5 +1,8 @@
 """Networks as guides: what acts is their `act`, if their class has one, else `forward`."""
 
+from collections import deque
+from types import SimpleNamespace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -95,3 +98,44 @@ def test_act_that_needs_more_is_refused_at_construction():
 def test_guides_are_in_evaluation_mode_from_the_start():
     network = nn.Sequential(nn.BatchNorm1d(1), nn.Dropout())
     assert not GuideActions({"theirs": ControllerGuide(network)}).guides.training
+
+
+class Remembering(nn.Module):
+    """Remembers in a part of its own, in ways that torch does not save."""
+
+    def __init__(self, memory):
+        super().__init__()
+        self.layer, self.part = nn.Linear(1, 1), nn.Identity()
+        self.part.memory, self.settings = memory, SimpleNamespace(gain=2.0)
+        self.register_buffer("sum", torch.zeros(1), persistent=False)
+
+    def act(self, observation):
+        self.sum += torch.as_tensor(observation)
+        self.part.memory = self.part.memory + type(self.part.memory)([float(self.sum)])
+        return self.layer(self.sum) + self.settings.gain * sum(self.part.memory)
+
+    def reset(self):
+        self.sum.zero_()
+        self.part.memory = type(self.part.memory)()
+
+
+def test_what_a_network_remembers_in_any_attribute_is_in_the_checkpoint(tmp_path):
+    network = Remembering([])
+    guide = ControllerGuide(network)
+    for step in range(3):
+        asked(guide, [0.5 + step, -1.0], first=step == 0)
+    torch.save(guide.state_dict(), tmp_path / "state.pt")
+    other = ControllerGuide(network)
+    other.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    assert other.guide.continues
+    for step in range(2):
+        expected = asked(guide, [3.0, step], first=False)
+        torch.testing.assert_close(asked(other, [3.0, step], first=False), expected, rtol=0, atol=0)
+
+
+def test_network_that_remembers_what_no_checkpoint_can_hold_begins_new_episodes():
+    guide = ControllerGuide(Remembering(deque()))
+    asked(guide, [0.5, -1.0], first=True)
+    with pytest.warns(UserWarning, match="for all that it remembers, so new episodes begin"):
+        guide.load_state_dict(guide.state_dict())
+    assert not guide.guide.continues

@@ -97,18 +97,19 @@ def test_scores_are_rewards_if_no_guide_earns_anything(tmp_path):
     )
     comparison = compare(read_runs([tmp_path]))
     assert not comparison.normalised
+    assert comparison.plain_because == "the guide earns nothing in any case"
     assert comparison.agents[0].score.mean == 550
 
 
 @pytest.mark.parametrize(
-    ("returns", "crashed"),
+    ("returns", "crashed", "worst"),
     [
-        ([0.01, -50.0, -60.0, -40.0, -55.0], [0, 0, 0, 0, 0]),
-        ([100.0, -2.0, 90.0], [0, 0, 0]),
-        ([10.0, -50.0, 12.0], [0, 1, 0]),
+        ([0.01, -50.0, -60.0, -40.0, -55.0], [0, 0, 0, 0, 0], "-60.0 in c"),
+        ([100.0, -2.0, 90.0], [0, 0, 0], "-2.00 in b"),
+        ([10.0, -50.0, 12.0], [0, 1, 0], "-50.0 in b"),
     ],
 )
-def test_scores_are_rewards_if_the_guide_loses_in_a_case(returns, crashed, tmp_path):
+def test_scores_are_rewards_if_the_guide_loses_in_a_case(returns, crashed, worst, tmp_path):
     guide = [
         row
         for case, reward, crash in zip("abcde", returns, crashed, strict=False)
@@ -118,6 +119,7 @@ def test_scores_are_rewards_if_the_guide_loses_in_a_case(returns, crashed, tmp_p
     make_run(tmp_path / "0", "agent", 0, guide + agent)
     comparison = compare(read_runs([tmp_path]))
     assert not comparison.normalised
+    assert comparison.plain_because == f"the guide loses too much for a ratio, {worst}"
     assert comparison.agents[0].score.mean == -40
     assert comparison.guides[0].score.mean == pytest.approx(sum(returns) / len(returns))
 

@@ -130,10 +130,13 @@ def test_only_the_policy_of_a_label_is_renamed(tmp_path):
         ({"env": {"kwargs": {"hard": True}}, "budget": {"frames": 3}}, "env.kwargs, budget.frames"),
         ({"disturb": {"late": {"steps": 1}}}, "disturb.late.steps"),
         ({"track": {"test": "hard"}}, "track.test"),
+        ({"evaluation": {"repeats": 5}}, "evaluation.repeats"),
+        ({"observes": ["observation", "task"]}, "observes"),
     ],
 )
 def test_runs_under_other_conditions_are_said(other, names, runs):
     base = {"env": {"id": "A", "kwargs": {}}, "budget": {"frames": 2}, "disturb": {}}
+    base |= {"observes": ["observation"]}
     read = runs(base | {"label": "a"}, base | {"label": "b"} | _inside(base, other))
     (sentence,) = of_several_conditions(read)
     assert all(name in sentence for name in names.split(", "))
@@ -142,7 +145,8 @@ def test_runs_under_other_conditions_are_said(other, names, runs):
 
 def _inside(base, other):
     """Return what changes in a configuration, with the rest of each group."""
-    return {key: base.get(key, {}) | value for key, value in other.items()}
+    groups = {key: base.get(key, {}) | value for key, value in other.items() if key != "observes"}
+    return other | groups
 
 
 def test_what_experiments_compare_is_no_other_condition(runs):

@@ -6,7 +6,7 @@ import pytest
 from run_folders import driven, make_run
 
 from coil_rl.report.configurations import guide_follows_seed
-from coil_rl.report.guides import of_changed_guides
+from coil_rl.report.guides import of_changed_guides, of_guides_of_labels
 from coil_rl.report.runs import read_runs
 
 
@@ -85,3 +85,32 @@ def test_seed_of_the_training_is_none_of_the_guide(runs, settings):
     found = runs({0: 1.0, 1: 2.0}, settings=settings)
     assert not guide_follows_seed(found)
     assert len(of_changed_guides(found)) == 1
+
+
+def test_guide_of_one_configuration_with_other_returns_in_another_label_is_said(runs):
+    runs({0: -14.0, 1: -14.0}, "coil")
+    assert of_guides_of_labels(runs({0: -14.000001, 2: -14.0}, "residual")) == []
+    (sentence,) = of_guides_of_labels(runs({0: -28.0, 1: -28.0}, "ppo"))
+    assert sentence.startswith("The guide has different returns in the same cases in runs of dif")
+    assert "(coil / ppo): either the env, the guide or what they use changed" in sentence
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"guide": {"spline": {"gain": 2.0}}},
+        {"degrade": {"noisy": {"sigma": 1.0}}},
+        {"env": {"rate": 10.5}},
+        {"evaluation": {"env": {"first_seed": 7}}},
+        {"method": {"learner": "guides", "needs_guide": True}},
+    ],
+)
+def test_guides_of_different_configurations_may_have_other_returns(runs, settings):
+    runs({0: -14.0, 1: -14.0}, "coil")
+    assert of_guides_of_labels(runs({0: -28.0}, "ppo", settings=lambda _: settings)) == []
+
+
+def test_batch_and_training_of_a_label_are_no_other_configuration_of_its_guide(runs):
+    settings = {"env": {"num_envs": 3}, "learner": {"gamma": 0.5}, "evaluation": {"repeats": 9}}
+    runs({0: -14.0, 1: -14.0}, "coil")
+    assert len(of_guides_of_labels(runs({0: -28.0}, "ppo", settings=lambda _: settings))) == 1

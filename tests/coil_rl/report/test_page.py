@@ -190,6 +190,16 @@ def test_all_policies_that_the_seeds_of_a_label_began_with_are_named():
     assert sentence.endswith("_seed2 and 2 more, whose frames are not among theirs.")
 
 
+def test_reason_of_plain_rewards_is_said(tmp_path):
+    make_run(tmp_path / "0", "ppo", 0, driven("ppo", {"a": 1.0, "b": 2.0}))
+    compared = {"deterministic": compare(read_runs([tmp_path]))}
+    sentence = "Means are rewards, not fractions of a guide's: no guide was evaluated in the cases "
+    assert f"{sentence}of ppo." in page.notes(None, compared)
+    make_sweep(tmp_path / "sweep")
+    compared = {"deterministic": compare(read_runs([tmp_path / "sweep"]))}
+    assert "Means are rewards" not in page.notes(None, compared)
+
+
 def test_empty_columns_and_many_cases_are_omitted(tmp_path):
     cases = {f"case_{k}": 1.0 * k for k in range(9)}
     make_run(tmp_path / "run", "coil", 0, driven("guide", cases) + driven("coil", cases))

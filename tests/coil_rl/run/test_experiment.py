@@ -1,11 +1,12 @@
 import csv
+import math
 import re
 
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.envs import Compose, RewardSum, Transform, TransformedEnv
-from torchrl.record.loggers import TensorboardLogger
+from torchrl.record.loggers import CSVLogger, TensorboardLogger
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
@@ -279,6 +280,20 @@ def test_nan_in_a_loss_or_a_weight_stops_the_run_and_keeps_the_checkpoint(tmp_pa
     assert not (tmp_path / "run" / "policy_last.pt").exists()
 
 
+def test_update_without_a_minibatch_may_have_no_loss(tmp_path):
+    run = experiment(tmp_path / "run")
+    update = run.learner.update
+
+    def without_first(batch, progress):
+        loss = {"loss_critic": float("nan")} if run.updates == 0 else {}
+        return update(batch, progress) | loss | {"minibatches": float(run.updates)}
+
+    run.learner.update = without_first
+    rows = run.run()
+    known = [math.isfinite(row["learner/loss_critic"]) for row in rows[1:]]
+    assert known == [False] + [True] * (len(rows) - 2)
+
+
 ROWS = [
     {"frames": 10 * update, "loss": 1 / update, "return": float("nan")} for update in range(1, 6)
 ]
@@ -341,3 +356,34 @@ def test_tensorboard_shows_no_point_twice(tmp_path, count):
     again.flush()
     points = EventAccumulator(str(tmp_path / "board")).Reload().Scalars("loss")
     assert [point.step for point in points] == [10, 20, 30, 40, 50]
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_files_of_the_csv_logger_have_no_line_twice(tmp_path, count):
+    def logger(name):
+        return CSVLogger("csv", str(tmp_path / name))
+
+    def filled(metrics):
+        metrics.fill({2: {"return": 7.0}})
+
+    whole = write_metrics(tmp_path / "whole.csv", ROWS, logger("whole"))
+    filled(whole)
+    first = logger("stopped")
+    metrics = write_metrics(tmp_path / "metrics.csv", ROWS, first)
+    if count:
+        filled(metrics)
+        first.log_scalar("return", 8.0, step=20)  # and killed before it is in the table
+    with (tmp_path / "stopped" / "csv" / "scalars" / "loss.csv").open("a") as file:
+        file.write("10,0.")
+    again = Metrics(tmp_path / "metrics.csv", logger("stopped"))
+    again.truncate(count)
+    for row in ROWS[count:]:
+        again.append(row)
+    if not count:
+        filled(again)
+    for name in ("frames", "loss", "return"):
+        ours, expected = (
+            (tmp_path / each / "csv" / "scalars" / f"{name}.csv").read_text()
+            for each in ("stopped", "whole")
+        )
+        assert ours == expected

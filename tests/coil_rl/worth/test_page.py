@@ -1,13 +1,15 @@
-"""The page of a comparison: the sentence about a delay, and the command to go on with."""
+"""The page of a comparison: its sentences, and the command to go on with."""
 
 import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from coil_rl.config.python import Named, compose_train
+from coil_rl.report.runs import Run
 from coil_rl.worth.entry import Entry
-from coil_rl.worth.page import command_of, delayed_sentence
+from coil_rl.worth.page import command_of, delayed_sentence, few_cases
 from coil_rl.worth.verdict import Verdict
 
 
@@ -43,3 +45,18 @@ def test_printed_command_has_the_values_of_the_comparison(word):
     expected = compose_train([*words, *place]).env.options.mode
     found = compose_train([*printed, "run_dir=unused"]).env.options.mode
     assert (type(found), found) == (type(expected), expected)
+
+
+def anchored(seed, **first):
+    curve = ({"frames": 400.0} | {f"start/{name}": value for name, value in first.items()},)
+    return Run(Path("run"), "coil_anchored", seed, needs_guide=True, settings={}, curve=curve)
+
+
+def test_start_test_of_few_cases_that_held_no_guide_is_said():
+    weak = anchored(0, cases=2.0, weight=0.0)
+    strong = anchored(1, cases=2.0, weight=1.0), anchored(2, cases=4.0, weight=0.0), anchored(3)
+    assert few_cases(strong) == few_cases(()) == ""
+    sentence = few_cases((*strong, weak))
+    assert (
+        "had only 2 cases in the frames of a training here, and held none in 1 of 4 s" in sentence
+    )
