@@ -123,7 +123,7 @@ class Row:
         if self.fineness is not None and self.fineness.unseen:
             self.fineness.see(np.asarray(self.reward))
         self.values = self.gate.read(self.observation, self.entries)
-        if not self.terminated:
+        if self.controllers and not self.terminated:
             self._advise()
 
     def _look_for_masks(self) -> None:
@@ -216,22 +216,18 @@ class Rows(RowsInTurn):
     def entries_of_rows(self) -> Entries:
         """Return the entries of all rows, [rows, ...], and their rewards."""
         rows, count = self.rows, len(self.rows)
-        ends = np.empty((2, count, 1), dtype=bool)
-        rewards = np.empty((count, 1), dtype=rows[0].dtype)
-        observed = [np.empty((count, *entry.given), entry.dtype) for entry in self.entries]
-        for number, row in enumerate(rows):
-            ends[0, number], ends[1, number] = row.terminated, row.truncated
-            rewards[number] = row.reward
-            for array, value in zip(observed, row.values, strict=True):
-                array[number] = value
+        terminated = np.array([[row.terminated] for row in rows])
+        truncated = np.array([[row.truncated] for row in rows])
         found: Entries = {
-            "terminated": ends[0],
-            "truncated": ends[1],
-            "done": ends[0] | ends[1],
-            "reward": rewards,
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+            "reward": np.array([[row.reward] for row in rows], dtype=rows[0].dtype),
         }
-        for entry, array in zip(self.entries, observed, strict=True):
-            found[entry.key if len(entry.key) > 1 else entry.key[0]] = array
+        for index, entry in enumerate(self.entries):
+            joined = np.concatenate([row.values[index] for row in rows])
+            key = entry.key if len(entry.key) > 1 else entry.key[0]
+            found[key] = joined.reshape(count, *entry.given)
         if self.unseen:
             self._look_for_info()
         for name in self.info:

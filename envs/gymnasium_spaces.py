@@ -30,6 +30,7 @@ WATCHED = 256  # first observations, in which the range of each number is found
 # A number whose range has fewer steps of its dtype than COARSE is rounded too much to act on; fewer
 # than STILL are the rounding of the env itself.
 COARSE, STILL = 100.0, 1e-6
+FEW = 16  # numbers
 
 
 class Fineness:
@@ -160,13 +161,15 @@ class Entry:
         if self.binary:
             self._check(value, (value == 0) | (value == 1))
         if value.dtype == self.dtype:
-            converted = value.copy().reshape(self.given)
+            converted = value.copy()
+            if converted.shape != self.given:
+                converted = converted.reshape(self.given)
         else:
             if self.fineness.unseen and not np.can_cast(value.dtype, self.dtype, "safe"):
                 self.fineness.see(value)
             with np.errstate(over="ignore"):
                 converted = value.astype(self.dtype).reshape(self.given)
-        if converted.dtype.kind == "f" and not np.isfinite(converted).all():
+        if converted.dtype.kind == "f" and not _are_finite(converted):
             wrong = float(value.reshape(-1)[~np.isfinite(converted.reshape(-1))][0])
             raise ForeignError(f"{self.title} holds {wrong}, not a finite number of {self.dtype}")
         return converted
@@ -242,6 +245,13 @@ class Entry:
         vector = np.zeros(self.given, self.dtype)
         vector[chosen.astype(np.int64) + self.first] = 1
         return vector
+
+
+def _are_finite(numbers: NDArray[Any]) -> bool:
+    """Return whether all numbers are finite."""
+    if numbers.size <= FEW:  # one by one takes a quarter of the time
+        return all(map(math.isfinite, numbers.ravel().tolist()))
+    return bool(np.isfinite(numbers).all())
 
 
 def leaves(

@@ -430,7 +430,8 @@ def random_action(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:
     spec = env.full_action_spec[env.action_key]
     bounded = isinstance(spec, Bounded) and (spec.space.high - spec.space.low).isfinite().all()
     if bounded or not spec.dtype.is_floating_point:
-        return env.rand_action(tensordict)
+        # TorchRL's `rand_action` draws the same, and imports pandas where that is installed.
+        return tensordict.set(env.action_key, spec.rand())
     draws = torch.rand(spec.shape, dtype=spec.dtype, device=spec.device)
     return tensordict.set(env.action_key, ActionSpace(spec, env.batch_dims).random(draws))
 

@@ -88,11 +88,11 @@ def check_parts(config: DictConfig) -> None:
         _check_tuning(config)
         _check_delivery(config, has_agent=has_agent)
     make_env = build.env_maker(config)
-    cases = len(build.build_evaluation(config).cases)
-    recorded = build.recorded(build.build_pictures(config))
+    cases = _count_cases(config)
     if trains:
         check_replay(config, make_env)
-    if trains or OmegaConf.select(config, "run") is None:
+    if not _is_of_run(config):
+        recorded = build.recorded(build.build_pictures(config))
         _check_env(config, make_env, cases, recorded.values())
     build_all(config.evaluation.advice, "evaluation.advice")
     if has_agent:
@@ -106,6 +106,21 @@ def check_parts(config: DictConfig) -> None:
         if config.method.transforms:
             for advice in config.evaluation.advice:
                 _check_cases(cases, partial(make_env, cases, TEST, advice))
+
+
+def _is_of_run(config: DictConfig) -> bool:
+    """Return whether a configuration is of the evaluation of a run, which has its own env."""
+    return (
+        OmegaConf.get_type(config) is not TrainConfig
+        and OmegaConf.select(config, "run") is not None
+    )
+
+
+def _count_cases(config: DictConfig) -> int:
+    """Return the number of cases of an evaluation; 0 if they are tracks, and a run has its own."""
+    if _is_of_run(config) and OmegaConf.is_dict(config.evaluation.cases):
+        return 0
+    return len(build.build_evaluation(config).cases)
 
 
 def _check_kind(config: DictConfig) -> None:

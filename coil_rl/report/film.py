@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +37,8 @@ class Film(Picture):
     Policies that drive the first case with altered advice are left out.
 
     Args:
-        every: number of steps between two frames.
+        every: number of steps between two frames; None for those of the env in the duration of a
+            frame, so that the film has the env's own pace. 2 for an env that does not say its rate.
         frames: largest number of frames.
         width: largest width and height of the frame of one policy, pixels; a larger picture is
             reduced by a whole number.
@@ -44,10 +46,10 @@ class Film(Picture):
         active: whether to make the film.
     """
 
-    every: int = 2
-    frames: int = 300
+    every: int | None = None
+    frames: int = 200
     width: int = 320
-    duration: int = 40
+    duration: int = 80
     active: bool = True
 
     def __post_init__(self) -> None:
@@ -67,16 +69,23 @@ class Film(Picture):
                 if it cannot.
             rows: the row in which each policy drives the first case, of those that still drive.
         """
+        every = self._steps_of_frame(getattr(env, "rate", math.nan))
         for name, row in rows.items():
             images, steps = self.images.setdefault(name, []), self.steps.get(name, 0)
             self.steps[name] = steps + 1
-            if not self.active or steps % self.every or len(images) >= self.frames:
+            if not self.active or steps % every or len(images) >= self.frames:
                 continue
             pixels: NDArray[np.uint8] | None = env.render(row)
             if pixels is not None:
                 image = Image.fromarray(pixels).convert("RGB")
                 # Means of whole blocks take a tenth of the time of any other size.
                 images.append(image.reduce(-(-max(image.size) // self.width)))
+
+    def _steps_of_frame(self, rate: float) -> int:
+        """Return the number of steps between two frames, for an env of so many steps a second."""
+        if self.every is not None:
+            return self.every
+        return 2 if math.isnan(rate) else max(1, round(rate * self.duration / 1000))
 
     def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
         """Write the animation; nothing without frames.
@@ -90,7 +99,8 @@ class Film(Picture):
         for name, result in results.items():
             first = result.episodes[0]
             # After its end an episode may be drawn as the next one.
-            images = taken.get(name, [])[: max(1, -(-first["steps"] // self.every))]
+            every = self._steps_of_frame(result.rate)
+            images = taken.get(name, [])[: max(1, -(-first["steps"] // every))]
             if images:
                 columns.append(images)
                 spec = return_format([first["reward"]])

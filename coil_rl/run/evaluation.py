@@ -107,6 +107,9 @@ def evaluate_policy(
     return EvaluationResult(rows, histories, getattr(env, "rate", float("nan")))
 
 
+EXTREMES = {"min", "max", "last"}  # reductions that are no sums
+
+
 class Totals:
     """Measures of the episodes of all rows of an env, reduced step by step.
 
@@ -119,63 +122,70 @@ class Totals:
 
     def __init__(self, measures: Mapping[str, Measure]) -> None:
         self.measures, self.steps = dict(measures), torch.zeros((), dtype=torch.int64)
-        self.groups: dict[str, list[str]] = {}  # names by reduction
-        for name, measure in measures.items():
-            self.groups.setdefault(measure.reduction, []).append(name)
-        self.state: dict[str, tuple[Tensor, Tensor]] = {}
+        self.extremes: dict[str, list[int]] = {}  # places of those that are no sums, by reduction
+        for place, measure in enumerate(measures.values()):
+            if measure.reduction in EXTREMES:
+                self.extremes.setdefault(measure.reduction, []).append(place)
+        self.where = any(measure.where is not None for measure in measures.values())
+        self.values = self.counts = torch.zeros(len(measures), 0)  # of no rows yet
 
     def add(self, after: TensorDictBase, running: Tensor) -> None:
         """Add the entries after a step of the rows that are `running`.
 
         There is one flag a row. Entries of several agents are summed.
         """
-        running = running.reshape(-1)
+        running, measures = running.reshape(-1), self.measures.values()
         self.steps = self.steps.to(running.device) + running.long()
-        for reduction, names in self.groups.items():
-            group = [self.measures[name] for name in names]
-            values = torch.stack(
-                [after[m.entry].double().reshape(len(running), -1).sum(-1) for m in group]
+        entries = [after[each.entry].double().reshape(len(running), -1) for each in measures]
+        if all(entry.shape[1] == 1 for entry in entries):
+            values = torch.stack(entries).sum(-1)
+        else:
+            values = torch.stack([entry.sum(-1) for entry in entries])
+        if not self.values.numel():
+            self._begin(values)
+        mask = running & ((values != 0) | self.with_zeros) & ~(values.isnan() & self.without_nan)
+        if self.where:
+            mask = mask & torch.stack(
+                [running if each.where is None else _flags(after[each.where]) for each in measures]
             )
-            mask = running.expand_as(values)
-            if any(measure.where for measure in group):
-                mask = mask & torch.stack(
-                    [running if m.where is None else _flags(after[m.where]) for m in group]
-                )
-            if reduction in ("any", "count"):
-                mask = mask & (values.nan_to_num() != 0)  # nothing happens where no number is
-            elif reduction == "mean_nonzero":
-                mask = mask & (values != 0)
-            extreme = reduction in ("min", "max", "last")
-            left_out = torch.tensor([[extreme or in_info(m.entry)] for m in group])
-            mask = mask & ~(values.isnan() & left_out.to(values.device))
-            empty = torch.full_like(values, torch.nan if extreme else 0.0), torch.zeros_like(values)
-            value, count = self.state.get(reduction, empty)
+        before, self.values = self.values, self.values + torch.where(mask, values, 0.0)
+        self.counts = self.counts + mask
+        for reduction, part in self.extremes.items():
+            value, new = before[part], values[part]
             if reduction == "last":
-                value = torch.where(mask, values, value)
-            elif reduction in ("min", "max"):
-                best = torch.fmin if reduction == "min" else torch.fmax
-                value = best(value, torch.where(mask, values, torch.nan))
+                self.values[part] = torch.where(mask[part], new, value)
             else:
-                value = value + torch.where(mask, values, 0.0)
-            self.state[reduction] = value, count + mask
+                best = torch.fmin if reduction == "min" else torch.fmax
+                self.values[part] = best(value, torch.where(mask[part], new, torch.nan))
+
+    def _begin(self, values: Tensor) -> None:
+        """Begin with no numbers, for values of the measures [M, rows]."""
+        self.values, self.counts = torch.zeros_like(values), torch.zeros_like(values)
+        for part in self.extremes.values():
+            self.values[part] = torch.nan
+        kinds = [(each.reduction, in_info(each.entry)) for each in self.measures.values()]
+        # Nothing happens where no number is, and it is no extreme.
+        no_nan = [info or kind in EXTREMES | {"any", "count"} for kind, info in kinds]
+        zeros = [kind not in ("any", "count", "mean_nonzero") for kind, _ in kinds]
+        self.without_nan = torch.tensor(no_nan, device=values.device).unsqueeze(-1)
+        self.with_zeros = torch.tensor(zeros, device=values.device).unsqueeze(-1)
 
     def results(self) -> dict[str, Tensor]:
         """Return the measures by name, [rows] each: numbers (float64) or flags (bool).
 
         Flags of which some are undecided are numbers: 0, 1, and NaN for these.
         """
-        results = {}
-        for reduction, names in self.groups.items():
-            values, counts = self.state[reduction]
-            if reduction in ("mean", "mean_nonzero"):
-                values = values / counts
-            elif reduction == "count":
-                values = counts
-            for name, number, count in zip(names, values, counts, strict=True):
-                measure = self.measures[name]
-                if measure.reduction == "any":
-                    number = count > 0
-                results[name] = _within(measure, number, count)
+        results: dict[str, Tensor] = {}
+        for (name, measure), number, count in zip(
+            self.measures.items(), self.values, self.counts, strict=True
+        ):
+            if measure.reduction in ("mean", "mean_nonzero"):
+                number = number / count
+            elif measure.reduction == "count":
+                number = count
+            elif measure.reduction == "any":
+                number = count > 0
+            results[name] = _within(measure, number, count)
         return results
 
 

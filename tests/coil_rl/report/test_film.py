@@ -1,5 +1,7 @@
 """Films of the first case of an evaluation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -53,6 +55,17 @@ def test_film_shows_every_so_many_steps_of_the_first_episode(tmp_path):
     # The episode of the first case has 30 steps.
     assert len(shown) == 10
     assert shown[0].shape == (20 + CAPTION, 30, 3)
+
+
+@pytest.mark.parametrize(("rate", "every"), [(50.0, 4), (30.0, 2), (1.0, 1), (float("nan"), 2)])
+def test_film_has_the_pace_of_the_env(rate, every, tmp_path):
+    screen = Screen()
+    screen.rate = rate
+    filmed(screen, 40).draw({"agent": replace(drive(24), rate=rate)}, tmp_path)
+    assert len(frames(tmp_path)) == 24 // every
+    with Image.open(tmp_path / "episode.webp") as image:
+        image.load()
+        assert image.info["duration"] == 80, "ms"
 
 
 def test_film_shows_the_guide_left_and_the_agent_right_under_their_names(tmp_path):
