@@ -1,3 +1,4 @@
+import functools
 import gc
 import os
 import pickle
@@ -12,6 +13,7 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
 from hydra.core.config_store import ConfigStore
 from hypothesis import settings
+from omegaconf import base
 
 from coil_rl.config.written import SHIPPED
 from coil_rl.envs import Track, load_track
@@ -106,6 +108,7 @@ defaults_list._create_defaults_list = list_defaults_once(defaults_list._create_d
 ConfigLoaderImpl._compose_config_from_defaults_list = merge_each_list_once(
     ConfigLoaderImpl._compose_config_from_defaults_list
 )
+base.parse = functools.lru_cache(maxsize=None)(base.parse)  # the trees of references are only read
 # Hydra copies the registered configurations for every test, and changes none of them.
 ConfigStore.__deepcopy__ = lambda self, memo: self
 os.fsync = lambda descriptor: None  # no test cuts the power
