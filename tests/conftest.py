@@ -19,6 +19,7 @@ from coil_rl.config.written import SHIPPED
 from coil_rl.envs import Track, load_track
 from coil_rl.report import style
 
+OURS = (*SHIPPED, "pkg://coil_paper.")  # places of files of a configuration that no test changes
 LEVELS = Path(__file__).resolve().parents[2] / "shared" / "tracks"
 
 # The tensors of the tests are too small for several threads.
@@ -51,7 +52,7 @@ def read_each_file_once(load):
     known = {}
 
     def load_known(self, config_path):
-        if not all(each.full_path().startswith(SHIPPED) for each in self.sources):
+        if not all(each.full_path().startswith(OURS) for each in self.sources):
             return load(self, config_path)
         places = tuple(each.full_path() for each in self.sources)
         if (config_path, places) not in known:
@@ -73,7 +74,7 @@ def list_defaults_once(create):
 
     def create_known(repo, config_name, overrides, **options):
         places = tuple(each.full_path() for each in repo.get_sources())
-        if not all(place.startswith(SHIPPED) for place in places):
+        if not all(place.startswith(OURS) for place in places):
             return create(repo, config_name, overrides, **options)
         values, groups = overrides.config_overrides, vars(overrides)
         overrides.config_overrides = []
@@ -94,7 +95,7 @@ def merge_each_list_once(merge):
 
     def merge_known(self, defaults, repo):
         places = tuple(each.full_path() for each in repo.get_sources())
-        if not all(place.startswith(SHIPPED) for place in places):
+        if not all(place.startswith(OURS) for place in places):
             return merge(self, defaults, repo)
         key = (places, repr(defaults))
         if key not in known:
