@@ -14,6 +14,7 @@ from hydra._internal.config_repository import ConfigRepository
 from hydra.core.config_store import ConfigStore
 from hypothesis import settings
 from omegaconf import base
+from torch._export import utils
 
 from coil_rl.config.written import SHIPPED
 from coil_rl.envs import Track, load_track
@@ -110,6 +111,8 @@ ConfigLoaderImpl._compose_config_from_defaults_list = merge_each_list_once(
     ConfigLoaderImpl._compose_config_from_defaults_list
 )
 base.parse = functools.lru_cache(maxsize=None)(base.parse)  # the trees of references are only read
+# Each export asks for the operations of PyTorch anew.
+utils._materialize_cpp_cia_ops = functools.cache(utils._materialize_cpp_cia_ops)
 # Hydra copies the registered configurations for every test, and changes none of them.
 ConfigStore.__deepcopy__ = lambda self, memo: self
 os.fsync = lambda descriptor: None  # no test cuts the power
