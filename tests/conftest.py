@@ -1,4 +1,4 @@
-import copy
+import functools
 import gc
 import os
 import pickle
@@ -8,14 +8,19 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from hydra._internal import defaults_list
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
 from hydra.core.config_store import ConfigStore
 from hypothesis import settings
+from omegaconf import base
+from torch._export import utils
 
 from coil_rl.config.written import SHIPPED
 from coil_rl.envs import Track, load_track
 from coil_rl.report import style
 
+OURS = (*SHIPPED, "pkg://coil_paper.")  # places of files of a configuration that no test changes
 LEVELS = Path(__file__).resolve().parents[2] / "shared" / "tracks"
 
 # The tensors of the tests are too small for several threads.
@@ -48,17 +53,66 @@ def read_each_file_once(load):
     known = {}
 
     def load_known(self, config_path):
-        if not all(each.full_path().startswith(SHIPPED) for each in self.sources):
+        if not all(each.full_path().startswith(OURS) for each in self.sources):
             return load(self, config_path)
         places = tuple(each.full_path() for each in self.sources)
         if (config_path, places) not in known:
-            known[config_path, places] = load(self, config_path)
-        return copy.deepcopy(known[config_path, places])
+            known[config_path, places] = pickle.dumps(load(self, config_path))
+        return pickle.loads(known[config_path, places])
 
     return load_known
 
 
 ConfigRepository.load_config = read_each_file_once(ConfigRepository.load_config)
+
+
+def list_defaults_once(create):
+    """Return `defaults_list._create_defaults_list` with a memory for the files of this project.
+
+    The list depends on the files and on the overrides of groups; values change nothing in it.
+    """
+    known = {}
+
+    def create_known(repo, config_name, overrides, **options):
+        places = tuple(each.full_path() for each in repo.get_sources())
+        if not all(place.startswith(OURS) for place in places):
+            return create(repo, config_name, overrides, **options)
+        values, groups = overrides.config_overrides, vars(overrides)
+        overrides.config_overrides = []
+        key = (places, config_name, repr(groups), repr(options))
+        if key not in known:
+            result = create(repo, config_name, overrides, **options)
+            known[key] = pickle.dumps((result, groups))
+        result, after = pickle.loads(known[key])
+        groups |= after | {"config_overrides": values}
+        return result
+
+    return create_known
+
+
+def merge_each_list_once(merge):
+    """Return `_compose_config_from_defaults_list` with a memory for the files of this project."""
+    known = {}
+
+    def merge_known(self, defaults, repo):
+        places = tuple(each.full_path() for each in repo.get_sources())
+        if not all(place.startswith(OURS) for place in places):
+            return merge(self, defaults, repo)
+        key = (places, repr(defaults))
+        if key not in known:
+            known[key] = pickle.dumps(merge(self, defaults, repo))
+        return pickle.loads(known[key])
+
+    return merge_known
+
+
+defaults_list._create_defaults_list = list_defaults_once(defaults_list._create_defaults_list)
+ConfigLoaderImpl._compose_config_from_defaults_list = merge_each_list_once(
+    ConfigLoaderImpl._compose_config_from_defaults_list
+)
+base.parse = functools.lru_cache(maxsize=None)(base.parse)  # the trees of references are only read
+# Each export asks for the operations of PyTorch anew.
+utils._materialize_cpp_cia_ops = functools.cache(utils._materialize_cpp_cia_ops)
 # Hydra copies the registered configurations for every test, and changes none of them.
 ConfigStore.__deepcopy__ = lambda self, memo: self
 os.fsync = lambda descriptor: None  # no test cuts the power

@@ -6,8 +6,9 @@ import coil_rl
 
 STEPS = 20
 SHORT = ["evaluation.cases=2", "evaluation.gif=false", f"env.max_steps={STEPS + 4}"]
+# No test looks at a curve.
 TINY = ["budget.num_envs=2", "budget.steps=16", "logger=none", *SHORT]
-TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1"]
+TINY += [f"~evaluation.curve.cases.{name}" for name in ("evaluation", "selection")]
 REPLAY = ["learner.starts=16", "learner.ratio=1", "learner.batch_size=16"]
 ON_POLICY = ["learner.minibatches=2", "learner.epochs=1", "learner.action_gain=1"]
 FOREST = ["learner.regressor.estimator.n_estimators=3"]

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import fields
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -29,7 +30,10 @@ def complete_measures(config: DictConfig) -> None:
             whose name is another column of the tables.
     """
     measures = OmegaConf.select(config, "evaluation.measures")
+    schema: Any = None
     for name in measures or ():
+        if OmegaConf.get_type(measures, name) is MeasureConfig:
+            continue
         if name in TAKEN:
             raise UserError(
                 f"evaluation.measures.{name}: {name} is already a column of the tables; give the "
@@ -48,8 +52,9 @@ def complete_measures(config: DictConfig) -> None:
                     f"there is no key {key}; evaluation.measures.{name} has {', '.join(known)}"
                     f"{similar(str(key), known)}"
                 )
+        schema = OmegaConf.structured(MeasureConfig) if schema is None else schema
         try:
-            typed = OmegaConf.merge(OmegaConf.structured(MeasureConfig), measures[name])
+            typed = OmegaConf.merge(schema, measures[name])
         except OmegaConfBaseException as error:
             raise UserError(f"evaluation.measures.{name}: {sentence(error)}") from error
         OmegaConf.update(config, f"evaluation.measures.{name}", typed, merge=False)

@@ -14,7 +14,7 @@ from coil_rl.run.parts import EnvMaker
 class GuideReturns:
     """Mean return of each guide of a learner that trains its guides, with its present parameters.
 
-    A `Callback`.
+    A `Callback`. It measures nothing without a curve.
 
     Args:
         make_env: makes the env.
@@ -31,7 +31,8 @@ class GuideReturns:
         each_phase: bool = True,
     ) -> None:
         self.make_env, self.guides, self.each_phase = make_env, guides, each_phase
-        self.names: Sequence[str] = [f"guide/{name}" for name in guides]
+        measured = guides if EVALUATION in make_env.sizes else ()
+        self.names: Sequence[str] = [f"guide/{name}" for name in measured]
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
         """Return whether the guides have changed, or the training begins or ends."""

@@ -33,6 +33,7 @@ SMALL = [
     "logger=none",
     "delivery=tested",
 ]
+ONCE = "learner.epochs=1"  # for what does not depend on how much is learned
 
 
 def trained(folder, *overrides):
@@ -54,7 +55,7 @@ def guide_wins(tmp_path_factory):
     """A run of COIL that learns nothing, so that its guide is better than any of its policies."""
     folder = tmp_path_factory.mktemp("delivery") / "run"
     disturbed = ["disturb=[action_delay,observation_noise]", "disturb.action_delay.max_lag=6"]
-    return trained(folder, "method=coil", "training.learning_rate=0", *disturbed)
+    return trained(folder, "method=coil", "training.learning_rate=0", ONCE, *disturbed)
 
 
 def test_policies_that_act_alike_have_equal_returns_whatever_disturbs_the_env(guide_wins):
@@ -125,7 +126,7 @@ def test_test_at_the_end_gets_what_the_start_test_leaves_of_a_tenth(taken, kept,
 
 def test_run_with_tests_takes_no_more_frames_than_one_without(tmp_path):
     small = ["method=coil_anchored", "budget.frames=700", "budget.num_envs=2"]
-    rows = rows_of(trained(tmp_path / "run", *small) / "metrics.csv")
+    rows = rows_of(trained(tmp_path / "run", ONCE, *small) / "metrics.csv")
     # Two cases of 40 steps with two policies, more than both tests may take together.
     assert float(rows[-1]["frames/tests"]) > 0.2 * 700
     assert float(rows[-1]["frames"]) <= 700
@@ -133,7 +134,7 @@ def test_run_with_tests_takes_no_more_frames_than_one_without(tmp_path):
 
 def test_test_at_the_end_is_left_out_where_the_start_test_took_the_frames_of_both(tmp_path):
     small = ["method=coil_anchored", "degrade=[random]", "budget.frames=2400", "budget.num_envs=2"]
-    run = trained(tmp_path / "run", *small)
+    run = trained(tmp_path / "run", ONCE, *small)
     # Two cases of 40 steps with the guide, its opposite and the new policy, which hold none.
     last = rows_of(run / "metrics.csv")[-1]
     assert float(last["frames/tests"]) == 2 * 3 * 40 == 0.1 * 2400
@@ -149,7 +150,7 @@ def test_test_at_the_end_is_left_out_where_the_start_test_took_the_frames_of_bot
 
 def test_run_without_a_start_test_knows_from_its_training_how_long_a_test_would_be(tmp_path):
     small = ["method=coil", "delivery=tested", "budget.frames=1200", "budget.num_envs=2"]
-    run = trained(tmp_path / "run", *small)
+    run = trained(tmp_path / "run", ONCE, *small)
     last = rows_of(run / "metrics.csv")[-1]
     # Two cases of 40 steps with two policies are more than 5 % of the frames.
     assert float(last["frames/tests"]) == 0
@@ -193,7 +194,7 @@ def test_guide_acts_alone_also_where_actions_are_combined(method):
 
 
 def test_run_without_a_guide_in_its_env_compares_its_own_policies(tmp_path):
-    folder = trained(tmp_path / "run", "method=ppo")
+    folder = trained(tmp_path / "run", "method=ppo", ONCE)
     assert set(report(folder)["returns"]) <= {"last", "earlier"}
     assert math.isnan(float(rows_of(folder / "metrics.csv")[-1]["delivery/guide"]))
 
