@@ -1,3 +1,4 @@
+import copy
 import importlib.resources
 import json
 import sys
@@ -62,14 +63,19 @@ def composed(folder, *overrides):
 
 
 def changed(saved, key, value):
-    config = OmegaConf.create(saved)
-    OmegaConf.update(config, key, value, merge=False, force_add=True)
+    config = copy.deepcopy(saved)
+    *parents, last = key.split(".")
+    node = config
+    for name in parents:
+        node[name] = node[name] if isinstance(node.get(name), dict) else {}
+        node = node[name]
+    node[last] = value
     return config
 
 
 def read(folder, content):
     if not isinstance(content, str):
-        content = json.dumps(OmegaConf.to_container(OmegaConf.create(content)))  # JSON is YAML
+        content = json.dumps(content)  # JSON is YAML
     (folder / "config.yaml").write_text(content)
     return read_config(folder, "run", goes_on=True)
 

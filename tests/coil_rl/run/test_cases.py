@@ -15,6 +15,7 @@ from coil_rl.run.training import training_of
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 pytest.importorskip("gymnasium.envs.classic_control")
+SHORT = ["env=pendulum", "env.max_steps=48"]  # for what an episode of any length shows
 
 
 def configured(*overrides):
@@ -35,7 +36,7 @@ def built(*overrides, frames=100_000, seed=0):
 
 
 def test_all_policies_act_in_the_same_cases_and_each_comparison_has_others():
-    cases, learner = built("env=pendulum")
+    cases, learner = built(*SHORT)
     cases.renew(3)
     first = cases.returns(learner.policy)
     assert torch.equal(cases.returns(learner.policy), first)
@@ -44,9 +45,9 @@ def test_all_policies_act_in_the_same_cases_and_each_comparison_has_others():
 
 
 def test_cases_depend_on_the_seed_and_go_on_from_a_saved_state():
-    one, learner = built("env=pendulum")
-    other, _ = built("env=pendulum", seed=1)
-    again, _ = built("env=pendulum")
+    one, learner = built(*SHORT)
+    other, _ = built(*SHORT, seed=1)
+    again, _ = built(*SHORT)
     returns = []
     for cases in (one, other):
         cases.renew(2)
@@ -61,17 +62,17 @@ def test_cases_depend_on_the_seed_and_go_on_from_a_saved_state():
 
 
 def test_steps_and_calls_of_guides_are_counted():
-    cases, learner = built("env=pendulum")
+    cases, learner = built(*SHORT)
     cases.renew(3)
     cases.returns(learner.policy)
-    assert cases.steps == 3 * 200
-    assert cases.calls == 3 * 201, "also in the first states"
+    assert cases.steps == 3 * 48
+    assert cases.calls == 3 * 49, "also in the first states"
     env = cases.env
     assert guide_calls(env) == cases.calls
 
 
 def test_comparison_leaves_policy_and_random_numbers_alone():
-    cases, learner = built("env=pendulum")
+    cases, learner = built(*SHORT)
     before, state = torch.get_rng_state(), learner.policy.state_dict()
     copies = {name: value.clone() for name, value in state.items()}
     cases.renew(2)
@@ -83,14 +84,14 @@ def test_comparison_leaves_policy_and_random_numbers_alone():
 
 
 def test_no_case_without_renew():
-    cases, learner = built("env=pendulum")
+    cases, learner = built(*SHORT)
     with pytest.raises(RuntimeError, match="call renew"):
         cases.returns(learner.policy)
 
 
 @pytest.mark.parametrize("action", ["continuous", "choices"])
 def test_first_policy_has_the_returns_of_its_guide(action):
-    cases, learner = built("env=pendulum", f"action={action}")
+    cases, learner = built(*SHORT, f"action={action}")
     cases.renew(4)
     guide = cases.returns(GuideActs(cases.env))
     assert torch.equal(cases.returns(learner.policy), guide)
@@ -114,7 +115,7 @@ def test_start_test_holds_a_guide_that_swings_up_and_the_opposite_of_a_reversed_
 
 @pytest.mark.parametrize("degrade", ["random", "zeroed"])
 def test_start_test_holds_no_useless_guide(degrade):
-    assert start_test("env=pendulum", "env.max_steps=50", f"degrade={degrade}")[0] == [0]
+    assert start_test(*SHORT, f"degrade={degrade}")[0] == [0]
 
 
 def test_cases_of_the_cone_world_are_new_places_with_the_whole_time_limit():
@@ -145,7 +146,7 @@ def test_rows_may_begin_in_the_same_cases(words):
 
 
 def test_policies_side_by_side_have_the_returns_of_each_alone():
-    cases, learner = built("env=pendulum")
+    cases, learner = built(*SHORT)
     cases.renew(3)
     guide = GuideActs(cases.env)
     beside = cases.compared([learner.policy, guide])
@@ -188,7 +189,7 @@ def test_sampled_actions_have_the_correlated_noise_of_the_training():
 
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 def test_traced_policy_has_the_noise_of_one_that_is_not(correlation):
-    cases, learner = built("env=pendulum")
+    cases, learner = built(*SHORT)
     cases.noise_correlation = correlation
     cases.renew(3)
     beside, _ = cases.compared([learner.policy, learner.policy], [True, False])
@@ -226,7 +227,7 @@ def test_policies_side_by_side_have_the_same_noise_of_their_scans():
     ids=["noise", "delay", "noisy advice", "shuffled advice", "random guide"],
 )
 def test_policies_side_by_side_have_the_same_noise_and_delays(words):
-    cases, learner = built("env=pendulum", *words)
+    cases, learner = built(*SHORT, *words)
     assert cases.can_copy()
     cases.renew(3)
     first, second = cases.compared([learner.policy, learner.policy])
@@ -239,7 +240,7 @@ def test_policies_side_by_side_have_the_same_noise_and_delays(words):
 
 
 def test_a_block_of_cases_makes_one_env():
-    cases, learner = built("env=pendulum")
+    cases, learner = built(*SHORT)
     made, build = [], cases.build
     cases.build = lambda rows: made.append(rows) or build(rows)
     cases.can_copy()
