@@ -28,6 +28,12 @@ class Candidates(TensorDictModuleBase):
         self.space: ActionSpace | None = None
         self.choices: OwnChoices = {}
         self.guides = nn.ModuleList(guides)
+        self.share = 0  # number of rows of each guide, known at the start of episodes
+
+    @property
+    def by_row(self) -> bool:
+        """Whether there is one object for each row, see `Guides`."""
+        return all(getattr(guide, "by_row", False) for guide in self.guides)
 
     def replace(self, guides: Sequence[TensorDictModuleBase]) -> None:
         """Act by other guides of the same class from here on, in new episodes.
@@ -64,10 +70,20 @@ class Candidates(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the actions, and what the guides remember for their next step."""
-        rows = len(tensordict) // len(self.guides)
-        parts = [
-            guide(part) for guide, part in zip(self.guides, tensordict.split(rows), strict=True)
-        ]
+        split = zip(self.guides, tensordict.split(self._sizes(tensordict)), strict=True)
+        parts = [guide(part) for guide, part in split if len(part)]
         for key in self.out_keys:
             tensordict.set(key, torch.cat([part[key] for part in parts]))
         return tensordict
+
+    def _sizes(self, tensordict: TensorDictBase) -> list[int]:
+        """Return the number of rows of each guide; some may have left, see `Guides`."""
+        count = len(self.guides)
+        if not self.by_row:
+            return [len(tensordict) // count] * count
+        if tensordict["is_init"].all():
+            self.share = len(tensordict) // count
+        sizes: list[int] = (
+            (tensordict["row"].flatten() // self.share).bincount(minlength=count).tolist()
+        )
+        return sizes
