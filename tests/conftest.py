@@ -134,6 +134,7 @@ LONGEST = [
     "test_packaging",
     "test_replay",
     "test_promise",
+    "test_readme",
 ]
 
 
@@ -149,7 +150,7 @@ def pytest_collection_modifyitems(items):
 def pytest_collection_finish():
     """Keep the garbage collector from visiting all imported modules in each of its rounds."""
     gc.freeze()
-    gc.set_threshold(20_000, 50, 50)
+    gc.set_threshold(50_000, 50, 50)
 
 
 @pytest.fixture(scope="session")

@@ -32,7 +32,7 @@ def complete_measures(config: DictConfig) -> None:
     measures = OmegaConf.select(config, "evaluation.measures")
     schema: Any = None
     for name in measures or ():
-        if OmegaConf.get_type(measures, name) is MeasureConfig:
+        if is_complete(measures, name):
             continue
         if name in TAKEN:
             raise UserError(
@@ -58,3 +58,13 @@ def complete_measures(config: DictConfig) -> None:
         except OmegaConfBaseException as error:
             raise UserError(f"evaluation.measures.{name}: {sentence(error)}") from error
         OmegaConf.update(config, f"evaluation.measures.{name}", typed, merge=False)
+
+
+def is_complete(measures: DictConfig, name: str) -> bool:
+    """Return whether a measure has its types, and all its values.
+
+    Args:
+        measures: of a configuration, by name.
+        name: of the measure.
+    """
+    return OmegaConf.get_type(measures, name) is MeasureConfig

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.config.logger import shipped_logger
-from coil_rl.config.measured import complete_measures
+from coil_rl.config.measured import complete_measures, is_complete
 from coil_rl.config.schema import IGNORED_KEYS, TrainConfig
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import check_config
@@ -110,8 +110,10 @@ def identity(config: DictConfig) -> dict[str, Any]:
     Args:
         config: composed, or read from a folder; it stays as it is.
     """
-    config = copy.deepcopy(config)
-    complete_measures(config)
+    measures: Any = OmegaConf.select(config, "evaluation.measures")
+    if not all(is_complete(measures, name) for name in measures or ()):
+        config = copy.deepcopy(config)  # which takes longer than all else here
+        complete_measures(config)
     values: Any = OmegaConf.to_container(config, resolve=True)
     if values.get("recording") is None:  # of all envs but one
         values.pop("recording", None)
