@@ -57,7 +57,7 @@ def agreement(act: Act, states: TensorDictBase) -> Tensor:
         states: [N], with `guide_action` [N, n_guides, A].
 
     Returns:
-        [N, n_guides], in action units.
+        [N, n_guides], in the unit of the agent's action.
     """
     return (_act(act, states, states[ADVICE]).unsqueeze(-2) - states[ADVICE]).norm(dim=-1)
 
@@ -71,8 +71,8 @@ def intervention(
     Permutation importance (Breiman 2001) of the action instead of a loss: the replacement is a
     likely advice without information on this state; the advice of other guides stays. Donors come
     from all states, not from other cars at the same time, because deterministic cars on one track
-    are in the same state at the same time. The change is [N, n_guides] in action units; 0 if the
-    advice has no influence.
+    are in the same state at the same time. The change is [N, n_guides] in the unit of the
+    agent's action; 0 if the advice has no influence.
 
     Args:
         act: the agent.

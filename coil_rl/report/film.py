@@ -55,6 +55,7 @@ class Film(Picture):
     def __post_init__(self) -> None:
         self.images: dict[str, list[Image.Image]] = {}  # of each policy
         self.steps: dict[str, int] = {}  # of the env so far
+        self.whole = True  # whether no frame is missing
 
     @property
     def watches(self) -> bool:
@@ -76,7 +77,9 @@ class Film(Picture):
             if not self.active or steps % every or len(images) >= self.frames:
                 continue
             pixels: NDArray[np.uint8] | None = env.render(row)
-            if pixels is not None:
+            if pixels is None:
+                self.whole = False
+            else:
                 image = Image.fromarray(pixels).convert("RGB")
                 # Means of whole blocks take a tenth of the time of any other size.
                 images.append(image.reduce(-(-max(image.size) // self.width)))
@@ -88,7 +91,7 @@ class Film(Picture):
         return 2 if math.isnan(rate) else max(1, round(rate * self.duration / 1000))
 
     def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
-        """Write the animation; nothing without frames.
+        """Write the animation; nothing if an env gave no frame, or stopped giving them.
 
         Args:
             results: the episodes of each policy, the agent last.
@@ -96,6 +99,7 @@ class Film(Picture):
         """
         columns, captions = [], []
         taken, self.images, self.steps = self.images, {}, {}
+        whole, self.whole = self.whole, True
         for name, result in results.items():
             first = result.episodes[0]
             # After its end an episode may be drawn as the next one.
@@ -105,7 +109,7 @@ class Film(Picture):
                 columns.append(images)
                 spec = return_format([first["reward"]])
                 captions.append(f"{name}: return {first['reward']:{spec}}")
-        if not columns:
+        if not (columns and whole):
             return
         frames = _side_by_side(columns, captions)
         with whole_file(folder / "episode.webp") as unfinished:

@@ -117,3 +117,12 @@ def test_film_of_an_env_that_is_not_drawn_has_no_file(screen, steps, active, tmp
     film.draw({"agent": drive()}, tmp_path)
     assert film.watches is active
     assert not list(tmp_path.iterdir())
+
+
+def test_film_that_would_be_cut_has_no_file(tmp_path):
+    screen = Screen()
+    film = filmed(screen, 6, every=1)
+    screen.size = None  # the env cannot draw any more
+    film.watch(screen, AGENT)
+    film.draw({"agent": drive(7)}, tmp_path)
+    assert not list(tmp_path.iterdir())
