@@ -1,6 +1,9 @@
 """docs/torchrl_users.md: its Python blocks run, and COIL in TorchRL's PPOTrainer learns."""
 
+import os
 import re
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -28,10 +31,27 @@ def test_coil_runs_in_their_ppo_trainer():
     assert changed[:, 3].max() > 1e-4, "the weights of the advice learn, too"
 
 
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.slow
+def test_distributed_collector_runs_a_learner(tmp_path):
+    file = tmp_path / "distributed_coil.py"  # a file, which each process imports again
+    file.write_text(BLOCKS[2])
+    ended = subprocess.run(
+        [sys.executable, file],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert [line.split(":")[0] for line in ended.stdout.splitlines()] == [
+        f"update {number}" for number in range(4)
+    ]
+
+
+@pytest.mark.parametrize("number", [1, 3])
 def test_other_blocks_run(number):
     assert run(BLOCKS[number])["env"] is not None
 
 
 def test_no_block_is_left_out():
-    assert len(BLOCKS) == 3
+    assert len(BLOCKS) == 4
