@@ -268,7 +268,9 @@ def _say_cost_of_curve(config: DictConfig, found: Tried) -> None:
     command would make another run on a busier machine.
     """
     curve = config.evaluation.curve
-    asks = config.method.observes is not None and (config.method.search or build.advises(config))
+    asks = config.method.observes is not None and (
+        config.method.search or "advice" in config.method.transforms
+    )
     sets = 1 if config.delivery == "tested" else len(curve.cases)
     episodes = (curve.points + 1) * curve.num_envs * sets
     minutes = STEPS_SAID * episodes * found.seconds / 60
