@@ -22,7 +22,7 @@ from coil_rl.guides.simple import FollowAdvice
 from coil_rl.transforms import GuideActions
 
 STEPS = 10
-LONGEST = 0.1  # s, after which the check takes no further step
+LONGEST = 0.5  # s, after which the check takes no further step
 LARGEST_SEED = 2**64  # of a person
 
 
