@@ -117,7 +117,7 @@ def _is_of_run(config: DictConfig) -> bool:
 
 
 def _count_cases(config: DictConfig) -> int:
-    """Return the number of cases of an evaluation; 0 if they are tracks, and a run has its own."""
+    """Return the number of cases of an evaluation; 0 if they are the tracks of a run."""
     if _is_of_run(config) and OmegaConf.is_dict(config.evaluation.cases):
         return 0
     return len(build.build_evaluation(config).cases)
@@ -262,7 +262,7 @@ def _check_draws(found: Tried) -> None:
 
 
 def _say_cost_of_curve(config: DictConfig, found: Tried) -> None:
-    """Say how long the evaluation curve asks a slow controller, and how it takes less.
+    """Say how much time a slow controller takes in the evaluation curve, and how to shorten it.
 
     The number of policies in it is left to the user: if it followed a measured time, the same
     command would make another run on a busier machine.

@@ -103,7 +103,7 @@ def _unseeded(thing: Any) -> Iterator[tuple[int, Any]]:
 
 
 class Tried(NamedTuple):
-    """What a few actions of a guide have shown.
+    """Result of a trial of a controller in a few steps.
 
     Attributes:
         title: of the controller; empty for a guide that has no object for each row.

@@ -141,7 +141,9 @@ class Reasons:
         return next(filter(None, (rule(key) for rule in self.rules)), "")
 
     def of_unchecked(self, key: str) -> str:
-        """Return the same of a configuration that may be wrong; empty if its check refuses it.
+        """Return why nothing reads a key, as `of` does, for a configuration that was not checked.
+
+        The result is empty if the configuration is wrong: the check of its run says so.
 
         Args:
             key: full key of a word.

@@ -58,7 +58,7 @@ class Candidates(TensorDictModuleBase):
                 guide.in_space(space)  # type: ignore[operator]
 
     def reads_choices(self, choices: OwnChoices) -> None:
-        """Tell the guides that ask for it how to read choices as the env gives them.
+        """Let the guides that can do so read choices as the env gives them.
 
         Args:
             choices: what converts an entry, by entry.

@@ -135,7 +135,7 @@ def _plain(network: nn.Module) -> Iterator[tuple[tuple[str, str], Any]]:
 
 
 def _can_be_saved(value: Any) -> bool:
-    """Return whether a checkpoint can hold a value: it may not run code when it is read."""
+    """Return whether a value can be saved, and loaded again without running code from the file."""
     if type(value) in SAVED:
         return True
     file = io.BytesIO()

@@ -5,7 +5,7 @@ Every run evaluates its guides anew, in the same cases.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -109,15 +109,11 @@ def of_changed_guides(runs: Sequence[Run]) -> list[str]:
         runs: finished runs; those of one label have one configuration.
     """
     found: dict[str, list[str]] = {}
-    for label in dict.fromkeys(run.label for run in runs):
-        of_label = [run for run in runs if run.label == label]
-        if guide_follows_seed(of_label):
-            continue
-        for name, of_seeds in _by_seed(of_label).items():
-            parts = _alike(of_seeds)
-            if len(parts) > 1:
-                shown = [_some(list(map(str, seeds)), MOST_SEEDS) for seeds in parts]
-                found.setdefault(name, []).append(f"{label} seeds {_some(shown, joint=' / ')}")
+    for run, name, of_seeds in _guides_without_seed(runs):
+        parts = _alike(of_seeds)
+        if len(parts) > 1:
+            shown = [_some(list(map(str, seeds)), MOST_SEEDS) for seeds in parts]
+            found.setdefault(name, []).append(f"{run.label} seeds {_some(shown, joint=' / ')}")
     warnings = []
     for name, labels in found.items():
         warnings.append(
@@ -140,18 +136,13 @@ def of_guides_of_labels(runs: Sequence[Run]) -> list[str]:
     """
     first: dict[str, list[tuple[str, dict[str, Any], list[pd.DataFrame]]]] = {}
     differ: dict[str, list[str]] = {}
-    for label in dict.fromkeys(run.label for run in runs):
-        of_label = [run for run in runs if run.label == label]
-        if guide_follows_seed(of_label):
-            continue
-        settings = of_guide(of_label[0])
-        for name, of_seeds in _by_seed(of_label).items():
-            results = _different(of_seeds.values())
-            known = first.setdefault(name, [])
-            others = [each for each in known if each[1] == settings and _in_same(results, each[2])]
-            if others and not any(_share(results, theirs) for _, _, theirs in others):
-                differ.setdefault(name, []).append(f"{others[0][0]} / {label}")
-            known.append((label, settings, results))
+    for run, name, of_seeds in _guides_without_seed(runs):
+        settings, results = of_guide(run), _different(of_seeds.values())
+        known = first.setdefault(name, [])
+        others = [each for each in known if each[1] == settings and _in_same(results, each[2])]
+        if others and not any(_share(results, theirs) for _, _, theirs in others):
+            differ.setdefault(name, []).append(f"{others[0][0]} / {run.label}")
+        known.append((run.label, settings, results))
     warnings = []
     for name, labels in differ.items():
         warnings.append(
@@ -161,6 +152,20 @@ def of_guides_of_labels(runs: Sequence[Run]) -> list[str]:
             "not to be compared, or the guide or the env draws random numbers of its own."
         )
     return warnings
+
+
+def _guides_without_seed(
+    runs: Sequence[Run],
+) -> Iterator[tuple[Run, str, dict[int, pd.DataFrame]]]:
+    """Yield each guide of each label that does not depend on the seed of the run.
+
+    With its name come the first run of the label, and the guide's evaluations by seed.
+    """
+    for label in dict.fromkeys(run.label for run in runs):
+        of_label = [run for run in runs if run.label == label]
+        if not guide_follows_seed(of_label):
+            for name, of_seeds in _by_seed(of_label).items():
+                yield of_label[0], name, of_seeds
 
 
 def _in_same(results: Sequence[pd.DataFrame], others: Sequence[pd.DataFrame]) -> bool:

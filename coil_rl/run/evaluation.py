@@ -159,7 +159,7 @@ class Totals:
                 self.values[part] = best(value, torch.where(mask[part], new, torch.nan))
 
     def _begin(self, values: Tensor) -> None:
-        """Begin with no numbers, for values of the measures [M, rows]."""
+        """Set the sums and counts of all measures to their start, for values [M, rows]."""
         self.values, self.counts = torch.zeros_like(values), torch.zeros_like(values)
         for part in self.extremes.values():
             self.values[part] = torch.nan

@@ -121,7 +121,10 @@ def _is_operation(node: Any) -> bool:
 
 
 def _is_constant(node: Any, known: Container[Node]) -> bool:
-    """Return whether an operation has one result, of known tensors and without random numbers."""
+    """Return whether an operation returns the same tensor in every call of the graph.
+
+    Its inputs are known tensors, and it draws no random numbers.
+    """
     inputs, results = node.all_input_nodes, node.target._schema.returns
     return (
         bool(inputs)

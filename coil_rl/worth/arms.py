@@ -142,6 +142,6 @@ def job_of(given: Named, arm: Arm, seed: int, frames: int | None, short: Sequenc
 
 
 def _starts_of_sac() -> int:
-    """Return the number of stored steps before SAC learns, in its file."""
+    """Return the default of `learner.starts` for SAC: the stored steps before it learns."""
     file = resources.files("coil_rl.conf") / "learner" / "sac.yaml"
     return int(yaml.safe_load(file.read_text("utf-8"))["learner"]["starts"])
