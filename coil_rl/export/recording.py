@@ -58,6 +58,11 @@ class Recording:
         value: Tensor = self.advice[step] if key == ADVICE else self.entries[step][key]
         return value
 
+    def example(self) -> TensorDictBase:
+        """Return the entries of the first step, with the advice."""
+        entries = self.entries[0].copy()
+        return entries.set(ADVICE, self.advice[0]) if self.advice else entries
+
 
 @torch.no_grad()
 def record(
@@ -80,7 +85,7 @@ def record(
     env = transformed(bare(1, TRAIN, None), [], "env").eval()
     env.set_seed(seed)
     keys = [*env.base_env.observation_spec.keys()]
-    recording, heard = Recording(), _Heard(controller)
+    recording, heard = Recording(), Heard(controller)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         episode, steps = -1, 0
@@ -110,7 +115,7 @@ def record(
     return recording
 
 
-class _Heard:
+class Heard:
     """Listens to the guides of a controller.
 
     Args:

@@ -19,7 +19,7 @@ from coil_rl.export.parity import LIMIT, WITH_GUIDE, Parity, compare, expected
 from coil_rl.export.policy import ExportedPolicy
 from coil_rl.export.recording import Recording, record
 from coil_rl.export.session import require
-from coil_rl.export.step import NotExportableError, PolicyStep, check_transforms
+from coil_rl.export.step import NotExportableError, PolicyStep, exportable
 from coil_rl.files import temporary
 from coil_rl.guides.controllers import EntryGuide, PerRow
 from coil_rl.guides.functions import FunctionGuide
@@ -62,7 +62,7 @@ def export_policy(
     check_range(1, 1_000_000, observations=observations)
     controller = run.controller(which)
     try:
-        check_transforms(controller)
+        exportable(controller)
     except NotExportableError as error:
         raise UserError(_impossible(run, str(error))) from error
     recording = _recorded(run, controller, observations, seed)
@@ -131,7 +131,7 @@ def _written(
     Raises:
         NotExportableError: if that is not possible, or they differ too much.
     """
-    step = PolicyStep(controller, inside=inside)
+    step = PolicyStep(controller, recording.example(), inside=inside)
     limit = WITH_GUIDE if inside and step.guides else LIMIT
     say("export: writing the function ...")
     try:
