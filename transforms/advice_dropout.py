@@ -25,6 +25,7 @@ class AdviceDropout(GuideTransform):
     """
 
     written = ("advice_given",)
+    constant = True
 
     def __init__(
         self,

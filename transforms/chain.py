@@ -58,6 +58,11 @@ class Chain(nn.Module):
         """
         return [link.first(data) for link in self._links()]
 
+    def remembered(self, past: Past) -> dict[tuple[int, NestedKey], Tensor]:
+        """Return what changes within an episode, by the number of the link and the key."""
+        parts = enumerate(zip(self._links(), past, strict=True))
+        return {(n, key): own[key] for n, (link, own) in parts if not link.constant for key in own}
+
     def forward(self, data: TensorDictBase, past: Past | None) -> tuple[TensorDictBase, Past]:
         """Return the data with the action that the env is given, and the state for the next step.
 
@@ -174,8 +179,3 @@ class Remembered(Link):
     def _mark(self, data: TensorDictBase, *, begins: bool) -> State:
         shape = (*data.batch_size, 1)
         return {"is_init": torch.full(shape, begins, device=data.device)} if self.marks else {}
-
-
-def flat(past: Past) -> dict[tuple[int, NestedKey], Tensor]:
-    """Return a state by the number of the link and the key of the entry."""
-    return {(number, key): value for number, own in enumerate(past) for key, value in own.items()}

@@ -408,6 +408,7 @@ class JumpStart(_ActionSwitch):
     """
 
     written = (EXECUTED, ACTS, REMAINING)
+    constant = True
 
     def __init__(
         self,

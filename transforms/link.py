@@ -27,6 +27,7 @@ class Link(Transform):
     """
 
     needs_past = False  # whether stored data of a single step are not enough
+    constant = False  # whether the state stays the same within an episode of an evaluation
     passed: Sequence[NestedKey] = ()  # entries that `act` leaves for the next `observe` only
 
     @property

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -19,10 +20,11 @@ from coil_rl.errors import UserError
 from coil_rl.run.parts import TRAIN
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import ActionSpace, space_of
-from coil_rl.transforms.chain import Chain, flat, links_of
+from coil_rl.transforms.chain import Chain, links_of
 
 LONGEST_CHAIN = 4  # learned guides of learned guides
-_loading: list[Path] = []  # runs that are being loaded, each of which is a guide of the one before
+# Runs that are being loaded, each of which is a guide of the one before.
+_LOADING: ContextVar[tuple[Path, ...]] = ContextVar("loading", default=())
 
 
 class LearnedGuide(TensorDictModuleBase):
@@ -66,7 +68,7 @@ class LearnedGuide(TensorDictModuleBase):
         inner = [guide for each in guides for guide in each.guides.guides.values()]
         self.by_row = any(getattr(guide, "by_row", False) for guide in inner)
         first = self.chain.first(TensorDict({}, [1], device=env.device))
-        self.memory = {f"learned_{n}_{'_'.join(_path(key))}": (n, key) for n, key in flat(first)}
+        self.memory = {f"learned_{n}": at for n, at in enumerate(self.chain.remembered(first))}
         self.start = {name: first[n][key][0] for name, (n, key) in self.memory.items()}
         supplied = {key for each in guides for key in each.supplied}
         self.in_keys = [*self.chain.reads, *supplied.intersection(["row"]), *self.memory]
@@ -113,20 +115,16 @@ class LearnedGuide(TensorDictModuleBase):
 @contextmanager
 def _guarded(folder: Path) -> Iterator[None]:
     """Refuse a run that is already being loaded as a guide, and too long a chain of them."""
-    place = folder.resolve()
-    if place in _loading:
+    place, loading = folder.resolve(), _LOADING.get()
+    if place in loading:
         raise UserError(f"run={folder} is its own guide; give a run that does not depend on itself")
-    if len(_loading) == LONGEST_CHAIN:
+    if len(loading) == LONGEST_CHAIN:
         raise UserError(
             f"run={folder} ends a chain of more than {LONGEST_CHAIN} learned guides; give a "
             "shorter one"
         )
-    _loading.append(place)
+    token = _LOADING.set((*loading, place))
     try:
         yield
     finally:
-        _loading.pop()
-
-
-def _path(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else key
+        _LOADING.reset(token)

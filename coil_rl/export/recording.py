@@ -58,11 +58,6 @@ class Recording:
         value: Tensor = self.advice[step] if key == ADVICE else self.entries[step][key]
         return value
 
-    def example(self) -> TensorDictBase:
-        """Return the entries of the first step, with the advice."""
-        entries = self.entries[0].copy()
-        return entries.set(ADVICE, self.advice[0]) if self.advice else entries
-
 
 @torch.no_grad()
 def record(

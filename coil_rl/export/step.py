@@ -14,7 +14,6 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import GRUModule
 
 from coil_rl.export.gru import WrittenGru
@@ -22,7 +21,7 @@ from coil_rl.learners.critics import Critics
 from coil_rl.run.controller import Controller
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import space_of
-from coil_rl.transforms.chain import Chain, Other, flat, links_of
+from coil_rl.transforms.chain import Chain, Other, links_of
 from coil_rl.transforms.degraded_advice import DegradedAdvice
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.last_action import LastAction
@@ -114,7 +113,6 @@ class PolicyStep(nn.Module):
 
     Args:
         controller: of a run; it must have acted before.
-        example: entries of the env of one step, with the input `guide_action`.
         inside: whether its guides are inside. Otherwise their actions are the input `guide_action`,
             [B, n_guides, A] in the unit of the env, for choices the numbers of the choices; guides
             that nothing reads are left out.
@@ -128,9 +126,7 @@ class PolicyStep(nn.Module):
         NotExportableError: for a part that is no function of tensors.
     """
 
-    def __init__(
-        self, controller: Controller, example: TensorDictBase, *, inside: bool = True
-    ) -> None:
+    def __init__(self, controller: Controller, *, inside: bool = True) -> None:
         super().__init__()
         plant, policy = controller.plant, WrittenPolicy(controller.policy)
         links = exportable(controller)
@@ -151,24 +147,16 @@ class PolicyStep(nn.Module):
             self.inputs.append(given.entry)
         self.space = space_of(plant, plant.action_key)
         self.eval().requires_grad_(False)
-        self.places, self.state = self._changing(example)
+        first = self.chain.remembered(self.chain.first(TensorDict({}, [1])))
+        self.places = list(first)
+        self.state = [self._entry(*place, value[0]) for place, value in first.items()]
 
-    @torch.no_grad()
-    def _changing(self, example: TensorDictBase) -> tuple[list[Any], list[Entry]]:
-        """Return the places of what changes from step to step in the state, and the entries."""
-        data = example.select(*(entry.key for entry in self.inputs))
-        first = self.chain.first(data)
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            after = flat(self.chain(data, [dict(each) for each in first])[1])
-        entries = list[Entry]()
-        places = [place for place, value in flat(first).items() if after[place] is not value]
-        for number, key in places:
-            # A guide may remember the executed action by the key of the agent's own ones.
-            own = isinstance(self.chain.links[number], LastAction)
-            name = ("past", *((key,) if isinstance(key, str) else key)) if own else key
-            value = first[number][key][0]
-            entries.append(Entry(name, tuple(value.shape), value.dtype, value))
-        return places, entries
+    def _entry(self, number: int, key: NestedKey, first: Tensor) -> Entry:
+        """Return an entry of the state."""
+        # A guide may remember the executed action by the key of the agent's own ones.
+        if isinstance(self.chain.links[number], LastAction):
+            key = ("past", *((key,) if isinstance(key, str) else key))
+        return Entry(key, tuple(first.shape), first.dtype, first)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         """Return the action and the state for the next step.

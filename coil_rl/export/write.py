@@ -131,7 +131,7 @@ def _written(
     Raises:
         NotExportableError: if that is not possible, or they differ too much.
     """
-    step = PolicyStep(controller, recording.example(), inside=inside)
+    step = PolicyStep(controller, inside=inside)
     limit = WITH_GUIDE if inside and step.guides else LIMIT
     say("export: writing the function ...")
     try:
