@@ -1,4 +1,4 @@
-"""What envs and controllers of others do wrong: one sentence with its place, or the right number."""
+"""What envs and controllers of others do wrong is one sentence with its place, or no harm."""
 
 import decimal
 import fractions
@@ -15,7 +15,7 @@ from torch import nn
 from torchrl.envs import TransformedEnv
 
 from coil_rl import GymnasiumEnv
-from coil_rl.envs.gate import ForeignError
+from coil_rl.foreign.faults import ForeignError
 from coil_rl.guides import ControllerGuide, PerRow
 from coil_rl.transforms import GuideActions
 
@@ -124,7 +124,9 @@ def is_one_sentence(caught, length=400):
     ],
 )
 def test_fault_in_a_step_has_its_place(answer, message):
-    with pytest.raises(ForeignError, match=rf"^the env .*row 0, seed 7, step 3\): .*{message}") as e:
+    with pytest.raises(
+        ForeignError, match=rf"^the env .*row 0, seed 7, step 3\): .*{message}"
+    ) as e:
         stepped(answer=answer)
     assert is_one_sentence(e)
 
@@ -261,6 +263,9 @@ def test_action_that_leaves_no_choice_is_refused(action, message):
         stepped(action=action, rows=1)
 
 
+ONE, SIZES = Plant(), itertools.count(1)
+
+
 class Broken(Plant):
     action_space = property(fail(NotImplementedError("later")), lambda self, space: None)
 
@@ -275,9 +280,9 @@ class Broken(Plant):
         (gymnasium.Env, "the env Env has no action_space: set it in its __init__"),
         (lambda: Plant(space=None), "the env .* has no observation_space"),
         (lambda: Plant(space=[1]), r"the observation_space of .* is \[1\], not a space"),
-        (lambda plant=Plant(): plant, "the maker of .* returned one env twice"),
+        (lambda: ONE, "the maker of .* returned one env twice"),
         (
-            lambda sizes=itertools.count(1): Plant(action=spaces.Box(-1, 1, (next(sizes),))),
+            lambda: Plant(action=spaces.Box(-1, 1, (next(SIZES),))),
             r"the action_space of .* is Box.* in row 1, but Box.* in row 0",
         ),
     ],
@@ -357,12 +362,12 @@ class Late:
     ],
 )
 def test_fault_of_a_controller_has_its_place(answer, message, beside):
+    makers = iter([Late(lambda: [0.5]), Late(answer)])
+    given = {"controllers": {"pid": Late(answer)}}
+    if not beside:
+        given = {"guide": PerRow(lambda: next(makers), title="PID")}
     with pytest.raises(ForeignError, match=message) as caught:
-        if beside:
-            stepped(controllers={"pid": Late(answer)})
-        else:
-            makers = iter([Late(lambda: [0.5]), Late(answer)])
-            stepped(PerRow(lambda: next(makers), title="PID"))
+        stepped(**given)
     place = r"row 0, seed 7, step 3" if beside else "the controller PID (row 1, step 3): "
     assert place in str(caught.value)
     assert is_one_sentence(caught)
@@ -415,7 +420,11 @@ class Gives:
         (spaces.Discrete(3, start=5), (0.5,), r"neither a number from \[5\] to \[7\] nor a one-"),
         (spaces.Discrete(3, start=-1), (7,), r"neither a number from \[-1\] to \[1\] nor a one-"),
         (spaces.MultiBinary(2), (6,), r"returned \[6\], which has the shape \[1\], but must have"),
-        (spaces.MultiDiscrete([3, 2], start=[1, 10]), ([1, 1],), r"from \[1, 10\] to \[3, 11\] nor"),
+        (
+            spaces.MultiDiscrete([3, 2], start=[1, 10]),
+            ([1, 1],),
+            r"from \[1, 10\] to \[3, 11\] nor",
+        ),
         (spaces.Box(-2, 2, (2, 2)), ([1, 1],), r"has the shape \[2\], but must have \[2, 2\]"),
         (spaces.Box(-1, 1, (2, 3)), (np.zeros((3, 2)),), r"shape \[3, 2\], but must have \[2, 3\]"),
     ],
