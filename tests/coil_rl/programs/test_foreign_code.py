@@ -9,7 +9,7 @@ import pytest
 from programs import called
 
 import coil_rl
-from coil_rl.foreign.faults import ForeignError
+from coil_rl import UserError
 
 SOURCE = """
 import gymnasium
@@ -139,7 +139,7 @@ def test_fault_ends_a_program_with_one_sentence(program, env, words, message, tm
 
 def test_fault_is_one_sentence_in_python(tmp_path):
     words = [word for word in TINY[1:] if not word.startswith(("hydra", "budget.frames"))]
-    with pytest.raises(ForeignError, match="the env NoReward .*: the reward is None"):
+    with pytest.raises(UserError, match=r"^the env NoReward .*: the reward is None"):
         coil_rl.train(
             "odd_plants:NoReward",
             guide=Model(),
