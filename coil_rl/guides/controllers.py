@@ -474,7 +474,7 @@ class RecordedGuide(TensorDictModuleBase):
     """Actions from a CSV file by the number of the step, from the first step of every episode on.
 
     The last one is held after the end of the file. The steering of a robot's recording is
-    `RecordingGuide`.
+    `coil_robot.RecordingGuide`.
 
     Args:
         file: a CSV of numbers, [T, A] in the env's unit, one line for each step, separated by
