@@ -20,6 +20,7 @@ from programs import CONF
 
 import coil_paper
 import coil_rl
+from coil_rl.ranges import settings_of
 
 MODULES = [
     module.name
@@ -112,8 +113,9 @@ def documented(thing: Public) -> list[str]:
 def faults(thing: Public) -> Iterator[str]:
     title = f"{thing.__module__}.{thing.__qualname__}"
     for parameter in parameters(thing):
-        if inspect.isclass(thing) and parameter.kind is parameter.VAR_KEYWORD:
-            yield f"{title} has **{parameter.name}; spell the arguments out"
+        unknown = parameter.kind is parameter.VAR_KEYWORD and settings_of(parameter) is None
+        if inspect.isclass(thing) and unknown:
+            yield f"{title} has **{parameter.name}; spell the arguments out, or Unpack settings"
     names = [parameter.name for parameter in parameters(thing)]
     if documented(thing) != names:
         yield f"{title} documents {documented(thing)}, but takes {names}"
