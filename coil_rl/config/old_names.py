@@ -6,7 +6,11 @@ from typing import Any
 
 from coil_rl.errors import UserError
 
-MOVED = {"coil_rl.guides.learned.LearnedGuide": "coil_rl.LearnedGuide"}
+OLD_NAMES = {
+    "coil_rl.envs.EnvBatch": "coil_rl.foreign.torchrl_env.EnvBatch",
+    "coil_rl.envs.gymnasium_env.GymnasiumEnv": "coil_rl.foreign.gymnasium_env.GymnasiumEnv",
+    "coil_rl.guides.learned.LearnedGuide": "coil_rl.LearnedGuide",
+}
 GONE = {
     "coil_rl.imitation.SklearnRegressor": "regressors of scikit-learn are saved in another way",
 }
@@ -28,4 +32,4 @@ def renamed(node: Any, path: Path) -> Any:
         return [renamed(value, path) for value in node]
     if isinstance(node, str) and node in GONE:
         raise UserError(f"{path} is of an earlier version: {GONE[node]} today; train again")
-    return MOVED.get(node, node) if isinstance(node, str) else node
+    return OLD_NAMES.get(node, node) if isinstance(node, str) else node
