@@ -8,7 +8,7 @@ each of them must be on a list of full names before anything is imported:
 
 - what the shipped configuration names in the groups of a run, also as an alternative in a comment:
   a part that has its YAML file is on the list;
-- the estimators of scikit-learn and the transforms of TorchRL in `conf/trusted.yaml`;
+- some transforms of TorchRL, none of which writes a file where the folder says;
 - what the configuration of the command itself names, because the command uses it anyway;
 - anything that is defined in a package that the user trusts.
 
@@ -31,7 +31,6 @@ from omegaconf import DictConfig, OmegaConf
 from coil_rl.config.guest_files import packages
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.run.stopping import remember_trust
-from coil_rl.trusted import ESTIMATORS, TRUSTED
 
 ENTRY_POINTS = (
     "coil_rl.trusted"  # a package with an entry point of its name in this group is trusted
@@ -50,9 +49,19 @@ NEVER_TRUSTED = frozenset(sys.stdlib_module_names) | {
     "torch",
 }
 
-NAMED = ESTIMATORS.union(
-    ["coil_rl.config.given.kept"],  # it looks an object up that the user handed over in Python
-    (f"torchrl.envs.{name}" for name in TRUSTED["transforms"]),
+NAMED = frozenset(
+    [
+        "coil_rl.config.given.kept",  # it looks an object up that the user handed over in Python
+        "torchrl.envs.CatFrames",
+        "torchrl.envs.ClipTransform",
+        "torchrl.envs.DoubleToFloat",
+        "torchrl.envs.ObservationNorm",
+        "torchrl.envs.RewardClipping",
+        "torchrl.envs.RewardScaling",
+        "torchrl.envs.StepCounter",
+        "torchrl.envs.TimeMaxPool",
+        "torchrl.envs.VecNorm",
+    ]
 )
 
 _packages: frozenset[str] = frozenset()  # of the option `trust`
@@ -142,10 +151,6 @@ def check_config(config: DictConfig, path: Path) -> None:
             _check_target(target, name, path)
         elif str(key).startswith("_") and key != "_partial_":
             raise UserError(f"{path}: {name:.100} is not a key of a run's configuration; remove it")
-        if (key == "memory" or str(key).endswith("__memory")) and value is not None:
-            raise UserError(
-                f"{path}: {name:.100} names a cache, whose files can run code; set it to null"
-            )
         # Only a logger is saved with references, and none to itself, so that they cannot grow.
         known = r"(?!)"
         if name.startswith("logger.") and key != "_target_":
