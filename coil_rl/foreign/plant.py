@@ -156,7 +156,7 @@ class GymnasiumPlant(Plant):
             self._open()
         self.seed, self.steps = seed, 0
         with foreign(self.place, "reset"):
-            answer = self.env.reset(seed=seed)
+            answer: Any = self.env.reset(seed=seed)
         with self.placed():
             if not isinstance(answer, (tuple, list)) or len(answer) != 2:
                 raise ForeignError(
@@ -184,7 +184,7 @@ class GymnasiumPlant(Plant):
             return
         self.steps += 1
         try:  # without `foreign` and `placed`, which cost as much as a step of a small env
-            answer = self.env.step(action)
+            answer: Any = self.env.step(action)
         except (Exception, SystemExit) as error:
             with foreign(self.place, "step"):
                 raise error
@@ -280,7 +280,7 @@ class GymnasiumPlant(Plant):
                 size than before.
         """
         with foreign(f"the env {self.name}", "render"):
-            picture = self.env.render()
+            picture: Any = self.env.render()
         found = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.size > 0
         if not found or not (
             picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] in (3, 4))
