@@ -18,6 +18,12 @@ from coil_rl.run.stopping import remember_trust
 ROOT = Path(__file__).parents[1]
 CONF = Path(coil_rl.conf.__path__[0])  # of the library that is tested, which may be a wheel
 
+# Programs of guests, by command.
+GUESTS = {
+    "compare": "coil_rl.comparison.program",
+    "listen": "coil_studies.listening.program",
+    "reproduce": "coil_paper.program",
+}
 TRACK = ["track=folder", f"track.dir={ROOT / 'tests' / 'ring.csv'}"]
 LAP = [*TRACK, "env.laps=1", "env.rate=6"]
 SHORT_LAP = [*LAP, "env.time_limit=2"]
@@ -67,7 +73,7 @@ def shipped(group):
 
 def module(name):
     """Return the module of a program."""
-    return "coil_paper.program" if name == "reproduce" else f"coil_rl.programs.{name}"
+    return GUESTS.get(name, f"coil_rl.programs.{name}")
 
 
 def command(name, *arguments):

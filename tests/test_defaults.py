@@ -12,7 +12,7 @@ from programs import CONF
 
 import coil_paper.conf
 
-PROJECT = ("coil_rl.", "coil_paper.")
+PROJECT = ("coil_rl.", "coil_paper.", "coil_studies.")
 # Folders in which a file changes the defaults of a class for a method or an experiment.
 VARIATION_FOLDERS = ("experiment", "method", "preset", "paper/experiment")
 # Other deliberate variations, by file. A key stands for all keys that begin with it.

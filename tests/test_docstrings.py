@@ -20,14 +20,15 @@ from programs import CONF
 
 import coil_paper
 import coil_rl
+import coil_studies
 
 MODULES = [
     module.name
-    for package in (coil_rl, coil_paper)
+    for package in (coil_rl, coil_paper, coil_studies)
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
     if ">>>" in (importlib.util.find_spec(module.name).loader.get_source(module.name) or "")
 ]
-TARGET = re.compile(r"_target_: *(coil_rl\.[\w.]+)")
+TARGET = re.compile(r"_target_: *(coil_(?:rl|studies)\.[\w.]+)")
 NAME = re.compile(r"    (\*{0,2}\w[\w, ]*):")
 
 Public = Callable[..., Any]

@@ -14,6 +14,7 @@ LINKED = {
     "transforms": "coil_rl.transforms",
     "conf": "coil_rl.conf",
     "paper": "coil_paper",
+    "studies": "coil_studies",
 }
 TENSOR_LIBRARIES = {"torch", "tensordict", "torchrl"}
 
@@ -26,7 +27,7 @@ PUBLIC = [
     "coil_rl.guides",
     "coil_rl.imitation",
     "coil_rl.learners",
-    "coil_rl.listening",
+    "coil_studies.listening",
     "coil_rl.replay",
     "coil_rl.report",
     "coil_rl.robot",

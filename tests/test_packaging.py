@@ -20,6 +20,7 @@ LINKS = {
     "coil_rl/transforms": "../transforms",
     "coil_rl/conf": "../conf",
     "coil_paper": "paper",
+    "coil_studies": "studies",
 }
 
 SHIPPED = (".md", ".csv", ".pt", ".yaml")  # files of the shipped policies
@@ -95,7 +96,8 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
         "envs": ["*.py", "*.json", "tracks/**/*.csv"],
     }
     patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"], "paper": ["*.py", "*.yaml"]}
-    installed_as = {"coil_rl": "coil_rl", "paper": "coil_paper"}
+    patterns["studies"] = ["*.py", "*.yaml"]
+    installed_as = {"coil_rl": "coil_rl", "paper": "coil_paper", "studies": "coil_studies"}
     expected = set()
     for folder, globs in patterns.items():
         package = installed_as.get(folder, f"coil_rl/{folder}")
@@ -112,9 +114,13 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
     } <= names
 
 
-def test_wheel_has_two_import_names(wheel: Path) -> None:
+def test_wheel_has_three_import_names(wheel: Path) -> None:
     top = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
-    assert {name for name in top if not name.endswith(".dist-info")} == {"coil_rl", "coil_paper"}
+    assert {name for name in top if not name.endswith(".dist-info")} == {
+        "coil_rl",
+        "coil_paper",
+        "coil_studies",
+    }
 
 
 @pytest.mark.slow

@@ -50,10 +50,10 @@ from coil_rl.run.folder import weights_file
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
 from coil_rl.run.run import HANDED_OVER
 from coil_rl.run.training import INIT
-from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.guide_actions import UnfitActionError
+from coil_rl.tune.search import Search
 
 # Kind of a learner: description and example.
 KINDS = {
