@@ -235,11 +235,10 @@ class Cnn(Mlp):
 
     Args:
         hidden: widths of the hidden layers after the convolutions.
-        activation: of all layers: tanh, relu, elu, silu or fast_tanh.
+        activation: of all layers, see `Mlp`.
         channels: output channels of each convolution.
         kernels: width of each convolution.
         strides: step of each convolution.
-        layer_norm: whether the numbers of a hidden layer are normalised before its activation.
     """
 
     hidden: Sequence[int] = (512,)
@@ -272,9 +271,7 @@ class Gru(Mlp):
 
     Args:
         hidden: widths of the hidden layers after the GRU.
-        activation: of the hidden layers: tanh, relu, elu, silu or fast_tanh.
         state: width of the state of the GRU.
-        layer_norm: whether the numbers of a hidden layer are normalised before its activation.
 
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv

@@ -128,11 +128,6 @@ class FilteredKickstartLoss(KickstartLoss):
     al. 2018).
 
     Args:
-        coefficient: weight of the loss, a number or a schedule.
-        kind: "likelihood": -log pi(g | s); or "divergence": KL(N(g, scale) || pi).
-        scale: standard deviation of the guide for the divergence, before squashing.
-        guide: index of the guide in the advice.
-        advice_key: entry with the advice, [N, n_guides, A].
         soft: whether the weight is the probability that g has the larger value, by the spread of
             the critics (SPReD, 2025): Phi((mean Q_g - mean Q_pi) / sqrt(var Q_g + var Q_pi)).
     """
