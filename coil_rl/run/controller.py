@@ -21,7 +21,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type
 
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.transforms import GuideActions, undisturbed
 
 
@@ -36,7 +36,7 @@ class Controller:
             has its own delays and noise.
         policy: of the run, for this env.
         folder: of the run, if it has one.
-        which: name of the policy in the folder, "handed_over", "last" or "best".
+        which: name of the policy in the folder, "handed_over" or "last".
 
     Example:
         >>> import coil_rl

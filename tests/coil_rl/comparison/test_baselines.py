@@ -17,8 +17,8 @@ from coil_rl.comparison.baselines import (
 )
 from coil_rl.comparison.outcome import read_outcome
 from coil_rl.config.build import build_evaluation, env_maker
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.errors import UserError
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.report import write_csv
 from coil_rl.run.parts import TEST
 
