@@ -21,6 +21,7 @@ LINKS = {
     "coil_rl/conf": "../conf",
     "coil_paper": "paper",
     "coil_studies": "studies",
+    "coil_robot": "robot",
 }
 
 SHIPPED = (".md", ".csv", ".pt", ".yaml")  # files of the shipped policies
@@ -97,7 +98,13 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
     }
     patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"], "paper": ["*.py", "*.yaml"]}
     patterns["studies"] = ["*.py", "*.yaml"]
-    installed_as = {"coil_rl": "coil_rl", "paper": "coil_paper", "studies": "coil_studies"}
+    patterns["robot"] = ["*.py", "*.yaml", "*.json"]
+    installed_as = {
+        "coil_rl": "coil_rl",
+        "paper": "coil_paper",
+        "robot": "coil_robot",
+        "studies": "coil_studies",
+    }
     expected = set()
     for folder, globs in patterns.items():
         package = installed_as.get(folder, f"coil_rl/{folder}")
@@ -120,6 +127,7 @@ def test_wheel_has_three_import_names(wheel: Path) -> None:
         "coil_rl",
         "coil_paper",
         "coil_studies",
+        "coil_robot",
     }
 
 
@@ -129,10 +137,20 @@ def test_sdist_contains_everything_that_its_tests_need(tree: Path) -> None:
     [sdist] = tree.parent.glob("*.tar.gz")
     with tarfile.open(sdist) as file:
         names = {name.partition("/")[2] for name in file.getnames()}
-    folders = ["benchmarks", "coil_rl", "conf", "docs", "envs", "examples", "paper", "tests"]
+    folders = [
+        "benchmarks",
+        "coil_rl",
+        "conf",
+        "docs",
+        "envs",
+        "examples",
+        "paper",
+        "robot",
+        "tests",
+    ]
     paths = [
         path
-        for folder in [*folders, "transforms"]
+        for folder in [*folders, "tests", "transforms"]
         for path in (tree / folder).rglob("*")
         if path.is_file()
     ]
