@@ -129,11 +129,7 @@ class PackageNames(Generated):
 
 
 def help_of(program: str) -> str:
-    """Return the header of the help of a program; its docstring if it has no configuration.
-
-    Args:
-        program: the name of the command.
-    """
+    """Return the header of the help of a program; its docstring if it has no configuration."""
     module = PROJECT["scripts"][program].partition(":")[0]
     file = Path(program.removeprefix("coil-")).with_suffix(".yaml")
     for folder in (CONF, ROOT / "paper" / "conf"):
@@ -143,11 +139,7 @@ def help_of(program: str) -> str:
 
 
 def description(file: Path) -> str:
-    """Return the first sentence of the comment at the beginning of a YAML file.
-
-    Args:
-        file: of the configuration.
-    """
+    """Return the first sentence of the comment at the beginning of a YAML file."""
     comments = []
     for line in file.read_text().splitlines():
         if not line.startswith("#"):
@@ -159,24 +151,14 @@ def description(file: Path) -> str:
 
 
 def block(file: Path) -> Iterator[str]:
-    """Yield a YAML file as a block of code, with its name.
-
-    Args:
-        file: of the configuration.
-    """
+    """Yield a YAML file as a block of code, with its name."""
     yield from ("```{code-block} yaml", f":caption: conf/{file.relative_to(CONF)}", "")
     yield from file.read_text().splitlines()
     yield from ("```", "")
 
 
 def documented(module: str, name: str, thing: object) -> Iterator[str]:
-    """Yield the autodoc directive of a public name.
-
-    Args:
-        module: from which it is imported.
-        name: its name there.
-        thing: what it is.
-    """
+    """Yield the autodoc directive of a public name."""
     kind = "data"
     if inspect.isclass(thing):
         kind = "exception" if issubclass(thing, Exception) else "class"
@@ -190,18 +172,13 @@ def is_of(thing: object, modules: tuple[str, ...]) -> bool:
 
     Args:
         thing: class, function or value.
-        modules: their names.
     """
     module = getattr(thing, "__module__", "coil_rl")
     return any(module == each or module.startswith(f"{each}.") for each in modules)
 
 
 def escaped(text: str) -> str:
-    """Return a text as it stands in a cell of a table.
-
-    Args:
-        text: plain.
-    """
+    """Return a text as it stands in a cell of a table."""
     return text.replace("|", "\\|").replace("*", "\\*").replace("[", "\\[")
 
 
@@ -264,11 +241,7 @@ def keep_present(app: Sphinx, page: str, source: list[str]) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register the directives.
-
-    Args:
-        app: of the build.
-    """
+    """Register the directives."""
     directives: dict[str, type[Generated]] = {
         "commands": Commands,
         "extras": Extras,
