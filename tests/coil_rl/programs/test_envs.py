@@ -105,7 +105,9 @@ def test_env_takes_steps_with_the_advice_of_its_guide(env):
         assert rollout[key].float().isfinite().all(), key
 
 
-@pytest.mark.parametrize("env", [*TRACKED, *OTHERS])
+@pytest.mark.parametrize(
+    "env", [*(pytest.param(env, marks=pytest.mark.slow) for env in TRACKED), *OTHERS]
+)
 def test_env_trains_and_is_evaluated_in_its_own_cases(env, tmp_path):
     trained(env, "ppo", tmp_path / "run")
     with (tmp_path / "run" / "evaluation.csv").open(newline="") as file:
