@@ -19,7 +19,7 @@ from coil_rl.files import write_text
 from coil_rl.plain_yaml import read_yaml, yaml_of
 from coil_rl.report.runs import DELIVERY
 from coil_rl.report.table import markdown_table
-from coil_rl.run.folder import COMMAND, CONFIG
+from coil_rl.run.folder import COMMAND, CONFIG, HANDED_OVER, weights_file
 from coil_rl.run.reasons import handed_over
 
 PLACE = Path(__file__).parents[1] / "coil_rl" / "policies"
@@ -50,7 +50,7 @@ def ship(run: Path, name: str) -> Path:
     folder = PLACE / name
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / CONFIG, yaml_of(settings))
-    files = ["policy_best.pt" if tested else "policy_last.pt", EVALUATION]
+    files = [weights_file(run, HANDED_OVER if tested else "last").name, EVALUATION]
     files += [DELIVERY] if tested else []
     for file in files:
         (folder / file).write_bytes((run / file).read_bytes())

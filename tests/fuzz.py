@@ -112,7 +112,7 @@ POLICY, LOGS = (
     ["config.yaml", "metrics.csv", "guide_return.json"],
 )
 READ = {  # files by use; others are damaged now and then
-    "resume": [*LOGS, "checkpoint.pt", "checkpoint_previous.pt", "policy_best.pt"],
+    "resume": [*LOGS, "checkpoint.pt", "checkpoint_previous.pt", "policy_last.pt"],
     "report": [*LOGS, "evaluation.csv", "episodes.csv"],
 }
 ON_TRACKS = [

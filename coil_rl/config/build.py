@@ -159,7 +159,7 @@ def about_returns(sizes: Mapping[str, int], *, tested: bool = False) -> list[str
     if EVALUATION in sizes:
         chosen = ""
         if SELECTION in sizes and not tested:
-            chosen = f", and policy_best was chosen in {sizes[SELECTION]} others"
+            chosen = f", and the best policy of a report is chosen in {sizes[SELECTION]} others"
         sentences.append(
             f"The curve rests on {sizes[EVALUATION]} cases{chosen}; none of them is in the table."
         )

@@ -46,9 +46,8 @@ from coil_rl.output import say
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
 from coil_rl.run.fallback import check_cases_of_guide, critic_beside_guide, no_effect
-from coil_rl.run.folder import weights_file
+from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
-from coil_rl.run.run import HANDED_OVER
 from coil_rl.run.training import INIT
 from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions

@@ -59,7 +59,7 @@ Threads = Annotated[int, Field(ge=1, le=1024)]
 Envs = Annotated[int, Field(ge=1, le=2**20)]
 Steps = Annotated[int, Field(ge=1, le=2**16)]
 Repeats = Annotated[int, Field(ge=1, le=10_000)]
-WhichPolicy = Annotated[str, one_of("handed_over", "last", "best")]
+WhichPolicy = Annotated[str, one_of("handed_over", "last")]
 
 
 class NodeConfig:

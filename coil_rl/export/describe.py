@@ -27,6 +27,7 @@ from coil_rl.learners.normaliser import Normaliser
 from coil_rl.measures import MEAN_CASE
 from coil_rl.run.controller import Controller
 from coil_rl.run.delivery import GuideActs
+from coil_rl.run.folder import HANDED_OVER
 from coil_rl.run.reasons import FIRST, delivered, handed_over
 from coil_rl.run.run import Run
 
@@ -58,7 +59,7 @@ def describe(
         step: what was exported.
         parity: how much the file differs.
         contents: of the files, by name.
-        which: policy of the run, "handed_over", "last" or "best".
+        which: policy of the run, "handed_over" or "last".
         outside: why the guides are outside; None if they are not.
         meanings: of entries, in place of what the env says, see `coil_rl.envs.meanings`.
     """
@@ -122,8 +123,7 @@ def guide_itself(controller: Controller, step: PolicyStep) -> str | None:
 
 
 def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
-    file = run.file_of(which)
-    tested = file == "best"  # so a test may have chosen it
+    tested = which == HANDED_OVER and run.delivery == "tested"  # so a test may have chosen it
     method = run.settings.get("method") or {}
     acts = LEARNED
     if guide is not None:
@@ -136,7 +136,7 @@ def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
         "seed": run.seed,
         "frames": run.budget.frames,
         "which": which,
-        "chosen": (tested and handed_over(run.folder)) or f"the {file} policy of the training",
+        "chosen": (tested and handed_over(run.folder)) or "the last policy of the training",
         "acts": acts,
         "actions": "deterministic",
     }

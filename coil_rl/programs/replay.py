@@ -117,7 +117,6 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
     from coil_rl.replay.annotation import annotate, foxglove_layout
     from coil_rl.replay.report import draw_steering, over_time
     from coil_rl.report import write_csv
-    from coil_rl.run.folder import weights_file
 
     robot = config.env
     # The folder of the results is left out, so that it does not change the bytes.
@@ -127,8 +126,7 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
     for name, (run, own) in runs.items():
         text = (run / "config.yaml").read_bytes()
         attachments[f"{name}/config.yaml"] = inputs[f"{name}_config"] = text
-        which = assemble(own, run).file_of(config.policy)
-        inputs[f"{name}_checkpoint"] = weights_file(run, which).read_bytes()
+        inputs[f"{name}_checkpoint"] = assemble(own, run).weights(config.policy).read_bytes()
     about = {}
     for name, content in inputs.items():
         about[f"{name}_sha256"] = hashlib.sha256(content).hexdigest()

@@ -36,7 +36,7 @@ class Controller:
             has its own delays and noise.
         policy: of the run, for this env.
         folder: of the run, if it has one.
-        which: name of the policy in the folder, "handed_over", "last" or "best".
+        which: name of the policy in the folder, "handed_over" or "last".
 
     Example:
         >>> import coil_rl

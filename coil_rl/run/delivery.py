@@ -31,6 +31,7 @@ from coil_rl.report.statistics import mean_interval
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
 from coil_rl.run.curve import EvaluationCurve
+from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.judge import guide_titles
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.combined_actions import GradualResidual, ResidualAction
@@ -74,8 +75,8 @@ class GuideActs(TensorDictModuleBase):
 class Delivery:
     """The test at the end of a training, a `Callback`.
 
-    It writes `policy_best.pt`, the policy that is handed over, and `delivery.json`, which says
-    which it is and why. Ties go to the last policy.
+    It writes the policy that is handed over, `policy_handed_over.pt`, and `delivery.json`, which
+    says which it is and why. Ties go to the last policy.
 
     Args:
         learner: has the policy.
@@ -169,7 +170,7 @@ class Delivery:
         means = {name: float(values.mean()) for name, values in returns.items()}
         chosen = max(means, key=lambda name: means[name])
         cases = len(returns["last"])
-        checkpoint.save(candidates[chosen], self.folder / "policy_best.pt")
+        checkpoint.save(candidates[chosen], weights_file(self.folder, HANDED_OVER))
         self._report(chosen, means, returns, earlier)
         guides = [mean for name, mean in means.items() if name not in ("last", "earlier")]
         numbers = (
@@ -182,7 +183,7 @@ class Delivery:
 
     def _hand_over_untested(self, last: dict[str, Any]) -> dict[str, float]:
         """Hand over the last policy without a test, and return NaN for its mean returns."""
-        checkpoint.save(last, self.folder / "policy_best.pt")
+        checkpoint.save(last, weights_file(self.folder, HANDED_OVER))
         self._report(UNTESTED, {}, {"last": torch.empty(0)}, None)
         return dict.fromkeys(self.names, math.nan) | {"delivery/cases": 0.0}
 

@@ -21,6 +21,8 @@ from coil_rl.plain_yaml import yaml_of
 from coil_rl.run.stopping import resume_command
 
 CONFIG, COMMAND = "config.yaml", "command.txt"
+HANDED_OVER = "handed_over"  # the policy that `delivery` chose
+OLD_HANDED_OVER = "policy_best.pt"  # its file in older folders
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = (
     "coil-rl",
@@ -84,8 +86,11 @@ def write_config(folder: Path, saved: Mapping[str, Any]) -> None:
 
 
 def weights_file(folder: Path, which: str = "last") -> Path:
-    """Return the file with the weights of the `last` or `best` policy of a run."""
-    return folder / f"policy_{which}.pt"
+    """Return the file with the weights of the `last` or the `handed_over` policy of a run."""
+    file = folder / f"policy_{which}.pt"
+    if which == HANDED_OVER and not file.exists() and (folder / OLD_HANDED_OVER).exists():
+        return folder / OLD_HANDED_OVER
+    return file
 
 
 def check_same(

@@ -29,11 +29,11 @@ from coil_rl.run.cases import TrainingCases
 from coil_rl.run.curve import measures
 from coil_rl.run.delivery import GUIDE, GuideActs
 from coil_rl.run.experiment import PUT_BACK, check_identity
-from coil_rl.run.folder import weights_file
+from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.parts import TESTS
 from coil_rl.run.reasons import beyond_budget
-from coil_rl.run.run import HANDED_OVER, Run
+from coil_rl.run.run import Run
 from coil_rl.run.stopping import STOP, resume_command
 from coil_rl.run.tuning import BEST, MEAN, OWN, MakeGuide, Number, Search, Tuner, Values, chosen
 
@@ -66,7 +66,7 @@ class TunedRun(Run):
 
         Args:
             env: with the transforms of the run.
-            which: "handed_over", "last" or "best", which are the same here.
+            which: "handed_over" or "last", which are the same here.
 
         Raises:
             UserError: if the run is not finished, or its files are damaged.
@@ -208,7 +208,7 @@ class TunedRun(Run):
         returns = tuner.test()
         name = chosen(returns)
         write_text(self.folder / TUNED, json.dumps(values[name], indent=2))
-        for which in ("last", "best"):
+        for which in ("last", HANDED_OVER):
             checkpoint.save({GUIDE: torch.tensor(0)}, weights_file(self.folder, which))
         report = {
             "policy": NAMES[name],

@@ -104,7 +104,7 @@ def test_a_shipped_policy_completes_a_lap_of_the_robot(tmp_path):
         ([*OWN, "recording=x.mcap"], "do not go together"),
         ([*OWN, "where=recording", "recording=x.mcap"], "x.mcap"),
         ([*OWN, "where=moon"], "where"),
-        ([*OWN, "policy=best"], "policy=best has no effect: nothing reads it with a controller"),
+        ([*OWN, "policy=last"], "policy=last has no effect: nothing reads it with a controller"),
         ([*OWN, "scan=/x"], "scan=/x has no effect: nothing reads it with a controller and where="),
         ([*OWN, "ros.stamped=true"], "ros.stamped=true has no effect"),
         ([*OWN, "where=ros", "simulation.laps=1"], "simulation.laps=1 has no effect"),

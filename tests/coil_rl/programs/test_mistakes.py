@@ -471,7 +471,7 @@ def test_tracks_are_not_changed_where_none_are_chosen(started, run):
 @pytest.mark.parametrize(
     "change",
     [
-        "evaluation.policy=best",
+        "evaluation.policy=last",
         "evaluation.fallback=true",
         "evaluation.repeats=9",
         "+evaluation.advice.x=1",

@@ -284,13 +284,13 @@ def test_equal_labels_are_distinguished_by_seed_and_then_by_number():
             "runs=nowhere is not the folder of a run: it has no config.yaml",
         ),
         ("recording=drive.mcap runs=[guide]", "guide has no agent: its guide drives alone"),
-        ("recording=drive.mcap policy=best", "policy=best has no effect: nothing in a replay with"),
+        ("recording=drive.mcap policy=last", "policy=last has no effect: nothing in a replay with"),
         ("recording=drive.mcap env.num_envs=2", "env.num_envs=2 has no effect: each recording has"),
         ("recording=drive.mcap env.smooth=-1", "env.smooth=-1 has no effect: a replay earns no"),
         ("recording=drive.mcap runs=[coil_0,./coil_0]", "coil_0 twice; leave one out"),
         (
             "recording=drive.mcap runs=[coil_0] policy=best",
-            "there is no file coil_0/policy_best.pt",
+            "policy='best' must be 'handed_over' or 'last'",
         ),
         (
             "recording=drive.mcap runs=[coil_0] guide=zero +guide.coil=${guide.zero}",
