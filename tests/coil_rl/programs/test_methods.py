@@ -7,6 +7,7 @@ import shutil
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from slow import some_fast
 from tiny_runs import METHODS, TRACKS, trained
 
 from coil_rl.config.load import open_run
@@ -23,13 +24,7 @@ def proxies(tmp_path_factory):
     return f"proxy.folder={tmp_path_factory.mktemp('proxies')}"
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        name if name == "coil_anchored" else pytest.param(name, marks=pytest.mark.slow)
-        for name in METHODS
-    ],
-)
+@pytest.mark.parametrize("method", some_fast(METHODS, ["coil_anchored"]))
 def test_method_ends_with_the_same_files_after_a_resume(method, proxies, tmp_path, capsys):
     run = trained(tmp_path / "run", method, proxies, "track.test.count=1")
     stopped = tmp_path / "stopped"
