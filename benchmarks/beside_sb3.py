@@ -33,7 +33,7 @@ from torchrl.envs import (
 from tqdm import tqdm
 
 from benchmarks.timing import Stopwatch
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.learners import DQN, PPO, SAC, Mlp
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear

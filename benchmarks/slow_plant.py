@@ -13,7 +13,7 @@ from gymnasium.spaces import Box
 from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 
 from benchmarks.timing import Row, Work, measure, median_ratio, medians
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.learners import PPO
 from coil_rl.run.rollout import Rollout
 

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from coil_rl.config.values import check_values as check_values
     from coil_rl.envs import ConeTrackEnv as ConeTrackEnv
     from coil_rl.envs import DrivingTasksEnv as DrivingTasksEnv
-    from coil_rl.envs import EnvBatch as EnvBatch
     from coil_rl.envs import McapReplayEnv as McapReplayEnv
     from coil_rl.envs import SimulatedRobotEnv as SimulatedRobotEnv
     from coil_rl.envs import Track as Track
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
     from coil_rl.envs import load_tracks as load_tracks
     from coil_rl.envs import random_tracks as random_tracks
     from coil_rl.envs import shipped_tracks as shipped_tracks
-    from coil_rl.envs.gymnasium_env import GymnasiumEnv as GymnasiumEnv
     from coil_rl.envs.limits import check_range as check_range
     from coil_rl.errors import UserError as UserError
     from coil_rl.errors import did_you_mean as did_you_mean
@@ -41,6 +39,8 @@ if TYPE_CHECKING:
     from coil_rl.export import ExportedPolicy as ExportedPolicy
     from coil_rl.export import export_policy as export_policy
     from coil_rl.files import write_text as write_text
+    from coil_rl.foreign.gymnasium_env import GymnasiumEnv as GymnasiumEnv
+    from coil_rl.foreign.torchrl_env import EnvBatch as EnvBatch
     from coil_rl.guides import ConstantGuide as ConstantGuide
     from coil_rl.guides import ControllerGuide as ControllerGuide
     from coil_rl.guides import EntryGuide as EntryGuide
@@ -88,9 +88,10 @@ if TYPE_CHECKING:
     from coil_rl.worth.comparison import compare as compare
 
 _NAMES = {
-    "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv EnvBatch McapReplayEnv SimulatedRobotEnv Track "
+    "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv McapReplayEnv SimulatedRobotEnv Track "
     "load_track load_tracks random_tracks shipped_tracks",
-    "coil_rl.envs.gymnasium_env": "GymnasiumEnv",
+    "coil_rl.foreign.gymnasium_env": "GymnasiumEnv",
+    "coil_rl.foreign.torchrl_env": "EnvBatch",
     "coil_rl.envs.limits": "check_range",
     "coil_rl.errors": "UserError did_you_mean",
     "coil_rl.export": "ExportedGuide ExportedPolicy export_policy",

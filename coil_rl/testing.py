@@ -13,8 +13,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs, step_mdp
 
-from coil_rl.envs.env_batch import optional_entries
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.batch import optional_entries
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.transforms import GuideActions, set_progress
 from coil_rl.transforms.action_space import first_choices, nested_key, own_shape, space_of
 from coil_rl.transforms.guide_actions import unfit_action

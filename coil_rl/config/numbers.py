@@ -20,8 +20,8 @@ from tensordict.nn import TensorDictModuleBase
 from coil_rl.config.arguments import is_foreign, yaml_text
 from coil_rl.config.nodes import build, find_target
 from coil_rl.errors import UserError, did_you_mean
+from coil_rl.foreign.controllers import ControllerGuide, PerRow, load
 from coil_rl.guides import classic
-from coil_rl.guides.controllers import ControllerGuide, PerRow, load
 from coil_rl.run.tuned_run import read_tuned
 from coil_rl.run.tuning import Number
 

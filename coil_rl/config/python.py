@@ -28,8 +28,8 @@ from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import trust_own
 from coil_rl.config.unread import check_read
 from coil_rl.config.written import keep_written, quoted
-from coil_rl.envs.gate import foreign
 from coil_rl.errors import UserError
+from coil_rl.foreign.faults import foreign
 from coil_rl.run.controller import Controller
 from coil_rl.run.run import Run
 

@@ -11,15 +11,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.config.logger import shipped_logger
 from coil_rl.config.measured import complete_measures, is_complete
+from coil_rl.config.old_names import OLD_NAMES
 from coil_rl.config.schema import IGNORED_KEYS, TrainConfig
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import check_config
 from coil_rl.errors import UserError
 from coil_rl.plain_yaml import read_yaml
 from coil_rl.run.folder import CONFIG, check_same, is_begun
-
-# Parts that moved, by the names that older folders have for them.
-OLD_NAMES = {"coil_rl.guides.learned.LearnedGuide": "coil_rl.LearnedGuide"}
 
 
 def settings(config: DictConfig) -> dict[str, Any]:

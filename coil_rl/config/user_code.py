@@ -42,7 +42,7 @@ def _registered(id: Any) -> Any:
     """
     if isinstance(id, str):
         with suppress(Exception):
-            from coil_rl.envs.gymnasium_makers import registered_maker
+            from coil_rl.foreign.makers import registered_maker
 
             return registered_maker(id)
     return None

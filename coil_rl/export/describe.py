@@ -14,7 +14,6 @@ from gymnasium import spaces
 from torch import Tensor
 from torchrl.data import Bounded
 
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.envs.meanings import meaning, meanings_of
 from coil_rl.errors import file_of_a_run
 from coil_rl.export.contract import FORMAT, VERSION, checksum
@@ -22,6 +21,7 @@ from coil_rl.export.files import OPSET
 from coil_rl.export.parity import Parity
 from coil_rl.export.step import ADVICE, Entry, PolicyStep
 from coil_rl.files import LARGEST_TABLE, read_text
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.normaliser import Normaliser
 from coil_rl.measures import MEAN_CASE

@@ -11,9 +11,9 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from coil_rl.envs.gate import foreign
-from coil_rl.envs.gymnasium_rows import controller_of, fitted_action, resolved_controller
-from coil_rl.envs.gymnasium_spaces import action_spec, check_action_space, lowest_choices
+from coil_rl.foreign.codec import action_spec, check_action_space, lowest_choices
+from coil_rl.foreign.faults import foreign
+from coil_rl.foreign.plant import controller_of, fitted_action, resolved_controller
 from coil_rl.transforms.action_space import ActionSpace
 
 ADVICE = "guide_action"  # key of the advice in an observation of several entries

@@ -8,9 +8,9 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 from coil_rl import GymnasiumEnv, evaluate_policy
+from coil_rl.foreign.controllers import PerRow
 from coil_rl.guides.candidates import Candidates
 from coil_rl.guides.classic import ClassicGuide, Oscillator
-from coil_rl.guides.controllers import PerRow
 from coil_rl.guides.simple import ConstantGuide, FollowAdvice
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_memory import GuideMemory

@@ -171,7 +171,7 @@ def test_env_that_keeps_something_at_a_reset_is_noticed():
 
 
 def test_episode_longer_than_the_memory_is_not_repeated(monkeypatch):
-    monkeypatch.setattr("coil_rl.envs.env_batch.REMEMBERED", 20)
+    monkeypatch.setattr("coil_rl.foreign.batch.REMEMBERED", 20)
     env = build("Pendulum-v1")
     drive(env, 25)
     with pytest.warns(UserWarning, match="cannot go on"):

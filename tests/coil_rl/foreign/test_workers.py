@@ -12,8 +12,8 @@ from gymnasium import spaces
 from worlds import drive, reloaded, same
 
 from coil_rl import GymnasiumEnv
-from coil_rl.envs.gate import ForeignError
-from coil_rl.envs.workers import choose
+from coil_rl.foreign.faults import ForeignError
+from coil_rl.foreign.workers import choose
 
 
 class Plant(gymnasium.Env):

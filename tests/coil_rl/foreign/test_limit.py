@@ -1,6 +1,7 @@
 """A TorchRL env that never ends and names no limit is truncated after 1,000 steps."""
 
 import gymnasium
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -8,8 +9,9 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymWrapper, StepCounter, TransformedEnv
 
-from coil_rl.envs import ConeTrackEnv, EnvBatch, shipped_tracks
-from coil_rl.envs.step_limit import limit_of, limits_of
+from coil_rl import EnvBatch, GymnasiumEnv
+from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.foreign.limit import LIMIT, limit_of, limits_of
 from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.run.parts import EnvMaker
 
@@ -101,3 +103,61 @@ def test_rows_of_a_batch_keep_a_longer_limit():
     env = EnvBatch(lambda: TransformedEnv(Endless(), StepCounter(1200)), num_envs=1)
     steps = evaluate_policy(env, stay(env)).episodes[0]["steps"]
     assert steps == 1200
+
+
+class Plant(gymnasium.Env):
+    """It ends after some steps.
+
+    Args:
+        end: number of steps; None: never.
+    """
+
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+    def __init__(self, end=None):
+        self.end = end
+
+    def reset(self, *, seed=None, options=None):
+        self.time = 0
+        return [0.0], {}
+
+    def step(self, action):
+        self.time += 1
+        return [0.0], 1.0, False, self.time == self.end, {}
+
+
+def ended(env, steps):
+    """Return after how many steps the first row ends; None if it does not."""
+    carrier = env.reset()
+    for step in range(1, steps + 1):
+        carrier = env.step(env.rand_action(carrier))["next"]
+        if carrier["done"].any():
+            return step, bool(carrier["truncated"].any())
+    return None
+
+
+def test_env_without_a_limit_gets_one_that_is_said():
+    env = GymnasiumEnv(lambda: Plant(end=None), 2)
+    with pytest.warns(UserWarning, match=r"did not end within 1,000 steps, and no TimeLimit"):
+        assert ended(env, LIMIT + 5) == (LIMIT, True)
+
+
+@pytest.mark.filterwarnings("error")
+def test_limit_of_an_env_is_its_own():
+    assert ended(GymnasiumEnv(lambda: Plant(end=None), max_steps=4), 9) == (4, True)
+    assert ended(GymnasiumEnv(lambda: Plant(end=6)), 9) == (6, True)
+
+    class Named(Plant):
+        max_steps = 1010
+
+    assert ended(GymnasiumEnv(lambda: Named(end=1010)), 1020) == (1010, True)
+
+
+@pytest.mark.parametrize(("steps", "expected"), [(10, LIMIT), (np.int64(1010), 1010)])
+def test_attribute_of_a_gymnasium_env_only_makes_the_limit_longer(steps, expected):
+    class Mistaken(Plant):
+        horizon = steps  # of a predictive controller
+
+    env = GymnasiumEnv(lambda: Mistaken(end=None))
+    with pytest.warns(UserWarning, match=rf"did not end within {expected:,} steps"):
+        assert ended(env, 1020) == (expected, True)

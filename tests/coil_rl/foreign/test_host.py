@@ -1,6 +1,7 @@
-"""Controllers of other people: objects, functions, networks, entries of the env, files."""
+"""Whatever acts as a guide: objects, functions, networks, models of other libraries."""
 
 import importlib
+import itertools
 import textwrap
 from functools import partial
 
@@ -9,15 +10,18 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from sklearn.linear_model import LinearRegression
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.envs import Compose, TransformedEnv
 from worlds import continued
 
 from coil_rl import GymnasiumEnv
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
-from coil_rl.envs.gate import ForeignError
-from coil_rl.guides import ControllerGuide, EntryGuide, FollowAdvice, PerRow, RecordedGuide
+from coil_rl.foreign.faults import ForeignError, Predictor, predicts
+from coil_rl.guides import ControllerGuide, FollowAdvice, PerRow
+from coil_rl.learners import PPO
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
@@ -340,48 +344,6 @@ def test_matrix_of_a_controller_is_the_matrix_that_the_env_gets():
         env.reset()
 
 
-def test_entry_of_the_env_is_advice():
-    guide = EntryGuide(["controller", "theirs"])
-    data = TensorDict({"controller": {"theirs": torch.rand(3, 2)}}, [3])
-    assert torch.equal(guide(data)["action"], data["controller", "theirs"])
-    assert guide.sees == "env"
-    rollout, advice = driven(cones(EntryGuide("steering")))
-    assert torch.equal(advice, rollout["steering"])
-
-
-@pytest.mark.parametrize("header", ["", "steering\n"])
-def test_recording_begins_with_each_episode_and_holds_its_last_action(header, tmp_path):
-    file = tmp_path / "actions.csv"
-    file.write_text(header + "".join(f"{step / 100:e}\n" for step in range(10)))
-    rollout, advice = driven(cones(RecordedGuide(file)))
-    expected = (steps_of_episode(rollout) - 1).clamp(max=9) / 100
-    torch.testing.assert_close(advice.squeeze(-1), expected)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (None, "actions.csv cannot be read as numbers"),
-        (
-            "0.1\nleft\n",
-            r"actions.csv cannot be read as numbers with commas \(could not convert string to "
-            "float: 'left'",
-        ),
-        ("", "must hold at least one line of finite numbers"),
-        ("a,b\n", "must hold at least one line of finite numbers"),
-        ("0.1\n0.1,0.2\n", r"cannot be read as numbers with commas \(its lines have 1 and 2"),
-        ("nan\n0.1\n", "must hold at least one line of finite numbers"),
-    ],
-)
-@pytest.mark.filterwarnings("error")
-def test_file_without_actions_is_refused(text, message, tmp_path):
-    file = tmp_path / "actions.csv"
-    if text is not None:
-        file.write_text(text)
-    with pytest.raises(ValueError, match=message):
-        RecordedGuide(file)
-
-
 class Shelf(gymnasium.Env):
     """Choices to observe, numbered as the env numbers them."""
 
@@ -450,3 +412,212 @@ def test_network_reads_choices_as_one_hot_vectors():
     advised = TransformedEnv(env, GuideActions({"net": ControllerGuide(torch.nn.Linear(5, 2))}))
     data = advised.rollout(3)
     assert torch.equal(data["observation"].sum(-1), torch.full((2, 3), 2.0))
+
+
+STEPS = 5
+
+
+def advised(guide, id="Pendulum-v1", rows=2, **arguments):
+    """Return the steps of an env with advice of a guide."""
+    env = TransformedEnv(GymnasiumEnv(id, rows, **arguments), GuideActions({"theirs": guide}))
+    return env.rollout(STEPS, break_when_any_done=False)
+
+
+class Squeezed(nn.Module):
+    def forward(self, observation):
+        return 2.0 * observation[..., 0]
+
+
+def predictor(targets):
+    x = np.eye(3)
+    return LinearRegression(fit_intercept=False).fit(x, 2.0 * x[:, :1].repeat(targets, 1)).predict
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [
+        LinearRegression(fit_intercept=False).fit(np.eye(3), [2.0, 0.0, 0.0]).predict,  # gives [B]
+        predictor(1),  # gives [B, 1]
+        Squeezed(),
+        lambda x: 2.0 * x[..., 0],
+    ],
+)
+def test_one_number_for_each_row_is_an_action_of_one_number(controller):
+    data = advised(ControllerGuide(controller), "Pendulum-v1")
+    expected = (2.0 * data["observation"][..., :1]).clamp(-2.0, 2.0)
+    torch.testing.assert_close(data["guide_action"][..., 0, :], expected)
+
+
+def test_numbers_that_are_not_one_for_each_row_are_refused():
+    for controller in (predictor(2), predictor(3)):
+        with pytest.raises(ForeignError, match="but must have"):
+            advised(ControllerGuide(controller), "Pendulum-v1")
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        lambda x: -x[0],  # of two entries that are 0 at first
+        lambda x: (x - x.mean())[..., :1],
+        lambda x: (x / max(1.0, float(abs(x).max())))[..., :1],
+    ],
+    ids=["first entry", "less the mean", "scaled by the largest"],
+)
+def test_function_of_one_observation_does_not_mix_the_rows(action):
+    guide = ControllerGuide(action)
+    guide(TensorDict({"observation": torch.zeros(1, 2)}, [1]))
+    observations = torch.tensor([[1.0, 2.0], [40.0, -70.0]])
+    found = guide(TensorDict({"observation": observations}, [2]))["action"].flatten()
+    torch.testing.assert_close(found, torch.tensor([float(action(each)) for each in observations]))
+
+
+@pytest.mark.parametrize(
+    ("id", "action", "for_batch"),
+    [
+        ("Pendulum-v1", lambda x: -x[..., 0], False),
+        ("Pendulum-v1", lambda x: 1 * (x[..., 0] > 0), False),
+        ("Pendulum-v1", lambda x: -x[..., :1], True),
+        ("CartPole-v1", lambda x: 1 * (x[..., 2] > 0), True),
+        ("CartPole-v1", lambda x: 1.0 * (x[..., 2] > 0), True),
+    ],
+)
+def test_function_is_for_a_batch_only_if_its_answer_has_the_form_of_actions(id, action, for_batch):
+    guide = ControllerGuide(action)
+    rollout = advised(guide, id)
+    assert guide.guide.for_batch is for_batch
+    found = rollout["guide_action"][:, :, 0]
+    found = found[..., 1] if id == "CartPole-v1" else found[..., 0]
+    expected = action(rollout["observation"]).reshape(found.shape)
+    torch.testing.assert_close(found, expected.to(found.dtype))
+
+
+def test_function_that_remembers_is_refused():
+    calls = itertools.count()
+    for action in (lambda x: float(next(calls)), lambda x: x[:, :1] * 0 + next(calls)):
+        with pytest.raises(ForeignError, match=r"for the same observation: .* a class"):
+            advised(ControllerGuide(action))
+
+
+class Model:
+    """As a model of Stable-Baselines3 with a memory: its action is the number of the call."""
+
+    observation_space = spaces.Box(-10, 10, (3,), np.float32)
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        assert observation.shape == (3,)
+        assert deterministic
+        count = np.zeros(1) if state is None or episode_start[0] else state[0]
+        return np.float32(count / 10), (count + 1,)
+
+
+def test_model_of_another_library_is_a_controller():
+    advice = advised(ControllerGuide(Model()), max_steps=4)["guide_action"]
+    torch.testing.assert_close(advice[..., 0, 0], torch.tensor([[0, 0.1, 0.2, 0.3, 0]] * 2))
+    assert (advised(ControllerGuide(Model), max_steps=4)["guide_action"] == advice).all()
+
+
+def test_memory_of_a_model_is_in_the_checkpoint():
+    def rollout(seed):
+        env = GymnasiumEnv("Pendulum-v1", 2, seed=seed, max_steps=7)
+        env = TransformedEnv(env, GuideActions({"model": ControllerGuide(Model())}))
+        return Rollout(env, PPO(env, ["observation", "guide_action"]).policy, 5)
+
+    expected, resumed = continued(rollout)
+    torch.testing.assert_close(expected["guide_action"], resumed["guide_action"])
+    assert expected["guide_action"].max() > 0.5
+
+
+def test_model_gets_choices_and_dictionaries_as_its_spaces_have_them():
+    seen = []
+
+    class Reads:
+        observation_space = spaces.Dict(
+            {"place": spaces.Discrete(4, start=2), "pair": spaces.MultiDiscrete([2, 3])}
+        )
+
+        def predict(self, observation, deterministic=True):
+            seen.append(observation)
+            return 0, None
+
+    class Grid(gymnasium.Env):
+        observation_space = Reads.observation_space
+        action_space = spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return {"place": 4, "pair": np.array([1, 2])}, {}
+
+        def step(self, action):
+            return {"place": 5, "pair": np.array([0, 1])}, 0.0, False, False, {}
+
+    advised(ControllerGuide(Reads()), lambda: Grid(), 1)
+    assert seen[0]["place"] == 4
+    assert seen[0]["pair"].tolist() == [1, 2]
+    assert seen[1]["place"] == 5
+
+
+def test_object_with_a_predict_of_another_kind_is_refused():
+    class Regressor:
+        def predict(self, x):
+            return x
+
+    with pytest.raises(ValueError, match=r"or a model with predict\(observation, deterministic=T"):
+        ControllerGuide(Regressor())
+    with pytest.raises(ValueError, match="is an object, which takes no options"):
+        ControllerGuide(Model(), options={"gain": 1})
+
+
+def test_saved_model_of_stable_baselines3_is_a_guide(tmp_path):
+    """Its advice is what the library itself computes."""
+    sb3 = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+    for algorithm, id in ((sb3.PPO, "CartPole-v1"), (sb3.SAC, "Pendulum-v1")):
+        algorithm("MlpPolicy", id, seed=0, device="cpu").save(tmp_path / "model")
+        model = algorithm.load(tmp_path / "model", device="cpu")
+        rollout = advised(ControllerGuide(model), id)
+        observations = rollout["observation"].reshape(-1, rollout["observation"].shape[-1])
+        expected, _ = model.predict(observations.numpy(), deterministic=True)
+        advice = rollout["guide_action"].reshape(len(observations), -1)
+        if id == "CartPole-v1":
+            assert advice.argmax(-1).tolist() == expected.tolist()
+        else:
+            np.testing.assert_allclose(advice.numpy(), expected, atol=1e-5)
+
+
+class Recurrent:
+    """As a model of Stable-Baselines3, recurrent; it knows its batches of rows by their calls."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        count = np.zeros(1) if state is None or episode_start[0] else state[0]
+        assert deterministic
+        return np.float32(observation[:1] * 0 + count), (count + 1,)
+
+
+def test_model_with_predict_is_a_controller_beside_its_env():
+    env = GymnasiumEnv("Pendulum-v1", 2, max_steps=4, controllers={"model": Recurrent()})
+    advice = env.rollout(6, break_when_any_done=False)["controller", "model"]
+    assert advice[..., 0].tolist() == [[0, 1, 2, 3, 0, 1]] * 2
+
+
+def test_predictor_hands_the_state_on():
+    controller = Predictor(Recurrent())
+    for _ in range(2):
+        controller.reset()
+        assert [controller.act(np.zeros(2)).item() for _ in range(3)] == [0, 1, 2]
+
+
+def test_only_models_with_deterministic_predict():
+    class Regressor:
+        def predict(self, x):
+            return x
+
+    class Both(Recurrent):
+        def act(self, x):
+            return x
+
+    assert [predicts(each) for each in (Recurrent(), Recurrent, Regressor(), Both(), 3)] == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]

@@ -29,7 +29,7 @@ from typing import Any, Protocol
 import torch
 from numpy.typing import NDArray
 
-from coil_rl.envs.gate import ForeignError
+from coil_rl.foreign.faults import ForeignError
 
 AUTO = "auto"
 SAVED = 2e-3  # seconds; a batched step of this length pays for the messages

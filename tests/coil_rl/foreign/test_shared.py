@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from coil_rl.envs.gate import ForeignError
+from coil_rl.foreign.faults import ForeignError
 from coil_rl.guides import ControllerGuide
 
 REMEMBERS = r"for the same observation: .* must not remember or draw .*; write a class with act"

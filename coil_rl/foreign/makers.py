@@ -15,7 +15,7 @@ import gymnasium
 from gymnasium import error as errors
 from gymnasium.envs.registration import load_env_creator
 
-from coil_rl.envs.gate import shortened, shown
+from coil_rl.foreign.faults import shortened, shown
 
 # What an error about a missing package mentions, and the extra of coil-rl that installs it.
 EXTRAS = {"box2d": "gym", "pygame": "gym", "mujoco": "mujoco", "minigrid": "babyai"}

@@ -23,7 +23,7 @@ from torchrl.data import (
     Unbounded,
 )
 
-from coil_rl.envs.gate import ForeignError, plain_array, shown
+from coil_rl.foreign.faults import ForeignError, plain_array, shown
 
 MOST_CHOICES = 32  # of a whole number that is an action
 WATCHED = 256  # first observations, in which the range of each number is found

@@ -13,7 +13,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from coil_rl.guides.shared import SharedCheck
+from coil_rl.foreign.shared import SharedCheck
 
 # Key of a saved state with the attributes of a network and its parts that torch does not save.
 PLAIN = "plain attributes"

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from coil_rl.envs.gate import ForeignError, shown
+from coil_rl.foreign.faults import ForeignError, shown
 
 # Of the largest number of the actions: for the same question, and in a batch of another size, in
 # which a network adds up in another order, on some devices with few digits.

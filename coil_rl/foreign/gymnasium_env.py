@@ -18,9 +18,17 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
-from coil_rl.envs.env_batch import SeededRows
-from coil_rl.envs.gate import ForeignError, shortened
-from coil_rl.envs.gymnasium_makers import (
+from coil_rl.envs.limits import check_range
+from coil_rl.foreign.batch import SeededRows
+from coil_rl.foreign.codec import (
+    Choices,
+    action_spec,
+    check_action_space,
+    has_whole_numbers,
+    lowest_choices,
+)
+from coil_rl.foreign.faults import ForeignError, shortened
+from coil_rl.foreign.makers import (
     Env,
     ResetWith,
     make_env,
@@ -28,16 +36,8 @@ from coil_rl.envs.gymnasium_makers import (
     metadata_of,
     name_of,
 )
-from coil_rl.envs.gymnasium_rows import Row, Rows, resolved_controller
-from coil_rl.envs.gymnasium_spaces import (
-    Choices,
-    action_spec,
-    check_action_space,
-    has_whole_numbers,
-    lowest_choices,
-)
-from coil_rl.envs.limits import check_range
-from coil_rl.envs.workers import AUTO, Entries, Workers, choose, timed
+from coil_rl.foreign.plant import Row, Rows, resolved_controller
+from coil_rl.foreign.workers import AUTO, Entries, Workers, choose, timed
 
 MOST_WORKERS = 256
 RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "controller", "next")
@@ -104,7 +104,7 @@ class GymnasiumEnv(SeededRows):
         ValueError: if the env cannot be made, has a space that is not supported or an entry with a
             reserved name or bounds that leave no choice, or if a controller cannot be imported.
         ForeignError: at a reset or a step, for what the env or a controller raises or returns that
-            does not fit; see `coil_rl.envs.gate`.
+            does not fit; see `coil_rl.foreign.faults`.
 
     Example:
         >>> from coil_rl import GymnasiumEnv

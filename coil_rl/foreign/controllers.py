@@ -27,11 +27,11 @@ from torch import nn
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
-from coil_rl.envs.gate import ForeignError, Predictor, action_array, foreign, predicts, shown
 from coil_rl.errors import did_you_mean
 from coil_rl.files import LARGEST_TABLE, read_text
-from coil_rl.guides.functions import FunctionGuide
-from coil_rl.guides.networks import NetworkGuide, acts, maker_of_rows, restore, state_of
+from coil_rl.foreign.faults import ForeignError, Predictor, action_array, foreign, predicts, shown
+from coil_rl.foreign.functions import FunctionGuide
+from coil_rl.foreign.networks import NetworkGuide, acts, maker_of_rows, restore, state_of
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key, written_key
 
 # Other minus signs, as text programs write them: hyphens, the sign itself, and dashes.

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 
-from coil_rl.envs.gate import action_array
-from coil_rl.guides.controllers import PerRow
-from coil_rl.guides.simple import FollowAdvice
+from coil_rl.foreign.controllers import PerRow
+from coil_rl.foreign.faults import action_array
 from coil_rl.transforms import GuideActions
+from coil_rl.transforms.action_space import ActionSpace
 
 STEPS = 10
 LONGEST = 0.5  # s, after which the check takes no further step
@@ -136,14 +136,16 @@ def tried(guide: TensorDictModuleBase, env: EnvBase) -> Tried:
 
     probe = PerRow(make, own.read, own.out_keys[0], own.title)
     advised = TransformedEnv(env, GuideActions({"guide": probe}))
-    policy, end = FollowAdvice(advised), time.perf_counter() + LONGEST
+    space = ActionSpace(advised.full_action_spec["action"], advised.batch_dims)
+    end = time.perf_counter() + LONGEST
     try:
         with _global_numbers_kept():
             data = advised.reset()
             for _ in range(STEPS):
                 if time.perf_counter() > end or data["done"].any():
                     break
-                data = advised.step_mdp(advised.step(policy(data)))
+                action = space.actions(data["guide_action"].select(-2, 0))
+                data = advised.step_mdp(advised.step(data.set("action", action)))
     except Exception:
         return Tried()
     seconds = min((each.seconds for each in twins), default=math.inf)

@@ -7,14 +7,13 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.classic_control import PendulumEnv
 
 from coil_rl.config.check import check_parts
 from coil_rl.config.python import composed, named
-from coil_rl.config.repeats import STEPS, tried
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
-from coil_rl.guides.controllers import ControllerGuide
-
-pytest.importorskip("gymnasium.envs.classic_control")
+from coil_rl.foreign.controllers import ControllerGuide
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.trial import STEPS, tried
 
 
 class Still:
@@ -202,3 +201,14 @@ def test_cost_of_a_slow_controller_in_the_curve_is_said(of, words, said, tmp_pat
     for line in lines:
         assert said in line
         assert "340 episodes (17 policies); evaluation.curve.points=4 keeps fewer" in line
+
+
+class Unsteady(PendulumEnv):
+    def reset(self, **options):
+        super().reset(**options)
+        return np.random.uniform(size=3).astype(np.float32), {}
+
+
+def test_env_that_ignores_its_seed_is_noticed():
+    assert GymnasiumEnv(Unsteady).unrepeated() == "observation"
+    assert GymnasiumEnv("Pendulum-v1").unrepeated() is None

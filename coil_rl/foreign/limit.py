@@ -9,8 +9,8 @@ from typing import Any
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
-from coil_rl.envs.gate import LIMIT, OWN_LIMITS, limit_by_attributes, warn_of_limit
 from coil_rl.envs.seeded_env import SeededEnv
+from coil_rl.foreign.faults import LIMIT, OWN_LIMITS, limit_by_attributes, warn_of_limit
 
 NAMES = (*OWN_LIMITS, "episode_length")  # of the largest number of steps of an episode
 COUNTER = StepCounter.__name__

@@ -15,8 +15,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from coil_rl.envs.env_batch import RowsInTurn
-from coil_rl.envs.gate import (
+from coil_rl.foreign.batch import RowsInTurn
+from coil_rl.foreign.codec import Entry, Fineness, has_whole_numbers, leaves
+from coil_rl.foreign.faults import (
     EnvGate,
     ForeignError,
     acting,
@@ -26,9 +27,8 @@ from coil_rl.envs.gate import (
     predicts,
     shown,
 )
-from coil_rl.envs.gymnasium_makers import Env, time_limits_of
-from coil_rl.envs.gymnasium_spaces import Entry, Fineness, has_whole_numbers, leaves
-from coil_rl.envs.workers import Entries
+from coil_rl.foreign.makers import Env, time_limits_of
+from coil_rl.foreign.workers import Entries
 
 MASKS = {"action_mask", "action_masks"}  # in info: which actions are possible
 # The envs of all rows of this process, to find one that two rows would share.
@@ -170,7 +170,7 @@ class Row:
 
 
 class Rows(RowsInTurn):
-    """Rows that are stepped one after the other in one process; see `coil_rl.envs.workers.Shard`.
+    """Rows that are stepped one after the other in one process, see `Shard` of the workers.
 
     Args:
         make_row: makes a row by its number.

@@ -11,8 +11,8 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from coil_rl.envs.gate import ForeignError, action_array, foreign, shown
-from coil_rl.guides.shared import SharedCheck
+from coil_rl.foreign.faults import ForeignError, action_array, foreign, shown
+from coil_rl.foreign.shared import SharedCheck
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key
 
 # Factor and offset of a row, and of two others that a function for a batch must not mix with it:
