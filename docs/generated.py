@@ -5,8 +5,10 @@ Each directive of this file reads it where it is defined, at every build.
 
 import importlib
 import inspect
+import itertools
 import re
 import tomllib
+import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -223,6 +225,51 @@ def plain_docstring(
             lines[index] = re.sub(r"(?<=\w)`(?=s\b)", r"`\\ ", "`".join(parts))  # a plural: `Run`s
 
 
+def arguments_of_bases(
+    app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]
+) -> None:
+    """Add the arguments that a class takes and that a class above it documents."""
+    if what != "class" or not inspect.isfunction(thing.__init__):
+        return
+    known, names = entries(lines), taken(thing)
+    added: list[str] = []
+    for base in thing.__mro__[1:]:
+        above = entries(inspect.cleandoc(vars(base).get("__doc__") or "").splitlines())
+        for argument in above:
+            if argument in names and argument not in known:
+                known[argument] = above[argument]
+                added += above[argument]
+    if added and "Args:" not in lines:
+        lines += ["", "Args:", *added]
+    elif added:
+        end = lines.index("Args:") + 1
+        while end < len(lines) and lines[end]:
+            end += 1
+        lines[end:end] = added
+
+
+def entries(lines: list[str]) -> dict[str, list[str]]:
+    """Return the lines of each entry under `Args:`."""
+    found: dict[str, list[str]] = {}
+    start = lines.index("Args:") + 1 if "Args:" in lines else len(lines)
+    for line in itertools.takewhile(bool, lines[start:]):
+        if not line.startswith(" " * 8):
+            found[line.strip().partition(":")[0]] = []
+        found[next(reversed(found))].append(line)
+    return found
+
+
+def taken(thing: Any) -> set[str]:
+    """Return the names of the arguments of a class, those of its typed dictionaries too."""
+    names = set[str]()
+    for parameter in inspect.signature(thing.__init__).parameters.values():
+        settings = typing.get_args(parameter.annotation)
+        if typing.get_origin(parameter.annotation) is typing.Unpack:
+            names |= settings[0].__annotations__.keys()
+        names.add(parameter.name)
+    return names
+
+
 def is_field(
     app: Sphinx, what: str, name: str, thing: object, is_skipped: bool, options: Any
 ) -> bool | None:
@@ -252,6 +299,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     }
     for name, directive in directives.items():
         app.add_directive(name, directive)
+    app.connect("autodoc-process-docstring", arguments_of_bases, priority=50)
     app.connect("autodoc-process-docstring", plain_docstring, priority=100)  # before napoleon
     app.connect("autodoc-process-signature", own_signature)
     app.connect("autodoc-skip-member", is_field)
