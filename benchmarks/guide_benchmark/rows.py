@@ -33,8 +33,7 @@ from benchmarks.promise import (
     scale_of,
     verdict,
 )
-from coil_rl.errors import file_of_a_run
-from coil_rl.files import LARGEST_NUMBERS, read_text
+from coil_rl import record
 from coil_rl.report.curves import frames_until, points
 from coil_rl.report.runs import RETURN, Run
 
@@ -157,10 +156,8 @@ def _versions(runs: Sequence[Run]) -> dict[str, str]:
     """Return the versions of the libraries of runs; different ones are joined by a slash."""
     found = []
     for run in runs:
-        file = run.folder / "versions.json"
-        with file_of_a_run(file, "remove the run from the folder, or train it again"):
-            own = json.loads(read_text(file, LARGEST_NUMBERS))
-            found.append([str(own.get(name) or "") for name in VERSIONS])
+        own = record.VERSIONS.need(run.folder)
+        found.append([own.get(name, "") for name in VERSIONS])
     columns = zip(*found, strict=True)
     return {
         name: " / ".join(dict.fromkeys(filter(None, column)))

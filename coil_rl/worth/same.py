@@ -9,11 +9,10 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from coil_rl.config.fingerprint import fingerprint
+from coil_rl.config import source
 from coil_rl.config.given import kept
 from coil_rl.config.python import Named
 from coil_rl.config.saved import identity
-from coil_rl.config.user_code import code_of_user
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
 from coil_rl.run.folder import check_same
@@ -35,7 +34,7 @@ def identity_of(given: Named, config: DictConfig, minutes: float, seed: int) -> 
         minutes: that it may take.
         seed: of the first trainings.
     """
-    code = code_of_user(config, ("env", "guide"))
+    code = source.code_of_user(config, ("env", "guide"))
     arguments = {
         "words": list(given.words),
         "objects": sorted(given.nodes),
@@ -49,7 +48,9 @@ def identity_of(given: Named, config: DictConfig, minutes: float, seed: int) -> 
         for key, node in given.nodes.items():
             # The node of an object contains the folder, which may be moved.
             if key != "tune":
-                OmegaConf.update(described, key, fingerprint(kept(node["name"])), merge=False)
+                OmegaConf.update(
+                    described, key, source.identity_of(kept(node["name"])), merge=False
+                )
     return {"identity": arguments, "configuration": identity(described)}
 
 

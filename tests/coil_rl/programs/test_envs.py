@@ -47,9 +47,7 @@ PROXY = shlex.split(
     "proxy.budget.frames=64 proxy.budget.num_envs=2 proxy.budget.steps=16 "
     "proxy.learner.regressor.epochs=1"
 )
-FOREST = shlex.split(
-    "learner=forest learner.regressor.estimator.n_estimators=5 learner.validate=false"
-)
+FOREST = shlex.split("learner=forest learner.regressor.n_estimators=5 learner.validate=false")
 LEARNERS = {
     "ppo": ["method=ppo", *PPO],
     "guide": ["method=guide"],

@@ -23,7 +23,7 @@ TINY = ["budget.num_envs=4", "budget.steps=16", "evaluation.cases=2", "logger=no
 TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
 ON_POLICY = ["learner.minibatches=2", "learner.epochs=3"]
 REPLAY = ["learner.starts=16", "learner.ratio=0.25", "learner.batch_size=16"]
-FOREST = ["learner.regressor.estimator.n_estimators=3"]
+FOREST = ["learner.regressor.n_estimators=3"]
 OPTIONS = dict.fromkeys(("cheq", "ibrl", "policy_decorator", "rlpd", "wsrl", "q_filter"), REPLAY)
 OPTIONS |= {"dagger": FOREST, "oil": FOREST}
 PROXY = ["proxy.budget.frames=64", "proxy.budget.num_envs=4", "proxy.budget.steps=16"]

@@ -80,7 +80,7 @@ def test_policy_learns_the_same_with_flags_as_with_numbers(method, learner, tmp_
 
 
 def test_imitation_does_what_the_guide_does(tmp_path):
-    run = trained(Flags, tmp_path / "run", "oil", "learner.regressor.estimator.n_estimators=3")
+    run = trained(Flags, tmp_path / "run", "oil", "learner.regressor.n_estimators=3")
     for observation in ([0.5, -0.5], [-0.5, -0.5], [0.5, 0.5]):
         observation = np.array(observation, np.float32)
         action = run.controller().act(observation)
