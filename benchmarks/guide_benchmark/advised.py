@@ -50,13 +50,7 @@ COLUMNS = {
 
 
 def ends(rows: Sequence[Row], task: str, arm: str) -> dict[str, float]:
-    """Return what whole trainings with a guide gave, by method; plain PPO and the guide too.
-
-    Args:
-        rows: of the guide benchmark.
-        task: name of the task.
-        arm: of the guide.
-    """
+    """Return what whole trainings with a guide gave, by method; plain PPO and the guide too."""
     found: dict[str, float] = {}
     guides: list[float] = []
     for row in rows:
@@ -70,14 +64,7 @@ def ends(rows: Sequence[Row], task: str, arm: str) -> dict[str, float]:
 
 
 def words(task: str, arm: str, folder: Path, frames: int) -> list[str]:
-    """Return the arguments of coil-compare.
-
-    Args:
-        task: name of the task.
-        arm: of the guide.
-        folder: of the comparison.
-        frames: of a whole training.
-    """
+    """Return the arguments of coil-compare."""
     file = f"{arm}/{task.partition('_noisy')[0]}" if arm == DETUNED else arm
     searched = ["hydra.searchpath=[pkg://benchmarks.guide_benchmark.conf]"]
     own = searched if (OWN / f"{task}.yaml").exists() else []
@@ -85,14 +72,7 @@ def words(task: str, arm: str, folder: Path, frames: int) -> list[str]:
 
 
 def judged(rows: Sequence[Row], task: str, arm: str, folder: Path) -> dict[str, Any]:
-    """Return the row of a comparison: what it said, and what that is worth.
-
-    Args:
-        rows: of the guide benchmark.
-        task: name of the task.
-        arm: of the guide.
-        folder: of the comparison.
-    """
+    """Return the row of a comparison: what it said, and what that is worth."""
     values = ends(rows, task, arm)
     said = json.loads((folder / FOUND).read_text())
     use = said["train"] or GUIDE if said["use"] == NOTHING else said["use"]
@@ -126,11 +106,7 @@ def _measured(folder: Path, name: str) -> float:
 
 
 def page(found: Sequence[Mapping[str, Any]]) -> str:
-    """Return the page of all comparisons.
-
-    Args:
-        found: their rows.
-    """
+    """Return the page of all comparisons."""
     titles = {"regret": "coil-compare"} | {f"regret_{rule}": f"always {rule}" for rule in RULES}
     summary = []
     for name, title in titles.items():
@@ -156,10 +132,6 @@ def page(found: Sequence[Mapping[str, Any]]) -> str:
 
 def run(place: Path, arguments: Sequence[str]) -> None:
     """Run a comparison, unless it is finished; what it prints is in log.txt, beside its folder.
-
-    Args:
-        place: its folder.
-        arguments: of coil-compare.
 
     Raises:
         ChildProcessError: if it fails.

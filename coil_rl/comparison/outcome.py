@@ -1,6 +1,5 @@
 """The results of a comparison, read from its folder."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,13 +12,11 @@ import pandas as pd
 from coil_rl.comparison.arms import GUIDE, OPPOSITE, TUNE, ZERO
 from coil_rl.comparison.baselines import NAME, action_words, read_baselines
 from coil_rl.comparison.entry import ZERO_ACTIONS, Entry
-from coil_rl.errors import file_of_a_run
-from coil_rl.files import LARGEST_NUMBERS, read_file
+from coil_rl.record import TUNED
 from coil_rl.report.curves import points
 from coil_rl.report.runs import RETURN, Run, read_runs
 from coil_rl.run.next_step import still_rising
 from coil_rl.run.reasons import POLICIES
-from coil_rl.tune.run import TUNED
 
 
 @dataclass(frozen=True)
@@ -129,12 +126,8 @@ def tuned_numbers(runs: Sequence[Run]) -> str:
     Args:
         runs: of one arm; nothing is returned if they tuned nothing.
     """
-    files = [run.folder / TUNED for run in runs]
-    found: list[dict[str, float]] = []
-    for file in filter(Path.exists, files):
-        with file_of_a_run(file, "remove the folder of this training, and repeat the command"):
-            numbers = json.loads(read_file(file, LARGEST_NUMBERS))
-            found.append({str(name): float(value) for name, value in numbers.items()})
+    read = [TUNED.read(run.folder) for run in runs]
+    found = [numbers for numbers in read if numbers is not None]
     texts = []
     for name in found[0] if found else ():
         texts.append(f"{name} {' / '.join(f'{values[name]:.3g}' for values in found)}")

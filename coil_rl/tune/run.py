@@ -4,7 +4,6 @@ The numbers are written into `tuned.json`, from which its env takes them wheneve
 policy of the run follows that guide.
 """
 
-import json
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -16,12 +15,12 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
+from coil_rl import record
 from coil_rl.errors import UserError, file_of_a_run
-from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.output import decoration, progress, say
 from coil_rl.report import draw_learning_curves
-from coil_rl.report.runs import DELIVERY, EVALUATION
+from coil_rl.report.runs import EVALUATION
 from coil_rl.report.table import return_format
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
@@ -37,7 +36,7 @@ from coil_rl.run.stopping import STOP, resume_command
 from coil_rl.tune.candidates import Candidates
 from coil_rl.tune.search import BEST, MEAN, OWN, MakeGuide, Number, Search, Tuner, Values, chosen
 
-TUNED = "tuned.json"  # the numbers that the guide got, by name
+TUNED = record.TUNED.name
 NAMES = {OWN: "guide", MEAN: "tuned", BEST: "best_candidate"}  # in delivery.json
 
 
@@ -96,8 +95,7 @@ class TunedRun(Run):
         self._search(tuner, metrics)
         self._hand_over(tuner, metrics)
         if not resumed:  # the time before the interruption is unknown
-            seconds = {"seconds": time.monotonic() - start}
-            write_text(self.folder / "training_time.json", json.dumps(seconds, indent=2))
+            record.SECONDS.write(self.folder, {"seconds": time.monotonic() - start})
         with decoration(f"the learning curve in {self.folder}"):
             draw_learning_curves(
                 {self.label: [metrics.rows]},
@@ -193,32 +191,32 @@ class TunedRun(Run):
     def _hand_over(self, tuner: Tuner, metrics: Metrics) -> None:
         """Test which numbers the guide gets, unless that is done, and evaluate the kept ones."""
         with STOP.at_once():
-            if not all((self.folder / file).exists() for file in (DELIVERY, "policy_last.pt")):
-                self._test(tuner)
-            report = json.loads(read_file(self.folder / DELIVERY, LARGEST_NUMBERS))
-            tuner.cases.steps, tuner.cases.calls = report["steps"], report["calls"]
-            counted = {"frames": report["steps"], "frames/tests": report["steps"]}
-            metrics.fill({len(metrics.rows) - 1: counted | {"guide/calls": report["calls"]}})
+            report = record.DELIVERY.read(self.folder)
+            if report is None or not (self.folder / "policy_last.pt").exists():
+                report = self._test(tuner)
+            tuner.cases.steps, tuner.cases.calls = report.steps, report.calls
+            counted = {"frames": report.steps, "frames/tests": report.steps}
+            metrics.fill({len(metrics.rows) - 1: counted | {"guide/calls": report.calls}})
             self._fill_curve(metrics)
         self._save(tuner)
 
-    def _test(self, tuner: Tuner) -> None:
-        """Test, and write the numbers that the guide gets and why."""
+    def _test(self, tuner: Tuner) -> record.Delivery:
+        """Test, and write the numbers that the guide gets and why; return why."""
         values = {OWN: tuner.own, MEAN: tuner.mean, BEST: tuner.best}
         returns = tuner.test()
         name = chosen(returns)
-        write_text(self.folder / TUNED, json.dumps(values[name], indent=2))
+        record.TUNED.write(self.folder, dict(values[name]))
         for which in ("last", HANDED_OVER):
             checkpoint.save({GUIDE: torch.tensor(0)}, weights_file(self.folder, which))
-        report = {
-            "policy": NAMES[name],
-            "cases": len(returns[OWN]),
-            "steps": tuner.cases.steps,
-            "calls": tuner.cases.calls,
-            "returns": {NAMES[each]: float(found.mean()) for each, found in returns.items()},
-            "frames": None,
-        }
-        write_text(self.folder / DELIVERY, json.dumps(report, indent=2))
+        report = record.Delivery(
+            policy=NAMES[name],
+            cases=len(returns[OWN]),
+            steps=tuner.cases.steps,
+            calls=tuner.cases.calls,
+            returns={NAMES[each]: float(found.mean()) for each, found in returns.items()},
+        )
+        record.DELIVERY.write(self.folder, report)
+        return report
 
     def _save(self, tuner: Tuner) -> None:
         """Write the checkpoint."""
@@ -271,12 +269,11 @@ def read_tuned(folder: Path, numbers: Sequence[Number]) -> Values | None:
     Raises:
         UserError: for a file that holds other numbers, or numbers out of their bounds.
     """
-    file = folder / TUNED
-    if not file.exists():
+    saved = record.TUNED.read(folder)
+    if saved is None:
         return None
-    with file_of_a_run(file, PUT_BACK):
-        saved = json.loads(read_file(file, LARGEST_NUMBERS))
-        values = {number.name: float(saved[number.name]) for number in numbers}
+    with file_of_a_run(folder / record.TUNED.name, PUT_BACK):
+        values = {number.name: saved[number.name] for number in numbers}
         for number in numbers:
             low, high = min(number.low, number.own), max(number.high, number.own)
             if not low <= values[number.name] <= high:
