@@ -33,7 +33,7 @@ from torchrl.envs import (
 from tqdm import tqdm
 
 from benchmarks.timing import Stopwatch
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.learners import DQN, PPO, SAC, Mlp
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
@@ -104,7 +104,6 @@ def ours(
         algorithm: "ppo", "sac" or "dqn".
         env_id: Gymnasium's name of the env.
         values: hyper-parameters, see `VALUES`.
-        frames: of the training.
         seed: of the env and of the learner.
 
     Returns:

@@ -14,7 +14,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from benchmarks.beside_sb3 import VALUES, our_learner, their_learner
 from benchmarks.timing import Row, Stopwatch, median_ratio, medians
 from benchmarks.training import without_lean_forms
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms.normalised_action import normalising
 

@@ -13,7 +13,7 @@ from gymnasium.spaces import Box
 from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 
 from benchmarks.timing import Row, Work, measure, median_ratio, medians
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.learners import PPO
 from coil_rl.run.rollout import Rollout
 
@@ -65,11 +65,7 @@ def measure_workers(args: Namespace) -> list[Row]:
 
 
 def works(workers: int) -> dict[str, Work]:
-    """Return the functions that are timed by name: a step, a rollout, a batch.
-
-    Args:
-        workers: number of its processes.
-    """
+    """Return the functions that are timed by name: a step, a rollout, a batch."""
     env: EnvBase = GymnasiumEnv(SlowPlant, ROWS, workers=workers, seed=0)
     action = env.rand_action(env.reset())
     whole = TransformedEnv(

@@ -10,6 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from coil_rl.comparison.compare import compare as compare
     from coil_rl.config.learned_guide import LearnedGuide as LearnedGuide
     from coil_rl.config.load import open_run as open_run
     from coil_rl.config.load import pretrained as pretrained
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from coil_rl.config.values import check_values as check_values
     from coil_rl.envs import ConeTrackEnv as ConeTrackEnv
     from coil_rl.envs import DrivingTasksEnv as DrivingTasksEnv
-    from coil_rl.envs import EnvBatch as EnvBatch
     from coil_rl.envs import McapReplayEnv as McapReplayEnv
     from coil_rl.envs import SimulatedRobotEnv as SimulatedRobotEnv
     from coil_rl.envs import Track as Track
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from coil_rl.envs import load_tracks as load_tracks
     from coil_rl.envs import random_tracks as random_tracks
     from coil_rl.envs import shipped_tracks as shipped_tracks
-    from coil_rl.envs.gymnasium_env import GymnasiumEnv as GymnasiumEnv
     from coil_rl.envs.limits import check_range as check_range
     from coil_rl.errors import UserError as UserError
     from coil_rl.errors import did_you_mean as did_you_mean
@@ -41,13 +40,14 @@ if TYPE_CHECKING:
     from coil_rl.export import ExportedPolicy as ExportedPolicy
     from coil_rl.export import export_policy as export_policy
     from coil_rl.files import write_text as write_text
+    from coil_rl.foreign.gymnasium_env import GymnasiumEnv as GymnasiumEnv
+    from coil_rl.foreign.torchrl_env import EnvBatch as EnvBatch
     from coil_rl.guides import ConstantGuide as ConstantGuide
     from coil_rl.guides import ControllerGuide as ControllerGuide
     from coil_rl.guides import EntryGuide as EntryGuide
     from coil_rl.guides import PerRow as PerRow
     from coil_rl.guides import RandomGuide as RandomGuide
     from coil_rl.guides import RecordedGuide as RecordedGuide
-    from coil_rl.guides import RecordingGuide as RecordingGuide
     from coil_rl.guides import SplineGuide as SplineGuide
     from coil_rl.guides import ZeroGuide as ZeroGuide
     from coil_rl.guides.advice_observation import AdviceObservation as AdviceObservation
@@ -85,18 +85,18 @@ if TYPE_CHECKING:
     from coil_rl.transforms import ResidualAction as ResidualAction
     from coil_rl.transforms import RewardCoupling as RewardCoupling
     from coil_rl.transforms import set_progress as set_progress
-    from coil_rl.worth.comparison import compare as compare
 
 _NAMES = {
-    "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv EnvBatch McapReplayEnv SimulatedRobotEnv Track "
+    "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv McapReplayEnv SimulatedRobotEnv Track "
     "load_track load_tracks random_tracks shipped_tracks",
-    "coil_rl.envs.gymnasium_env": "GymnasiumEnv",
+    "coil_rl.foreign.gymnasium_env": "GymnasiumEnv",
+    "coil_rl.foreign.torchrl_env": "EnvBatch",
     "coil_rl.envs.limits": "check_range",
     "coil_rl.errors": "UserError did_you_mean",
     "coil_rl.export": "ExportedGuide ExportedPolicy export_policy",
     "coil_rl.files": "write_text",
     "coil_rl.guides": "ConstantGuide ControllerGuide EntryGuide PerRow RandomGuide RecordedGuide "
-    "RecordingGuide SplineGuide ZeroGuide",
+    "SplineGuide ZeroGuide",
     "coil_rl.config.learned_guide": "LearnedGuide",
     "coil_rl.guides.advice_observation": "AdviceObservation",
     "coil_rl.imitation": "Imitation",
@@ -119,7 +119,7 @@ _NAMES = {
     "coil_rl.run.parts": "EnvMaker",
     "coil_rl.run.run": "Budget Run",
     "coil_rl.config.trust": "trust_packages",
-    "coil_rl.worth.comparison": "compare",
+    "coil_rl.comparison.compare": "compare",
     "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction NormalisedAction "
     "ResidualAction RewardCoupling set_progress",
 }

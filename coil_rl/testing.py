@@ -13,8 +13,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs, step_mdp
 
-from coil_rl.envs.env_batch import optional_entries
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.batch import optional_entries
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.transforms import GuideActions, set_progress
 from coil_rl.transforms.action_space import first_choices, nested_key, own_shape, space_of
 from coil_rl.transforms.guide_actions import unfit_action
@@ -85,7 +85,7 @@ def _same(one: Tensor, other: Tensor) -> bool:
 def _look_at_bounds(env: GymnasiumEnv, steps: int) -> None:
     """Warn of each entry of the observation with a number outside of its space."""
     rollout = env.rollout(steps, break_when_any_done=False)
-    for entry in env.entries:
+    for entry in env.codec.entries:
         parts = [rollout[entry.key], rollout["next", *entry.key]]
         values = torch.cat([part.reshape(-1, *entry.given) for part in parts])
         found = entry.outside(values.cpu().numpy())

@@ -1,8 +1,10 @@
 """Batched TorchRL environments, tracks, recordings and the parts they share."""
 
+import importlib
+from typing import Any
+
 from coil_rl.envs.cone_track import ConeTrackEnv as ConeTrackEnv
 from coil_rl.envs.driving_tasks import DrivingTasksEnv as DrivingTasksEnv
-from coil_rl.envs.env_batch import EnvBatch as EnvBatch
 from coil_rl.envs.level_files import load_track as load_track
 from coil_rl.envs.level_files import load_tracks as load_tracks
 from coil_rl.envs.level_files import save_track as save_track
@@ -36,3 +38,10 @@ from coil_rl.envs.track import TrackError as TrackError
 from coil_rl.envs.track import resample as resample
 from coil_rl.envs.track_generator import random_track as random_track
 from coil_rl.envs.track_generator import random_tracks as random_tracks
+
+
+def __getattr__(name: str) -> Any:
+    # Its package imports this one.
+    if name == "EnvBatch":
+        return importlib.import_module("coil_rl.foreign.torchrl_env").EnvBatch
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -54,7 +54,7 @@ MILESTONES = [
     "evaluation.csv",
 ]
 LOGS = ["metrics.csv", "evaluation.csv", "episodes.csv", "guide_return.json"]
-STATES = ["policy_last.pt", "policy_best.pt", "checkpoint.pt"]
+STATES = ["policy_last.pt", "checkpoint.pt"]
 TIMEOUT = 600  # s
 
 

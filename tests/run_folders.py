@@ -106,7 +106,7 @@ def make_untrained_run(folder: Path, *overrides: str) -> Path:
         config = compose("train", [*overrides, f"run_dir={folder}"])
     if config.method.observes is not None:
         policy = build_learner(config, env_maker(config)()).policy
-        for which in ("last", "best")[: 2 if config.delivery == "tested" else 1]:
+        for which in ("last", "handed_over")[: 2 if config.delivery == "tested" else 1]:
             checkpoint.save(policy.state_dict(), folder / f"policy_{which}.pt")
     saved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     saved.logger = None

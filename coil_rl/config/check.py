@@ -31,13 +31,13 @@ from coil_rl.config.nodes import build as build_node
 from coil_rl.config.nodes import build_all, check_node
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
 from coil_rl.config.pretrained import run_folder
-from coil_rl.config.repeats import Tried, tried
 from coil_rl.config.replay import check_recordings_to_leave_out, check_replay
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.values import check_values
-from coil_rl.envs.env_batch import SeededRows, optional_entries
-from coil_rl.envs.gate import ForeignError
 from coil_rl.errors import UserError, did_you_mean
+from coil_rl.foreign.batch import SeededRows, optional_entries
+from coil_rl.foreign.faults import ForeignError
+from coil_rl.foreign.trial import Tried, tried
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.off_policy import OffPolicy
@@ -46,14 +46,13 @@ from coil_rl.output import say
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
 from coil_rl.run.fallback import check_cases_of_guide, critic_beside_guide, no_effect
-from coil_rl.run.folder import weights_file
+from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
-from coil_rl.run.run import HANDED_OVER
 from coil_rl.run.training import INIT
-from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.guide_actions import UnfitActionError
+from coil_rl.tune.search import Search
 
 # Kind of a learner: description and example.
 KINDS = {

@@ -35,7 +35,7 @@ class LearnedGuide(TensorDictModuleBase):
 
     Args:
         run: folder of a run of `coil-train`, or `pretrained:NAME`.
-        which: the policy that the run hands over, the last, or the best one.
+        which: the policy that the run hands over, or the last one.
         device: of the networks.
 
     Raises:
@@ -46,7 +46,7 @@ class LearnedGuide(TensorDictModuleBase):
     def __init__(
         self,
         run: str,
-        which: Literal["handed_over", "last", "best"] = "handed_over",
+        which: Literal["handed_over", "last"] = "handed_over",
         device: str = "cpu",
     ) -> None:
         super().__init__()

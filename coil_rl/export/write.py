@@ -21,11 +21,12 @@ from coil_rl.export.recording import Recording, record
 from coil_rl.export.session import require
 from coil_rl.export.step import NotExportableError, PolicyStep, exportable
 from coil_rl.files import temporary
-from coil_rl.guides.controllers import EntryGuide, PerRow
-from coil_rl.guides.functions import FunctionGuide
+from coil_rl.foreign.controllers import EntryGuide, PerRow
+from coil_rl.foreign.functions import FunctionGuide
 from coil_rl.output import progress, say
 from coil_rl.run.controller import Controller
-from coil_rl.run.run import HANDED_OVER, Run
+from coil_rl.run.folder import HANDED_OVER
+from coil_rl.run.run import Run
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_transform import SeededGenerator
 
@@ -48,7 +49,7 @@ def export_policy(
     Args:
         run: finished.
         folder: for the files.
-        which: policy, "handed_over", "last" or "best".
+        which: policy, "handed_over" or "last".
         observations: number of steps in the env in which both are compared.
         seed: of these steps.
         meanings: of entries and of `action`, for the contract: texts, or mappings with some of

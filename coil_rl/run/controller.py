@@ -21,7 +21,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type
 
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.transforms import GuideActions, undisturbed
 from coil_rl.transforms.chain import Chain, Past
 
@@ -37,7 +37,7 @@ class Controller:
             has its own delays and noise.
         policy: of the run, for this env.
         folder: of the run, if it has one.
-        which: name of the policy in the folder, "handed_over", "last" or "best".
+        which: name of the policy in the folder, "handed_over" or "last".
 
     Example:
         >>> import coil_rl
@@ -123,8 +123,8 @@ class Controller:
                     f"{'/'.join(key)} is read by the policy or its guide, but is no part of an "
                     "observation"
                 )
-        if isinstance(self.plant, GymnasiumEnv) and self.plant.rows[0].controllers:
-            names = ", ".join(self.plant.rows[0].controllers)
+        if isinstance(self.plant, GymnasiumEnv) and self.plant.held.plants[0].controllers:
+            names = ", ".join(self.plant.held.plants[0].controllers)
             warnings.warn(
                 f"the controller {names} belongs to an env of its own, in which nothing happens: "
                 "its advice is right only if it reads nothing but the observation",

@@ -6,7 +6,6 @@ each in the same cases.
 """
 
 import math
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from itertools import pairwise
@@ -19,10 +18,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.files import whole_file
 from coil_rl.measures import Measure
 from coil_rl.output import progress
-from coil_rl.report.runs import CHOICE, RETURN
+from coil_rl.report.runs import RETURN
 from coil_rl.run import checkpoint
 from coil_rl.run.evaluation import Totals, episodes
 from coil_rl.run.metrics import Metrics
@@ -34,11 +32,10 @@ Watch = Mapping[str, Mapping[str, Sequence[str]]]  # name to key, of "episode" a
 
 @dataclass(eq=False)
 class EvaluationCurve:
-    """Keeps policies of a run, evaluates them in sets of cases, and keeps the best; a `Callback`.
+    """Keeps policies of a run, and evaluates them in sets of cases; a `Callback`.
 
-    It writes `policies/FRAMES.pt`, and `policy_best.pt`, the kept policy with the highest return in
-    the cases of the selection. The results are filled into the rows of the updates after which the
-    policies were kept.
+    It writes `policies/FRAMES.pt`. The results are filled into the rows of the updates after which
+    the policies were kept.
 
     Args:
         folder: of the run.
@@ -49,7 +46,6 @@ class EvaluationCurve:
         points: number of policies that are kept, besides the first one.
         batches: number of evaluations over the run. Each is of the policies that were kept since
             the one before, and takes as long as one episode.
-        chooses: whether to write `policy_best.pt`; otherwise the test at the end of the run does.
 
     Attributes:
         columns: names of its numbers in the log.
@@ -62,7 +58,6 @@ class EvaluationCurve:
     watch: Watch = field(default_factory=dict)
     points: int = 16
     batches: int = 1
-    chooses: bool = True
 
     # It acts after the row of an update was logged.
     names: Sequence[str] = field(default=(), init=False)
@@ -96,10 +91,7 @@ class EvaluationCurve:
             self.keep(update)
         batch = self.batch(update)
         if batch and math.isnan(self.metrics.rows[batch[-1]][RETURN]):
-            results = dict(zip(batch, self.evaluate(batch), strict=True))
-            if self.chooses:
-                self._keep_best(results)
-            self.metrics.fill(results)
+            self.metrics.fill(dict(zip(batch, self.evaluate(batch), strict=True)))
         return {}
 
     def kept(self) -> list[int]:
@@ -146,14 +138,6 @@ class EvaluationCurve:
                     for row, mean in zip(rows, means.tolist(), strict=True):
                         row[f"{cases}/{name}"] = mean
         return rows
-
-    def _keep_best(self, results: Mapping[int, Mapping[str, float]]) -> None:
-        """Copy the best of all evaluated policies to `policy_best.pt`."""
-        rows = [{**row, **results.get(number, {})} for number, row in enumerate(self.metrics.rows)]
-        judged = [number for number, row in enumerate(rows) if not math.isnan(row[CHOICE])]
-        best = max(judged, key=lambda number: rows[number][CHOICE])
-        with whole_file(self.folder / "policy_best.pt") as unfinished:
-            shutil.copyfile(self.file(best), unfinished)
 
 
 def _evenly(ends: Sequence[int], parts: int) -> list[int]:

@@ -9,7 +9,6 @@ held and the start test has left no frames for it, the test is left out.
 """
 
 import copy
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,15 +21,15 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.files import write_text
+from coil_rl import record
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.anchor import hold_of
 from coil_rl.learners.learner import Learner
-from coil_rl.report.runs import DELIVERY, UNTESTED
 from coil_rl.report.statistics import mean_interval
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
 from coil_rl.run.curve import EvaluationCurve
+from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.judge import guide_titles
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.combined_actions import GradualResidual, ResidualAction
@@ -74,8 +73,8 @@ class GuideActs(TensorDictModuleBase):
 class Delivery:
     """The test at the end of a training, a `Callback`.
 
-    It writes `policy_best.pt`, the policy that is handed over, and `delivery.json`, which says
-    which it is and why. Ties go to the last policy.
+    It writes the policy that is handed over, `policy_handed_over.pt`, and `delivery.json`, which
+    says which it is and why. Ties go to the last policy.
 
     Args:
         learner: has the policy.
@@ -169,7 +168,7 @@ class Delivery:
         means = {name: float(values.mean()) for name, values in returns.items()}
         chosen = max(means, key=lambda name: means[name])
         cases = len(returns["last"])
-        checkpoint.save(candidates[chosen], self.folder / "policy_best.pt")
+        checkpoint.save(candidates[chosen], weights_file(self.folder, HANDED_OVER))
         self._report(chosen, means, returns, earlier)
         guides = [mean for name, mean in means.items() if name not in ("last", "earlier")]
         numbers = (
@@ -182,8 +181,8 @@ class Delivery:
 
     def _hand_over_untested(self, last: dict[str, Any]) -> dict[str, float]:
         """Hand over the last policy without a test, and return NaN for its mean returns."""
-        checkpoint.save(last, self.folder / "policy_best.pt")
-        self._report(UNTESTED, {}, {"last": torch.empty(0)}, None)
+        checkpoint.save(last, weights_file(self.folder, HANDED_OVER))
+        self._report(record.UNTESTED, {}, {"last": torch.empty(0)}, None)
         return dict.fromkeys(self.names, math.nan) | {"delivery/cases": 0.0}
 
     def _earlier(self, update: int) -> Path | None:
@@ -265,17 +264,18 @@ class Delivery:
             earlier: file of the best kept policy; None: there is none.
         """
         ahead = None
-        if chosen not in ("last", UNTESTED):
+        if chosen not in ("last", record.UNTESTED):
             ahead = mean_interval((returns[chosen] - returns["last"]).tolist())
-        report = {
-            "policy": chosen,
-            "cases": len(returns["last"]),
-            "steps": self.cases.steps,
-            "returns": means,
-            "ahead": ahead,  # of the last policy: mean difference, with its 95 % t interval
-            "frames": int(earlier.stem) if chosen == "earlier" and earlier is not None else None,
-        }
-        write_text(self.folder / DELIVERY, json.dumps(report, indent=2))
+        report = record.Delivery(
+            policy=chosen,
+            cases=len(returns["last"]),
+            steps=self.cases.steps,
+            calls=self.cases.calls,
+            returns=dict(means),
+            ahead=ahead,
+            frames=int(earlier.stem) if chosen == "earlier" and earlier is not None else None,
+        )
+        record.DELIVERY.write(self.folder, report)
 
 
 def policy_of(state: dict[str, Any], learner: Learner, env: EnvBase) -> TensorDictModuleBase:

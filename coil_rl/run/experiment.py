@@ -19,7 +19,7 @@ from coil_rl.report.table import return_format
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases, guide_calls
 from coil_rl.run.curve import EvaluationCurve, Watch
-from coil_rl.run.folder import check_same
+from coil_rl.run.folder import check_same, weights_file
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.reasons import start_test
 from coil_rl.run.rollout import Rollout
@@ -33,10 +33,9 @@ class Experiment:
     """The training of one run in one folder.
 
     Files: `metrics.csv` (a row for the state before the first update and after each update),
-    `checkpoint.pt` (the complete state), `checkpoint_previous.pt`, `policy_last.pt`,
-    `policy_best.pt` (the best of the kept ones; the last one without a curve) and `policies/` (the
-    kept ones). A run that was killed at any moment and resumed in a new process ends with the same
-    files, to the bit on a CPU.
+    `checkpoint.pt` (the complete state), `checkpoint_previous.pt`, `policy_last.pt` and `policies/`
+    (the kept ones). A run that was killed at any moment and resumed in a new process ends with the
+    same files, to the bit on a CPU.
 
     Args:
         learner: learns from the batches.
@@ -186,10 +185,7 @@ class Experiment:
                     with decoration("the progress bar"):
                         self._show(bar, row, guide_return)
                     self._act(row)
-        policy = self.learner.policy.state_dict()
-        checkpoint.save(policy, self.folder / "policy_last.pt")
-        if self.curve is None and self.reserve is None:
-            checkpoint.save(policy, self.folder / "policy_best.pt")
+        checkpoint.save(self.learner.policy.state_dict(), weights_file(self.folder))
         return self.metrics.rows
 
     def update(self, progress: float) -> dict[str, float]:

@@ -20,8 +20,8 @@ from torchrl.envs import (
     VecNormV2,
 )
 
-from coil_rl.envs.step_limit import limits_of
 from coil_rl.errors import UserError
+from coil_rl.foreign.limit import limits_of
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.normalised_action import normalising

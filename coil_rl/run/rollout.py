@@ -12,8 +12,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.envs.env_batch import optional_entries
 from coil_rl.errors import UserError
+from coil_rl.foreign.batch import optional_entries
 from coil_rl.run.exploration import noise_of
 from coil_rl.run.lean_steps import LeanSteps
 from coil_rl.transforms.guide_transform import set_progress

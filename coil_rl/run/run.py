@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,14 +15,14 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.errors import NO_SPACE, UserError, did_you_mean, file_of_a_run, is_outside
-from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
+from coil_rl import record
+from coil_rl.errors import NO_SPACE, UserError, is_outside
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.measures import Measure
 from coil_rl.output import decoration, say
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.report.pictures import Picture
-from coil_rl.report.runs import DELIVERY, EVALUATION, begun_with, read_curve
+from coil_rl.report.runs import EVALUATION, begun_with
 from coil_rl.run import checkpoint
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import Watch
@@ -32,6 +31,7 @@ from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.experiment import PUT_BACK
 from coil_rl.run.fallback import Fallback, make_fallback
 from coil_rl.run.folder import (
+    HANDED_OVER,
     begin,
     check_same,
     is_begun,
@@ -53,8 +53,6 @@ from coil_rl.run.weights import put_weights
 
 if TYPE_CHECKING:
     import pandas as pd
-
-HANDED_OVER = "handed_over"  # name of the policy that `delivery` chose
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ class Run:
             of random weights.
         delivery: what the run hands over, "last" for the last policy, or "tested" for what is best
             in a test at the end, see `Delivery`.
-        which: policy that is evaluated: "handed_over", "last" or "best".
+        which: policy that is evaluated: "handed_over" or "last".
         fallback: whether to evaluate the policy also with its guide to fall back to.
         compiled: whether to compile the steps of env and guides where they can be.
         device: of everything.
@@ -164,24 +162,18 @@ class Run:
         """Whether the run has a policy, and not only a guide that acts alone."""
         return self.make_learner is not None
 
-    @property
-    def chosen(self) -> str:
-        """Policy that is evaluated, "last" or "best"."""
-        return self.file_of(self.which)
-
-    def file_of(self, which: str) -> str:
-        """Return "last" or "best" for the name of a policy, which may be "handed_over".
+    def weights(self, which: str) -> Path:
+        """Return the file of a policy, "handed_over" or "last".
 
         Raises:
             UserError: for another name.
         """
-        names = [HANDED_OVER, "last", "best"]
-        if which not in names:
-            hint = did_you_mean(str(which), names)
-            raise UserError(f"which={which!r} must be one of {', '.join(names)}{hint}")
-        if which != HANDED_OVER:
-            return which
-        return "best" if self.delivery == "tested" else "last"
+        if which not in (HANDED_OVER, "last"):
+            raise UserError(
+                f"which={which!r} must be {HANDED_OVER} or last; with delivery=tested a run hands "
+                "over what is best in a test at its end"
+            )
+        return weights_file(self.folder, which if self.delivery == "tested" else "last")
 
     def train(self, frames: int | None = None) -> Run:
         """Train to the end, evaluate, and return the run.
@@ -239,13 +231,13 @@ class Run:
         """Return what a machine is sent: the policy with guide, normaliser and memory inside.
 
         Args:
-            which: policy, "handed_over", "last" or "best"; by default the one that is evaluated.
+            which: policy, "handed_over" or "last"; by default the one that is evaluated.
 
         Raises:
             UserError: if the policy is missing, or for another name.
         """
         which = self.which if which is None else which
-        self.file_of(which)
+        self.weights(which)
         env = self.make_env(1, TRAIN)
         if not self.has_agent:
             env, policy = self.make_env.guided(1, TRAIN)
@@ -257,7 +249,7 @@ class Run:
 
         Args:
             env: of the run, such as `run.make_env(rows)`; by default a new one.
-            which: policy, "handed_over", "last" or "best"; by default the one that is evaluated.
+            which: policy, "handed_over" or "last"; by default the one that is evaluated.
         """
         if not self.has_agent:
             return None
@@ -290,8 +282,8 @@ class Run:
         if not begun:
             return
         write_config(self.folder, self.settings)
-        for file in ("evaluation.csv", "evaluation.md", "training_time.json", DELIVERY):
-            (self.folder / file).unlink(missing_ok=True)
+        for file in (record.EVALUATION, record.PAGE, record.SECONDS, record.DELIVERY):
+            (self.folder / file.name).unlink(missing_ok=True)
         say(
             f"{self.folder} goes on from {budget.frames:,} to {frames:,} frames; schedules over "
             f"the run, such as a learning rate, go on at {budget.frames / frames:.0%} of their way",
@@ -359,7 +351,7 @@ class Run:
     def _say_next(self) -> None:
         """Print the command that usually follows a training."""
         if self.has_agent:
-            rows = read_curve(self.folder / "metrics.csv")
+            rows = record.METRICS.need(self.folder)
             say(next_step(self.folder, self.budget.frames, rows))
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
@@ -375,14 +367,13 @@ class Run:
         start = time.monotonic()
         rows = experiment.run(max(guide_returns.values(), default=None))
         if not resumed:  # the time before the interruption is unknown
-            seconds = {"seconds": time.monotonic() - start}
-            write_text(self.folder / "training_time.json", json.dumps(seconds, indent=2))
+            record.SECONDS.write(self.folder, {"seconds": time.monotonic() - start})
         learner = experiment.learner
         with decoration(f"the learning curve in {self.folder}"):
             self._draw(rows, learner, guide_returns)
         experiment.metrics.close()
         learner.export(self.folder)
-        return self._loaded(learner.policy, experiment.rollout.env, self.chosen)
+        return self._loaded(learner.policy, experiment.rollout.env, self.which)
 
     def _draw(
         self,
@@ -402,15 +393,12 @@ class Run:
 
         It is empty without such cases.
         """
-        file = self.folder / "guide_return.json"
-        if file.exists():
-            names = self.trial.guides if EVALUATION in self.make_env.sizes else ()
-            with file_of_a_run(file, "remove it, and the run measures it again"):
-                numbers = json.loads(read_file(file, LARGEST_NUMBERS))
-                return {name: float(numbers[name]) for name in names}
-        returns = guide_returns(self.make_env, self.make_env.guides())
-        write_text(file, json.dumps(returns, indent=2))
-        return returns
+        names = self.trial.guides if EVALUATION in self.make_env.sizes else ()
+        saved = record.GUIDE_RETURNS.read(self.folder)
+        if saved is None or not saved.keys() >= set(names):
+            saved = guide_returns(self.make_env, self.make_env.guides())
+            record.GUIDE_RETURNS.write(self.folder, saved)
+        return {name: saved[name] for name in names}
 
     def require_agent(self) -> Callable[[EnvBase], Learner]:
         """Return what makes the learner of the run for an env.
@@ -429,7 +417,7 @@ class Run:
 
         Args:
             env: with the transforms of the run.
-            which: "handed_over", "last", or "best".
+            which: "handed_over" or "last".
 
         Raises:
             UserError: if the policy is missing, damaged, or does not fit the configuration.
@@ -444,12 +432,12 @@ class Run:
         Args:
             policy: of the learner.
             env: with the transforms of the run.
-            which: "handed_over", "last" or "best".
+            which: "handed_over" or "last".
 
         Raises:
             UserError: if the file is missing, damaged, or does not fit the policy.
         """
-        path = weights_file(self.folder, self.file_of(which))
+        path = self.weights(which)
         state = checkpoint.load(path, self.device)
         guide = guide_of(state, env)
         if guide is not None:
@@ -464,11 +452,11 @@ class Run:
 
     def reasons(self) -> list[str]:
         """Return the sentences on how the training began, and on its tests."""
-        rows = read_curve(self.folder / "metrics.csv") if self.has_agent else []
+        rows = record.METRICS.need(self.folder) if self.has_agent else []
         found = [start_test(rows[0])] if rows else []
         if (source := begun_with(self.settings)) is not None:
             found.append(f"It began with {source}, whose frames are not among those of this run.")
-        if self.chosen == "best":
+        if self.which == HANDED_OVER and self.delivery == "tested":
             found.append(handed_over(self.folder))
         return [sentence for sentence in found if sentence is not None]
 

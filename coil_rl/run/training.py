@@ -90,8 +90,8 @@ def _curve_of(run: Run, policy: TensorDictModuleBase) -> EvaluationCurve | None:
     sizes = run.make_env.sizes
     if EVALUATION not in sizes:
         return None
-    chooses = run.delivery != "tested"
-    sets = sizes if chooses else [EVALUATION]
+    # An earlier policy is chosen by the test at the end, if there is one.
+    sets = [EVALUATION] if run.delivery == "tested" else sizes
     envs = {cases: partial(_rows_of_policies, run.make_env, cases) for cases in sets}
     return EvaluationCurve(
         run.folder,
@@ -100,7 +100,6 @@ def _curve_of(run: Run, policy: TensorDictModuleBase) -> EvaluationCurve | None:
         watch=run.watch,
         points=run.budget.points,
         batches=run.budget.batches,
-        chooses=chooses,
     )
 
 

@@ -26,8 +26,8 @@ from scipy.spatial import cKDTree
 from coil_paper.figures.ego_view import Array, marker
 from coil_rl import EvaluationResult, Track, UserError, open_run
 from coil_rl.envs import SIDES
-from coil_rl.listening import LEFT, RIGHT, classify, smooth_line
 from coil_rl.report import DrivenLines, markdown_table, style
+from coil_studies.listening import LEFT, RIGHT, classify, smooth_line
 
 INSIDE_COLOUR = "#eceff2"
 HALF_WIDTH = 1.5  # m, of the straightened track
@@ -85,7 +85,7 @@ def drive(
     Args:
         folders: of finished runs; tracks and guide are those of the first one.
         count: number of tracks.
-        policy: of each run, "last" or "best".
+        policy: of each run, "last" or "handed_over".
     """
     runs = [open_run(folder) for folder in folders]
     trial = runs[0].trial
@@ -220,7 +220,7 @@ def main() -> None:
         "--output", type=Path, default=Path("outputs/figures"), help="output folder"
     )
     parser.add_argument("--tracks", type=int, default=3, help="number of test tracks")
-    parser.add_argument("--policy", choices=("last", "best"), default="last")
+    parser.add_argument("--policy", choices=("last", "handed_over"), default="last")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     tracks, drives = drive(options.runs, options.tracks, options.policy)

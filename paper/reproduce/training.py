@@ -37,13 +37,7 @@ POINT = ("frames", "mean", "low", "high")  # of a curve
 
 
 class Table4(WorldsResult):
-    """Return of the best and of the last policy of each method.
-
-    Args:
-        experiments: names of the experiments in the main world, files of `paper/conf/experiment`.
-        worlds: the experiments in each variant of the main world by its name; none by default.
-        against: label of the runs with which the others are compared, seed by seed.
-    """
+    """Return of the best and of the last policy of each method."""
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""

@@ -36,13 +36,7 @@ MEASURE_COLUMNS = {
 
 
 class Table5(WorldsResult):
-    """Lap time, smoothness, reward and crashes of each policy on unseen tracks.
-
-    Args:
-        experiments: names of the experiments in the main world, files of `paper/conf/experiment`.
-        worlds: the experiments in each variant of the main world by its name; none by default.
-        against: label of the runs with which the others are compared, seed by seed.
-    """
+    """Lap time, smoothness, reward and crashes of each policy on unseen tracks."""
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""

@@ -8,7 +8,7 @@ from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.guides import ConstantGuide, ControllerGuide, EntryGuide, RandomGuide, ZeroGuide
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.transforms import (

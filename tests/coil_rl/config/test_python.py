@@ -169,13 +169,13 @@ def test_rows_of_a_guide_are_those_of_the_object_that_was_handed_over(tmp_path):
 def test_controller_as_a_guide_is_the_policy_that_was_asked_for(tmp_path):
     words = [*SHORT, "delivery=tested", "learner.action_gain=1"]
     run = coil_rl.prepare(ENV, method="ppo", frames=32, folder=tmp_path / "run", overrides=words)
-    for seed, which in enumerate(("last", "best")):
+    for seed, which in enumerate(("last", "handed_over")):
         torch.manual_seed(seed)
         policy = run.make_learner(run.make_env()).policy
         checkpoint.save(policy.state_dict(), run.folder / f"policy_{which}.pt")
     run.begin()
     observation, actions = np.array([-6.0, 3.0], np.float32), []
-    for which in (None, "last", "best"):
+    for which in (None, "last", "handed_over"):
         controller = run.controller(which)
         guided = coil_rl.prepare(ENV, guide=controller, method="guide", folder=tmp_path / "guided")
         actions.append(float(controller.act(observation)[0]))
@@ -194,8 +194,8 @@ def test_number_that_is_none_is_refused_by_its_name(number, tmp_path):
 
 def test_other_name_of_a_policy_is_refused(tmp_path):
     run = coil_rl.prepare(ENV, guide=proportional, method="guide", folder=tmp_path / "run")
-    with pytest.raises(UserError, match="which='bset' must be one of handed_over, last, best"):
-        run.controller("bset")
+    with pytest.raises(UserError, match="which='best' must be handed_over or last; with del"):
+        run.controller("best")
 
 
 def test_tables_are_written_to_a_folder_that_is_a_text(tmp_path):

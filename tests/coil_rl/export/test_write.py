@@ -94,7 +94,7 @@ def test_guide_that_was_handed_over_is_said_to_be_no_policy(guide, tmp_path, cap
     folder = learned(
         tmp_path / "run", "coil", "delivery=tested", guide=f"thermostat.control:{guide}"
     )
-    checkpoint.save({GUIDE: torch.tensor(0)}, folder / "policy_best.pt")
+    checkpoint.save({GUIDE: torch.tensor(0)}, folder / "policy_handed_over.pt")
     run = coil_rl.open_run(folder)
     policy = coil_rl.export_policy(run, tmp_path / "exported", observations=OBSERVATIONS)
     said = capsys.readouterr().out
@@ -111,7 +111,7 @@ def test_first_policy_that_was_handed_over_is_said_to_have_learned_nothing(tmp_p
     folder = learned(tmp_path / "run", "coil_anchored", guide="thermostat.control:proportional")
     report = json.loads((folder / "delivery.json").read_text())
     (folder / "delivery.json").write_text(json.dumps(report | {"policy": "first"}))
-    shutil.copy(folder / "policy_last.pt", folder / "policy_best.pt")
+    shutil.copy(folder / "policy_last.pt", folder / "policy_handed_over.pt")
     run = coil_rl.open_run(folder)
     policy = coil_rl.export_policy(run, tmp_path / "exported", observations=OBSERVATIONS)
     said = "the first policy, which is its guide and has learned nothing"
@@ -220,7 +220,7 @@ def test_numbering_of_an_env_of_choices_is_kept(tmp_path):
 @pytest.mark.parametrize("method", sorted(REFUSED))
 def test_forest_is_refused(method, tmp_path):
     run = coil_rl.open_run(learned(tmp_path / "run", method))
-    with pytest.raises(coil_rl.UserError, match="it is a regressor of scikit-learn"):
+    with pytest.raises(coil_rl.UserError, match="it is a forest"):
         coil_rl.export_policy(run, tmp_path / "exported", observations=5)
     assert not (tmp_path / "exported").exists()
 

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from coil_rl import AdviceObservation, GymnasiumEnv
-from coil_rl.envs.gate import ForeignError
+from coil_rl.foreign.faults import ForeignError
 
 VECTOR = spaces.Box(-1.0, 1.0, (3,), np.float64)
 OBSERVATIONS = {

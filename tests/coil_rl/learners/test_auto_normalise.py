@@ -10,8 +10,8 @@ from gymnasium.spaces import Box
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 import coil_rl
-from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.errors import UserError
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.learners.normaliser import Moments
 from coil_rl.run.training import training_of
 

@@ -85,7 +85,7 @@ def test_file_is_a_guide_of_its_env_only(exported, tmp_path):
         ([RUN, "policy=first"], "policy"),
         ([RUN, "observations=0"], "observations"),
         ([RUN, "+meanings.action={size: 3}"], "must be a text, or a mapping with some of unit"),
-        ([RUN, "policy=best"], "policy_best.pt"),
+        ([RUN, "policy=best"], "policy='best' must be 'handed_over' or 'last'"),
         ([], "run must be given: write run=VALUE"),
     ],
 )

@@ -9,6 +9,7 @@ import pytest
 from programs import called
 
 import coil_rl
+from coil_rl import UserError
 
 SOURCE = """
 import gymnasium
@@ -116,36 +117,36 @@ def plants(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
 
 
-def guided(of="P"):
-    return ["method=coil", "guide=controller", f"guide.controller.of=odd_plants:{of}"]
-
-
 @pytest.mark.parametrize(
     ("program", "env", "words", "message"),
     [
-        ("train", "NoReward", ["method=ppo"], r"the reward is None, not one number"),
-        ("train", "Raises", ["method=ppo"], "step raised AssertionError: the pump is off"),
-        ("train", "Raises", guided(), "the env Raises (row 0, seed 11"),  # not the guide
-        ("train", "TrainingOnly", ["method=ppo"], "step returned 4 values, not the five"),
-        ("train", "Plant", guided("Late"), "the controller odd_plants:Late (row 0, step 10)"),
-        ("evaluate", "NoReward", guided()[1:], "the reward is None, not one number"),
-        (
-            "evaluate",
-            "Plant",
-            guided("Late")[1:],
-            "the controller odd_plants:Late (row 0, step 10)",
-        ),
+        ("train", "Raises", ["method=coil"], "step raised AssertionError: the pump is off"),
+        ("evaluate", "Plant", [], "the controller odd_plants:Late (row 0, step 10)"),
     ],
 )
 def test_fault_ends_a_program_with_one_sentence(program, env, words, message, tmp_path):
     tiny = TINY if program == "train" else ["env=gym", "evaluation.cases=2", "hydra.run.dir=run"]
-    words = [*tiny, *words, f"env.id=odd_plants:{env}", "evaluation.gif=false"]
+    of = "P" if program == "train" else "Late"
+    words = [*tiny, *words, "guide=controller", f"guide.controller.of=odd_plants:{of}"]
+    words += [f"env.id=odd_plants:{env}", "evaluation.gif=false"]
     done = called(program, *words, cwd=tmp_path, code=2)
     lines = [line for line in done.stderr.splitlines() if line.startswith(f"{program}: ")]
     lines = [line for line in lines if "frame/s" not in line]  # of the progress bar
     assert len(lines) == 1
     assert message in lines[0]
     assert "Traceback" not in done.stderr
+
+
+def test_fault_is_one_sentence_in_python(tmp_path):
+    words = [word for word in TINY[1:] if not word.startswith(("hydra", "budget.frames"))]
+    with pytest.raises(UserError, match=r"^the env NoReward .*: the reward is None"):
+        coil_rl.train(
+            "odd_plants:NoReward",
+            guide=Model(),
+            frames=64,
+            folder=tmp_path / "run",
+            overrides=[*words, "evaluation.gif=false"],
+        )
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def test_run_stopped_during_its_evaluation_resumes_to_the_same_numbers(run, tmp_
     train = command("train", *TINY, STILL, "logger=tensorboard", "hydra.run.dir=run")
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     first = subprocess.Popen(train, cwd=tmp_path, env=environment(tmp_path), **pipes)
-    while first.poll() is None and not (tmp_path / "run" / "policy_best.pt").exists():
+    while first.poll() is None and not (tmp_path / "run" / "policy_last.pt").exists():
         time.sleep(0.01)
     first.send_signal(
         signal.SIGSTOP
@@ -110,7 +110,6 @@ def test_run_stopped_during_its_evaluation_resumes_to_the_same_numbers(run, tmp_
         "evaluation.csv",
         "episodes.csv",
         "policy_last.pt",
-        "policy_best.pt",
     ):
         assert (tmp_path / "moved" / name).read_bytes() == (folder / "run" / name).read_bytes(), (
             name

@@ -12,10 +12,11 @@ from programs import called
 from coil_rl import open_run
 from coil_rl.config.build import env_maker
 from coil_rl.guides.simple import FollowAdvice
-from coil_rl.report.runs import DELIVERY
+from coil_rl.record import DELIVERY
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
 from coil_rl.run.delivery import GUIDE, Delivery, GuideActs
+from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import TESTS
 
 pytest.importorskip("gymnasium.envs.classic_control")
@@ -47,7 +48,7 @@ def rows_of(path):
 
 
 def report(folder):
-    return json.loads((folder / DELIVERY).read_text())
+    return json.loads((folder / DELIVERY.name).read_text())
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,7 @@ def test_guide_is_handed_over_where_nothing_better_was_learned(guide_wins):
     found = report(guide_wins)
     assert found["policy"] == "guide"
     assert found["returns"]["guide"] == max(found["returns"].values())
-    assert checkpoint.load(guide_wins / "policy_best.pt") == {GUIDE: torch.tensor(0)}
+    assert checkpoint.load(guide_wins / "policy_handed_over.pt") == {GUIDE: torch.tensor(0)}
     guide, agent = [
         row
         for row in rows_of(guide_wins / "evaluation.csv")
@@ -124,6 +125,30 @@ def test_test_at_the_end_gets_what_the_start_test_leaves_of_a_tenth(taken, kept,
     assert delivery.reserve() == kept
 
 
+class CountedCases(TrainingCases):
+    """Cases in which every episode of every policy has a number of steps."""
+
+    length = 0
+
+    def compared(self, policies, sampled=None):
+        self.steps += self.length * self.count * len(policies)
+        return [torch.zeros(self.count) for _ in policies]
+
+
+@pytest.mark.parametrize(("length", "is_compared"), [(8, True), (9, False)])
+def test_earlier_policy_is_compared_where_its_episodes_fit(
+    length, is_compared, monkeypatch, tmp_path
+):
+    """The test has 50 frames; two cases take 2 x `length` for each of three policies."""
+    monkeypatch.setattr("coil_rl.run.delivery.policy_of", lambda state, learner, env: state)
+    cases = CountedCases(build=lambda rows: None, frames=1000)
+    cases.length = length
+    delivery = Delivery(learner=None, env=None, cases=cases, curve=None, folder=tmp_path)
+    delivery.cases.renew = lambda count: setattr(cases, "count", count)
+    returns = delivery._tested({name: {} for name in ("last", "guide", "earlier")})
+    assert ("earlier" in returns) == is_compared
+
+
 def test_run_with_tests_takes_no_more_frames_than_one_without(tmp_path):
     small = ["method=coil_anchored", "budget.frames=700", "budget.num_envs=2"]
     rows = rows_of(trained(tmp_path / "run", ONCE, *small) / "metrics.csv")
@@ -140,7 +165,7 @@ def test_test_at_the_end_is_left_out_where_the_start_test_took_the_frames_of_bot
     assert float(last["frames/tests"]) == 2 * 3 * 40 == 0.1 * 2400
     assert float(last["frames"]) > 2300
     assert report(run)["policy"] == "last_untested"
-    state, given = (checkpoint.load(run / f"policy_{name}.pt") for name in ("last", "best"))
+    state, given = (checkpoint.load(run / f"policy_{name}.pt") for name in ("last", "handed_over"))
     assert all(torch.equal(state[key], given[key]) for key in state)
     page = (run / "evaluation.md").read_text()
     assert "Handed over is the last policy, without a test at the end" in page
@@ -158,6 +183,15 @@ def test_run_without_a_start_test_knows_from_its_training_how_long_a_test_would_
     assert report(run)["policy"] == "last_untested"
 
 
+def test_policy_of_an_older_folder_is_found_under_its_old_name(tmp_path):
+    assert weights_file(tmp_path, HANDED_OVER).name == "policy_handed_over.pt"
+    (tmp_path / "policy_best.pt").touch()
+    assert weights_file(tmp_path, HANDED_OVER).name == "policy_best.pt"
+    assert weights_file(tmp_path).name == "policy_last.pt"
+    (tmp_path / "policy_handed_over.pt").touch()
+    assert weights_file(tmp_path, HANDED_OVER).name == "policy_handed_over.pt"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("frames", [8000, 11_000])  # for three and for four cases
 def test_placebo_of_other_rows_always_has_other_rows(frames, tmp_path):
@@ -173,7 +207,7 @@ def test_learned_policy_is_handed_over_where_it_is_better(tmp_path):
     assert found["policy"] == best
     name = {"last": "policy_last.pt"}.get(best, f"policies/{found['frames'] or 0:012d}.pt")
     if best != "guide":
-        state, given = (checkpoint.load(folder / file) for file in ("policy_best.pt", name))
+        state, given = (checkpoint.load(folder / file) for file in ("policy_handed_over.pt", name))
         assert state.keys() == given.keys()
         assert all(torch.equal(state[key], given[key]) for key in state)
 
@@ -204,11 +238,17 @@ def test_killed_run_ends_with_the_same_files(tmp_path):
     overrides = ["method=coil_anchored", "checkpoint_every=2", "budget.frames=2400"]
     whole = trained(tmp_path / "whole", *overrides)
     stopped = trained(tmp_path / "stopped", *overrides)
-    for name in ("evaluation.csv", "evaluation.md", DELIVERY, "policy_best.pt", "policy_last.pt"):
+    for name in (
+        "evaluation.csv",
+        "evaluation.md",
+        DELIVERY.name,
+        "policy_handed_over.pt",
+        "policy_last.pt",
+    ):
         (stopped / name).unlink()
     (stopped / "checkpoint.pt").unlink()
     called("train", f"resume={stopped}", cwd=tmp_path)
-    for name in ("metrics.csv", DELIVERY, "policy_best.pt", "evaluation.csv"):
+    for name in ("metrics.csv", DELIVERY.name, "policy_handed_over.pt", "evaluation.csv"):
         assert (stopped / name).read_bytes() == (whole / name).read_bytes(), name
 
 
@@ -216,7 +256,7 @@ def test_killed_run_ends_with_the_same_files(tmp_path):
     ("overrides", "message"),
     [
         (["method=guide"], "delivery=tested has no effect: method=guide trains no policy"),
-        (["evaluation.policy=best"], "a training evaluates what it hands over"),
+        (["evaluation.policy=last"], "a training evaluates what it hands over"),
         (["delivery=best"], "delivery='best' must be 'last' or 'tested'"),
     ],
 )

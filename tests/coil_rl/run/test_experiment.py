@@ -68,7 +68,6 @@ def test_run_writes_its_files_and_a_row_per_update(tmp_path):
         "checkpoint.pt",
         "checkpoint_previous.pt",
         "metrics.csv",
-        "policy_best.pt",
         "policy_last.pt",
     }
     kept = {f"policies/{128 * update:012d}.pt" for update in range(5)}
@@ -201,16 +200,11 @@ def test_run_stopped_during_its_evaluation_ends_with_the_same_files(tmp_path, me
     )
 
 
-def test_best_policy_is_chosen_in_the_cases_of_selection(tmp_path):
+def test_one_update_is_left_where_tests_need_all_frames(tmp_path):
     run = experiment(tmp_path / "run")
-    evaluate = run.curve.evaluate
-    run.curve.evaluate = lambda updates: [
-        row | {"selection/return": -abs(update - 2)}
-        for update, row in zip(updates, evaluate(updates), strict=True)
-    ]
-    run.run()
-    files = contents(tmp_path / "run")
-    assert files["policy_best.pt"] == files["policies/000000000256.pt"] != files["policy_last.pt"]
+    run.reserve = lambda: run.frames
+    rows = run.run()
+    assert len(rows) == 2
 
 
 class WriteNaN(Transform):

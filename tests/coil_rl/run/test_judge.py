@@ -183,8 +183,8 @@ def test_curve_of_an_own_env_rests_on_20_cases_that_the_table_has_not():
     assert min(sizes.values()) >= 20
     (_, sentence) = about_returns(sizes)
     assert sentence == (
-        "The curve rests on 20 cases, and policy_best was chosen in 20 others; none of them is in "
-        "the table."
+        "The curve rests on 20 cases, and the best policy of a report is chosen in 20 others; "
+        "none of them is in the table."
     )
     curve = config.evaluation.curve
     firsts = [config.evaluation.env.first_seed, *(each.first_seed for each in curve.cases.values())]

@@ -1,0 +1,513 @@
+"""A space of Gymnasium as entries, specs and actions of TorchRL, and back.
+
+A guide or policy of this project reads tensors of numbers. So a choice becomes a one-hot vector,
+and nested Dict and Tuple spaces become nested keys.
+"""
+
+import math
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    MultiCategorical,
+    MultiOneHot,
+    TensorSpec,
+    Unbounded,
+)
+
+from coil_rl.foreign.faults import ForeignError, plain_array, shown
+from coil_rl.foreign.makers import Env
+
+MOST_CHOICES = 32  # of a whole number that is an action
+WATCHED = 256  # first observations, in which the range of each number is found
+# A number whose range has fewer steps of its dtype than COARSE is rounded too much to act on; fewer
+# than STILL are the rounding of the env itself.
+COARSE, STILL = 100.0, 1e-6
+FEW = 16  # numbers
+
+
+class Fineness:
+    """Warns if the first values of some numbers need more digits than their dtype has.
+
+    Args:
+        place: where they come from, for the warning.
+        title: of the numbers, for the warning.
+        dtype: to which they are rounded.
+
+    Attributes:
+        unseen: how many values are still to be seen.
+    """
+
+    def __init__(self, place: str, title: str, dtype: np.dtype[Any]) -> None:
+        self.place, self.title, self.dtype = place, title, dtype
+        self.unseen = WATCHED if dtype.kind == "f" else 0
+
+    def see(self, value: NDArray[Any]) -> None:
+        """Take a value; after the last one, warn if its range has too few steps of the dtype."""
+        if self.unseen == WATCHED:
+            self.low = self.high = value.astype(np.float64)
+        self.low, self.high = np.minimum(self.low, value), np.maximum(self.high, value)
+        self.unseen -= 1
+        if self.unseen:
+            return
+        with np.errstate(all="ignore"):  # of numbers that are refused anyway
+            step = np.spacing(np.maximum(abs(self.low), abs(self.high)).astype(self.dtype))
+            count = ((self.high - self.low) / step).ravel()
+        for index in np.flatnonzero((count > STILL) & (count < COARSE))[:1]:
+            low, high = self.low.flat[index], self.high.flat[index]
+            which = f"number {index} of {self.title}" if self.low.ndim else self.title
+            warnings.warn(
+                f"{self.place}: {which} goes from {low} to {high}, but {self.dtype} has steps of "
+                f"{step.flat[index]:.2g} there, so little of it is seen: subtract its offset in a "
+                "wrapper",
+                stacklevel=2,
+            )
+
+
+class Choices:
+    """Conversion of one-hot vectors side by side to the choices of a space, in its numbering.
+
+    Args:
+        space: a Discrete or MultiDiscrete space.
+    """
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        self.sizes, self.shape = _choices(space), tuple(space.shape or ())
+        self.first = torch.as_tensor(np.ravel(_start(space)).astype(np.int64))
+
+    def __call__(self, vectors: torch.Tensor) -> torch.Tensor:
+        """Return the choices, [*batch, *shape] with the shape of the space, as whole numbers.
+
+        Args:
+            vectors: [*batch, n].
+        """
+        parts = vectors.split(self.sizes, -1)
+        indices = torch.stack([part.argmax(-1) for part in parts], -1)
+        own = indices + self.first.to(indices.device)
+        return own.reshape((*vectors.shape[:-1], *self.shape))
+
+
+class Entry:
+    """One entry of the observation: where it is found, its spec, and its conversion to numbers.
+
+    Args:
+        id: of the env, for the `ValueError` about a space that is not supported.
+        path: keys of Dict spaces and indices of Tuple spaces.
+        space: of the entry.
+        floats: dtype of entries that are no pixels.
+    """
+
+    def __init__(
+        self, id: str, path: tuple[str | int, ...], space: spaces.Space[Any], floats: np.dtype[Any]
+    ) -> None:
+        self.path, self.dtype, self.start = path, floats, _start(space)
+        self.space, self.shape = space, tuple(space.shape or ())
+        self.binary = isinstance(space, spaces.MultiBinary)
+        # Not the entry of a Dict space: the observation itself, or within a Tuple.
+        whole = not path or isinstance(path[0], int)
+        names = [str(part) for part in path]
+        self.key: tuple[str, ...] = ("observation", *names) if whole else tuple(names)
+        self.title = ".".join(["the observation", *names])
+        self.choices = _choices(space)
+        dtype = torch.from_numpy(np.empty(0, floats)).dtype
+        if self.choices:
+            self.spec: TensorSpec = MultiOneHot(self.choices, dtype=dtype)
+            # Places of the first choices in the vector.
+            self.first = np.cumsum([0, *self.choices[:-1]])
+        elif _is_picture(space):
+            self.dtype = np.dtype(np.uint8)
+            self.spec = Unbounded(space.shape or (1,), dtype=torch.uint8)
+        elif isinstance(space, spaces.Box):
+            self.spec = Unbounded(space.shape or (1,), dtype=dtype)
+        elif isinstance(space, spaces.MultiBinary):
+            self.spec = Binary(shape=torch.Size(space.shape), dtype=dtype)
+        else:
+            raise ValueError(
+                f"the observation of {id} has a {type(space).__name__} space: replace it with a "
+                "wrapper"
+            )
+        self.given = tuple(self.spec.shape)
+        self.id, self.fineness = id, Fineness(f"the env {id}", self.title, self.dtype)
+
+    def __call__(self, observation: Any) -> NDArray[Any]:
+        """Return a copy of this entry of an observation, of the shape of `spec`.
+
+        Args:
+            observation: of one env, as it was returned.
+
+        Raises:
+            ForeignError: for an entry that is missing, of another shape than its space has, not of
+                numbers, not finite, or no choice of its space.
+        """
+        for part in self.path:
+            observation = self._part(observation, part)
+        value = plain_array(observation, self.title)
+        if value.shape != self.shape and not self._is_single(value):
+            raise ForeignError(
+                f"{self.title} has the shape {list(value.shape)}, but its space has "
+                f"{list(self.shape)}"
+            )
+        if self.choices:
+            return self._one_hot(value)
+        if self.dtype == np.uint8 and value.dtype != np.uint8:
+            self._check(value, (value >= 0) & (value <= 255) & (value == np.floor(value)))
+        if self.binary:
+            self._check(value, (value == 0) | (value == 1))
+        if value.dtype == self.dtype:
+            converted = value.copy()
+            if converted.shape != self.given:
+                converted = converted.reshape(self.given)
+        else:
+            if self.fineness.unseen and not np.can_cast(value.dtype, self.dtype, "safe"):
+                self.fineness.see(value)
+            with np.errstate(over="ignore"):
+                converted = value.astype(self.dtype).reshape(self.given)
+        if converted.dtype.kind == "f" and not _are_finite(converted):
+            wrong = float(value.reshape(-1)[~np.isfinite(converted.reshape(-1))][0])
+            raise ForeignError(f"{self.title} holds {wrong}, not a finite number of {self.dtype}")
+        return converted
+
+    @property
+    def bounds(self) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Declared bounds, of the shape and dtype of `spec`; None for pixels and choices.
+
+        They are not those of `spec`, as some published envs leave them.
+        """
+        if not isinstance(self.space, spaces.Box) or not self.spec.dtype.is_floating_point:
+            return None
+        low, high = (
+            torch.from_numpy(bound.astype(self.dtype).reshape(self.given))
+            for bound in (self.space.low, self.space.high)
+        )
+        return low, high
+
+    def outside(self, values: NDArray[Any]) -> tuple[int, float, float, float] | None:
+        """Return where numbers are farthest outside the bounds of the space; None if nowhere.
+
+        Bounds are rounded as the numbers were.
+
+        Args:
+            values: of this entry, [n, *shape].
+
+        Returns:
+            The index of the number in the entry, its value, and its bounds.
+        """
+        if not isinstance(self.space, spaces.Box):
+            return None
+        bounds = (self.space.low, self.space.high)
+        low, high = (bound.ravel().astype(self.dtype).astype(np.float64) for bound in bounds)
+        numbers = values.reshape(len(values), -1).astype(np.float64)
+        excess = np.maximum(low - numbers, numbers - high)
+        if not excess.size or excess.max() <= 0:
+            return None
+        row, index = np.unravel_index(excess.argmax(), excess.shape)
+        return int(index), float(numbers[row, index]), float(low[index]), float(high[index])
+
+    def _is_single(self, value: NDArray[Any]) -> bool:
+        """Return whether a value is one number, which may have a dimension of its own."""
+        return value.size == 1 and value.ndim <= 1 and self.shape in ((), (1,))
+
+    def _part(self, observation: Any, part: str | int) -> Any:
+        """Return a part of an observation by the key of a Dict space or the index of a Tuple."""
+        if isinstance(part, int):
+            if not isinstance(observation, (tuple, list)) or len(observation) <= part:
+                raise ForeignError(
+                    f"{self.title} is missing: the observation is {shown(observation)}, not the "
+                    "tuple of its space"
+                )
+        elif not isinstance(observation, Mapping) or part not in observation:
+            keys = list(observation) if isinstance(observation, Mapping) else observation
+            raise ForeignError(
+                f"{self.title} is missing: the observation has {shown(keys)}, but its space has "
+                f"the key {part!r}"
+            )
+        return observation[part]
+
+    def _check(self, value: NDArray[Any], fits: NDArray[np.bool_] | np.bool_) -> None:
+        """Raise a `ForeignError` if a number does not fit the space."""
+        if not np.all(fits):
+            wrong = float(value[np.logical_not(fits)].reshape(-1)[0])
+            raise ForeignError(f"{self.title} holds {wrong:g}, which is not in {self.space}")
+
+    def _one_hot(self, value: NDArray[Any]) -> NDArray[Any]:
+        """Return choices as one-hot vectors side by side."""
+        chosen = np.ravel(value) - np.ravel(self.start)
+        sizes = np.array(self.choices)
+        fits = (chosen >= 0) & (chosen < sizes) & (chosen == np.floor(chosen))
+        self._check(value.reshape(-1), fits)
+        vector = np.zeros(self.given, self.dtype)
+        vector[chosen.astype(np.int64) + self.first] = 1
+        return vector
+
+
+def _are_finite(numbers: NDArray[Any]) -> bool:
+    """Return whether all numbers are finite."""
+    if numbers.size <= FEW:  # one by one takes a quarter of the time
+        return all(map(math.isfinite, numbers.ravel().tolist()))
+    return bool(np.isfinite(numbers).all())
+
+
+def _leaves(
+    space: spaces.Space[Any], path: tuple[str | int, ...] = ()
+) -> Iterator[tuple[Any, spaces.Space[Any]]]:
+    """Yield the path and the space of all entries but texts.
+
+    Args:
+        space: of the observation, or of a part of it.
+        path: of that part: keys of Dict spaces and indices of Tuple spaces.
+    """
+    if isinstance(space, spaces.Dict):
+        for name, part in space.spaces.items():
+            yield from _leaves(part, (*path, name))
+    elif isinstance(space, spaces.Tuple):
+        for index, part in enumerate(space.spaces):
+            yield from _leaves(part, (*path, index))
+    elif space.dtype is None or space.dtype.kind != "U":
+        yield path, space
+
+
+def _is_picture(space: spaces.Space[Any]) -> bool:
+    """Return whether a space is of pixels, which networks divide by 255."""
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
+        return False
+    return len(space.shape) == 3 or bool((space.high == 255).all())
+
+
+def _choices(space: spaces.Space[Any]) -> list[int]:
+    """Return the numbers of choices of a Discrete or MultiDiscrete space; none for another."""
+    sizes = space.n if isinstance(space, spaces.Discrete) else getattr(space, "nvec", [])
+    return [int(size) for size in np.ravel(sizes)]
+
+
+def _start(space: spaces.Space[Any]) -> Any:
+    """Return the lowest value of a Discrete or MultiDiscrete space; 0 for another."""
+    return getattr(space, "start", 0)
+
+
+class Actions:
+    """The actions of an env as numbers of TorchRL, and back.
+
+    Args:
+        name: of the env, for messages.
+        space: of the action.
+        dtype: of actions that are real numbers, unless it is too coarse for their range.
+
+    Attributes:
+        spec: of an action of one env; a matrix of real numbers is a vector.
+        first: lowest number of each choice, if not 0.
+        own_shape: shape of an action as controllers give it, where it is a matrix.
+
+    Raises:
+        ValueError: for a space that is not supported, or leaves nothing to choose: for what is no
+            space of Gymnasium, for one without a number, and for bounds that are NaN, equal or in
+            the wrong order.
+    """
+
+    def __init__(self, name: str, space: Any, dtype: torch.dtype) -> None:
+        self.name, self.space, self.dtype = name, space, dtype
+        is_box = isinstance(space, spaces.Box)
+        self.whole = is_box and np.issubdtype(space.dtype, np.integer)
+        self.real = is_box and not self.whole
+        self._check()
+        self.spec = self._spec()
+        self.own_shape = space.shape if self.real and len(space.shape) > 1 else None
+        self.lowest = space.low.astype(np.int64) if self.whole else _start(space)
+        lowest = torch.as_tensor(self.lowest).reshape(-1)
+        self.first = lowest if lowest.any() else None
+
+    def _check(self) -> None:
+        space = self.space
+        if not isinstance(space, spaces.Space):
+            raise ValueError(
+                f"the action_space of {self.name} is {shown(space)}, not a space of Gymnasium: set "
+                "it in its __init__"
+            )
+        if not isinstance(space, spaces.Box):
+            return
+        if 0 in space.shape:
+            raise ValueError(
+                f"the action of {self.name} has the shape {list(space.shape)}: it has no number"
+            )
+        low, high = np.ravel(space.low), np.ravel(space.high)
+        for index in np.flatnonzero(~(low < high))[:1]:
+            raise ValueError(
+                f"number {index} of the action of {self.name} has the bounds {low[index]} and "
+                f"{high[index]}: the lower one must be smaller; leave a number without a choice "
+                "out by a wrapper"
+            )
+
+    def _spec(self) -> TensorSpec:
+        space = self.space
+        if self.whole:
+            return self._of_whole_numbers()
+        if self.real:
+            return self._of_real_numbers()
+        if isinstance(space, spaces.Discrete):
+            return Categorical(int(space.n), dtype=torch.int64)
+        if isinstance(space, spaces.MultiDiscrete) and len(space.shape) == 1:
+            return MultiCategorical(_choices(space), dtype=torch.int64)
+        if isinstance(space, spaces.MultiBinary):
+            return Binary(shape=space.shape, dtype=torch.int8)
+        raise ValueError(
+            f"the action of {self.name} is a {type(space).__name__} space: replace it with a "
+            "wrapper"
+        )
+
+    def _of_whole_numbers(self) -> TensorSpec:
+        """Return the spec of whole numbers: a few are choices, more a `ValueError`."""
+        space = self.space
+        sizes = space.high.astype(np.float64) - space.low.astype(np.float64) + 1
+        if len(space.shape) != 1 or sizes.max() > MOST_CHOICES:
+            raise ValueError(
+                f"the action of {self.name} is a {space} of whole numbers, which are choices, but "
+                f"only up to {MOST_CHOICES} of each and in one dimension: replace it with a wrapper"
+            )
+        return MultiCategorical([int(size) for size in sizes], dtype=torch.int64)
+
+    def _of_real_numbers(self) -> TensorSpec:
+        space, shape = self.space, (math.prod(self.space.shape),)
+        if not (np.isfinite(space.low).any() or np.isfinite(space.high).any()):
+            return Unbounded(shape, dtype=self.dtype)
+        dtype = self._fine_enough()
+        low, high = (
+            torch.as_tensor(bound, dtype=dtype).reshape(shape) for bound in (space.low, space.high)
+        )
+        for index in (low >= high).nonzero().flatten().tolist()[:1]:
+            raise ValueError(
+                f"number {index} of the action of {self.name} has the bounds "
+                f"{space.low.flat[index]} and {space.high.flat[index]}, which are equal in "
+                f"{dtype}: subtract the offset in a wrapper"
+            )
+        return Bounded(low, high, shape, dtype=dtype)
+
+    def _fine_enough(self) -> torch.dtype:
+        """Return the dtype of real numbers: float64 where their range has too few steps.
+
+        A space that is as coarse itself needs no finer dtype.
+        """
+        space = self.space
+        if space.dtype.kind != "f" or space.dtype.itemsize <= self.dtype.itemsize:
+            return self.dtype
+        # From a single bound on, actions count in units of 1.
+        low, high = (
+            np.where(np.isfinite(bound), bound, other + side)
+            for bound, other, side in ((space.low, space.high, -1), (space.high, space.low, 1))
+        )
+        floats = torch.empty(0, dtype=self.dtype).numpy().dtype
+        with np.errstate(all="ignore"):  # of coordinates without bounds, and of very large ones
+            count = (high - low) / np.spacing(np.maximum(abs(low), abs(high)).astype(floats))
+        return torch.float64 if (count < COARSE).any() else self.dtype
+
+    def decode(self, actions: NDArray[Any]) -> NDArray[Any]:
+        """Return actions as the env takes them, real numbers within its bounds.
+
+        Args:
+            actions: [..., *A] with A as in `spec`.
+
+        Raises:
+            ForeignError: for a number that is not finite.
+        """
+        if not self.real:
+            numbered: NDArray[Any] = actions + self.lowest
+            return numbered.astype(self.space.dtype) if self.whole else numbered
+        if not np.isfinite(actions).all():
+            raise ForeignError(
+                f"the action for the env {self.name} holds a number that is not finite: the policy "
+                "or its guide gave none"
+            )
+        typed = actions.astype(self.space.dtype)
+        typed = typed.reshape(*actions.shape[:-1], *self.space.shape)
+        return np.clip(typed, self.space.low, self.space.high)
+
+    def fitted(self, name: str, advice: Any) -> NDArray[Any]:
+        """Return the action of a controller as an array, in the env's own numbering.
+
+        Args:
+            name: of the controller, for the message.
+            advice: what the controller gave; the bounds of real numbers are not checked.
+
+        Raises:
+            ForeignError: for what is no action of the env.
+        """
+        try:
+            array = plain_array(advice, "it")
+            if self.whole:
+                typed = array.astype(self.space.dtype)
+                fits = bool((typed == array).all()) and self.space.contains(typed)
+            elif self.real:
+                fits = array.shape == self.space.shape and bool(np.isfinite(array).all())
+            else:
+                fits = bool(self.space.contains(array))
+        except ForeignError:
+            fits = False
+        if not fits:
+            raise ForeignError(
+                f"controller {name} gave {shown(advice)}, not an action of {self.space}"
+            )
+        return np.array(array)
+
+
+class Codec:
+    """The spaces of a Gymnasium env: its observation as entries, and its actions.
+
+    Args:
+        name: of the env, for messages.
+        env: the env.
+        dtype: of entries that are no pixels, of actions and of rewards.
+
+    Attributes:
+        entries: of the observation, at least one of which has a number.
+        actions: of the env.
+        fineness: watch on the rewards of all rows.
+
+    Raises:
+        ValueError: for spaces that are not supported.
+    """
+
+    def __init__(self, name: str, env: Env, dtype: torch.dtype) -> None:
+        self.name, self.env = name, env
+        self.floats = torch.empty(0, dtype=dtype).numpy().dtype
+        space = env.observation_space
+        if not isinstance(space, spaces.Space):
+            raise ValueError(
+                f"the observation_space of {name} is {shown(space)}, not a space of Gymnasium: set "
+                "it in its __init__"
+            )
+        self.entries = [Entry(name, path, leaf, self.floats) for path, leaf in _leaves(space)]
+        if all(0 in entry.given for entry in self.entries):
+            raise ValueError(
+                f"the observation_space of {name} is {space}, which has no numbers; observe at "
+                "least one, such as a constant"
+            )
+        self.actions = Actions(name, env.action_space, dtype)
+        self.fineness = Fineness(f"the env {name}", "the reward", self.floats)
+
+    def read(self, observation: Any) -> list[NDArray[Any]]:
+        """Return copies of the entries of an observation.
+
+        Args:
+            observation: as an env returned it; a `ForeignError` if it does not fit its space.
+        """
+        return [entry(observation) for entry in self.entries]
+
+    def check_same(self, env: Env, row: int) -> None:
+        """Raise a `ValueError` for an env whose spaces are others.
+
+        Args:
+            env: of another row.
+            row: its number.
+        """
+        for which in ("action_space", "observation_space"):
+            if env is not self.env and getattr(env, which) != getattr(self.env, which):
+                raise ValueError(
+                    f"the {which} of {self.name} is {getattr(env, which)} in row {row}, but "
+                    f"{getattr(self.env, which)} in row 0: all envs of a run need the same spaces"
+                )

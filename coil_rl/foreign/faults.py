@@ -1,0 +1,214 @@
+"""What code of other people returns, checked before anything computes with it, at every step.
+
+A fault in it is one sentence that names the env or the controller, the row, the seed of the episode
+and the step, and says what came and what was expected.
+"""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class ForeignError(ValueError):
+    """A fault in an env or controller of somebody else, as one sentence."""
+
+    outside: ClassVar[bool] = True  # the cause is not in this program
+
+
+@contextmanager
+def foreign(name: str, call: str) -> Iterator[None]:
+    """Turn what the code of somebody else raises into a `ForeignError`.
+
+    Args:
+        name: of the env or controller, as in "the env Plant".
+        call: what it was asked, such as "step".
+    """
+    try:
+        yield
+    except ForeignError:
+        raise
+    except (Exception, SystemExit) as error:
+        # A tail such as ": " without a text would say nothing.
+        text = shortened(str(error)) or "without a text"
+        raise ForeignError(f"{name}: {call} raised {type(error).__name__}: {text}") from error
+
+
+def shortened(text: str) -> str:
+    """Return a text on one line, of at most 200 characters."""
+    return _cut(text, 200)
+
+
+def _cut(text: str, most: int) -> str:
+    """Return a text on one line, of at most so many characters."""
+    line = " ".join(text.split())
+    return line if len(line) <= most else f"{line[:most].rstrip()} ..."
+
+
+def shown(value: Any) -> str:
+    """Return in a few words what code of other people has returned."""
+    try:
+        if hasattr(value, "dtype") and math.prod(value.shape) > 8:
+            return f"an array of the shape {list(value.shape)} ({value.dtype})"
+        text = repr(value.tolist() if hasattr(value, "tolist") else value)
+    except Exception:  # a `__repr__` of other people may fail, too
+        text = f"an object of {type(value).__name__}"
+    return _cut(text, 80)
+
+
+def plain_array(value: Any, what: str) -> NDArray[Any]:
+    """Return numbers as an array.
+
+    Args:
+        value: a number, a nested list of numbers, an array or a tensor.
+        what: name of the value, for the message.
+
+    Raises:
+        ForeignError: for anything else.
+    """
+    if type(value) is np.ndarray and value.dtype.kind in "biuf":
+        return value
+    try:
+        array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
+    except Exception as error:
+        raise ForeignError(f"{what} is {shown(value)}, not an array of numbers") from error
+    if array.dtype.kind not in "biuf" or np.ma.is_masked(value):
+        raise ForeignError(f"{what} is {shown(value)}, not an array of numbers")
+    return array
+
+
+def number(value: Any, what: str, dtype: np.dtype[Any]) -> float:
+    """Return one finite number.
+
+    Args:
+        value: what came.
+        what: name of the number, for the message.
+        dtype: in which the number must be finite.
+
+    Raises:
+        ForeignError: for None, a text, an array with a dimension, a complex number, and for a
+            number that is not finite.
+    """
+    plain = isinstance(value, (float, int))
+    if not plain and (isinstance(value, (str, bytes)) or np.ndim(value) > 0):
+        raise ForeignError(f"{what} is {shown(value)}, not one number")
+    try:
+        result = float(value)
+    except Exception as error:
+        raise ForeignError(f"{what} is {shown(value)}, not one number") from error
+    if not abs(result) <= largest(dtype):
+        raise ForeignError(f"{what} is {result}, not a finite number of {dtype}")
+    return result
+
+
+@cache
+def largest(dtype: np.dtype[Any]) -> float:
+    """Return the largest number of a dtype."""
+    return float(np.finfo(dtype).max)
+
+
+def flag(value: Any, what: str) -> bool:
+    """Return a flag.
+
+    Args:
+        value: what came.
+        what: name of the flag, for the message.
+
+    Raises:
+        ForeignError: for anything but True, False, 1 and 0.
+    """
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    single = np.ndim(value) == 0 and not isinstance(value, (str, bytes))
+    if not single or value is None or value not in (0, 1):
+        raise ForeignError(f"{what} is {shown(value)}, not True or False")
+    return bool(value)
+
+
+def action_array(value: Any) -> NDArray[Any]:
+    """Return an action of a controller as an array of at least one dimension.
+
+    Args:
+        value: what the controller returned.
+
+    Raises:
+        ForeignError: for what is not numbers, or not finite; also for an action with a state, as
+            controllers of some libraries return them.
+    """
+    if isinstance(value, tuple) and any(np.ndim(part) or part is None for part in value[:2]):
+        raise ForeignError(
+            f"the action is the tuple {shown(value)}; return the action alone, without a state"
+        )
+    array = np.atleast_1d(plain_array(value, "the action"))
+    if array.dtype == np.bool_:
+        array = array.astype(np.int64)
+    if not np.isfinite(array).all():
+        raise ForeignError(f"the action is {shown(array)}, which is not finite")
+    return array
+
+
+class Predictor:
+    """A trained model of another library as a controller: what has `predict` gets `act`.
+
+    The models of Stable-Baselines3 and its relatives have `predict(observation, state,
+    episode_start, deterministic)`, which returns the action and the state for the next call.
+
+    Args:
+        model: the model. `predict` must take `deterministic`; the others are given if it takes
+            them. A space of its own, `observation_space`, decides how it is given choices.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        parameters = inspect.signature(model.predict).parameters
+        self.takes = {name for name in ("state", "episode_start") if name in parameters}
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode: forget the state."""
+        self.state, self.first = None, True
+
+    def act(self, observation: Any) -> Any:
+        """Return the deterministic action for an observation.
+
+        Args:
+            observation: of one row.
+        """
+        given = {"state": self.state, "episode_start": np.array([self.first])}
+        known = {name: given[name] for name in self.takes}
+        answer = self.model.predict(observation, deterministic=True, **known)
+        self.first = False
+        if isinstance(answer, tuple) and len(answer) == 2:
+            answer, self.state = answer
+        return answer
+
+
+def predicts(thing: Any) -> bool:
+    """Return whether an object or class is a trained model: no `act`, but a `predict`.
+
+    It takes `deterministic`, as those of Stable-Baselines3 do; those of scikit-learn do not.
+    """
+    predict = getattr(thing, "predict", None)
+    if not callable(predict) or callable(getattr(thing, "act", None)):
+        return False
+    try:
+        return "deterministic" in inspect.signature(predict).parameters
+    except (TypeError, ValueError):  # some functions written in C have no signature
+        return False
+
+
+def acting(thing: Any) -> Any:
+    """Return an object with `act` for one row: a copy of a controller, or a model as a controller.
+
+    Args:
+        thing: has `act`, or is a model, which all rows share.
+    """
+    return Predictor(thing) if predicts(thing) else copy.deepcopy(thing)

@@ -1,0 +1,312 @@
+"""Gymnasium envs as one batched TorchRL env, with controllers beside them.
+
+TorchRL has a wrapper of its own. This one is seeded episode by episode, so that it can go on after
+an interruption (see `SeededRows`), names what is missing in one sentence, and lets controllers act
+beside the env that need the env itself, not only its observation.
+"""
+
+import math
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+
+from coil_rl.envs.limits import check_range
+from coil_rl.foreign.batch import SeededRows
+from coil_rl.foreign.codec import (
+    Choices,
+    Codec,
+)
+from coil_rl.foreign.faults import ForeignError, shortened
+from coil_rl.foreign.makers import (
+    Env,
+    ResetWith,
+    make_env,
+    maker_of,
+    metadata_of,
+    name_of,
+)
+from coil_rl.foreign.plant import GymnasiumPlant, resolved_controller
+from coil_rl.foreign.rows import GymnasiumRows
+from coil_rl.foreign.workers import AUTO, Workers, choose, timed
+
+MOST_WORKERS = 256
+RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "controller", "next")
+
+
+class GymnasiumEnv(SeededRows):
+    """Gymnasium envs as one env of batch size [num_envs].
+
+    They are stepped one after the other in this process, or in several ones at once (`workers`).
+
+    Reads `action`. Writes `reward`, `done`, `terminated`, `truncated` [B, 1] and the observation:
+    `observation`, or one entry a key of a Dict space (nested as there; a Tuple has the keys "0",
+    "1", ...). A Box is a tensor of `dtype`, but pixels stay uint8; Discrete and MultiDiscrete are
+    one-hot vectors of `dtype`, MultiBinary is one of 0 and 1; texts are left out. Actions are
+    bounded or unbounded for a Box (and clamped to its bounds; a matrix is a vector), indices from 0
+    for Discrete [B], MultiDiscrete [B, n] and a Box of a few whole numbers [B, n], and 0 or 1 for
+    MultiBinary.
+
+    A row whose episode is over stays as it is, with reward 0, until it is reset. A restored state
+    goes on to the bit if the env is deterministic, see `SeededRows`. `rate` is the steps per second
+    at which the env is drawn, NaN if it does not say.
+
+    Args:
+        id: registered name; "MODULE:NAME" imports the module first. Or a maker of an env: a class
+            or function, or the "MODULE:NAME" of one.
+        num_envs: B, number of rows.
+        options: keyword arguments of `gymnasium.make`, or of the maker.
+        reset_options: `options` of each `reset` of the env, such as where an episode begins.
+        wrappers: callables that take an env and return one, applied in this order.
+        max_steps: steps after which an episode is truncated, instead of the registered number or
+            that of a `TimeLimit` of the maker. An env that names no number at all is truncated
+            after 1,000, with a warning.
+        seed: of the draw of the episodes' seeds, at least 0.
+        first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
+            draw the seeds.
+        cases: number of different episodes, by default `num_envs`; needs `first_seed`.
+        info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], NaN where
+            missing.
+        controllers: by name, a controller or its import path "PACKAGE.MODULE:THING". A class gets
+            one object an env, `THING(env)`, with a method `act(observation)` and, if it wants,
+            `reset()`, called at the start of an episode; a function is called as `THING(env,
+            observation)`. Either may be a `functools.partial`. Its action for the present
+            observation is written as ("controller", NAME), not clamped, in the env's own
+            numbering; after a termination it is the last one. An object with `act`, or a trained
+            model with `predict`, is used as it is.
+        fresh: whether every episode has a new env, for those whose reset leaves something of the
+            past. BipedalWalker is one: without `fresh`, its episodes depend on the seed and, a
+            little, on those before.
+        render: whether `render` gives pictures, of the rows that begin with the first of `cases`
+            different episodes.
+        workers: number of processes over which the rows are spread, 0 for none besides this one;
+            "auto" for as many as there are cores if a timed step is long enough. The digits are
+            the same.
+        device: of all tensors.
+        dtype: of all floating-point tensors; an action of float64 with a range of less than 100
+            steps of it stays float64.
+
+    Attributes:
+        observation_bounds: declared bounds of the entries that have any, which they may leave.
+        observed_choices: what converts an entry to its choices as the env gives them, by entry.
+        optional: entries in which NaN is a number without a value, not a fault: those of `info`.
+
+    Raises:
+        ValueError: if the env cannot be made, has a space that is not supported or an entry with a
+            reserved name or bounds that leave no choice, or if a controller cannot be imported.
+        ForeignError: at a reset or a step, for what the env or a controller raises or returns that
+            does not fit; see `coil_rl.foreign.faults`.
+
+    Example:
+        >>> from coil_rl import GymnasiumEnv
+        >>> env = GymnasiumEnv("CartPole-v1", num_envs=4)
+        >>> env.rollout(3, break_when_any_done=False)["next", "observation"].shape
+        torch.Size([4, 3, 4])
+    """
+
+    remedy = "; fresh=true helps where a reset leaves something of the past"
+
+    def __init__(
+        self,
+        id: str | Callable[..., Env],
+        num_envs: int = 1,
+        *,
+        options: Mapping[str, Any] | None = None,
+        reset_options: Mapping[str, Any] | None = None,
+        wrappers: Sequence[Callable[[Env], Env]] = (),
+        max_steps: int | None = None,
+        seed: int = 0,
+        first_seed: int | None = None,
+        cases: int | None = None,
+        info: Sequence[str] = (),
+        controllers: Mapping[str, str | Callable[..., Any]] | None = None,
+        fresh: bool = False,
+        render: bool = False,
+        workers: int | str = 0,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
+        _check_workers(workers)
+        makers = {
+            name: resolved_controller(name, thing) for name, thing in (controllers or {}).items()
+        }
+        settings = dict(options or {})
+        if max_steps is not None:
+            settings["max_episode_steps"] = max_steps
+        maker = maker_of(id)
+        if reset_options:
+            wrappers = [partial(ResetWith, options=reset_options), *wrappers]
+        make = partial(make_env, maker, wrappers, settings)
+        drawn, every = make, cases or num_envs
+        self.shown = render and "rgb_array" in metadata_of(make(), "render_modes", ())
+        if self.shown:
+            drawn = partial(make_env, maker, wrappers, settings | {"render_mode": "rgb_array"})
+        name, self.floats = name_of(maker), torch.empty(0, dtype=dtype).numpy().dtype
+
+        def make_plant(row: int) -> GymnasiumPlant:
+            made = make if row % every else drawn
+            return GymnasiumPlant(made, makers, fresh, name, row, self.floats)
+
+        self.make_plant, self.asked = make_plant, workers
+        self.kind = f"{settings} {wrappers} {makers}"
+        self.workers: Workers | None = None
+        self.info, self.optional = tuple(info), [("info", name) for name in info]
+        first = make_plant(0)
+        self.codec = Codec(name, first.env, dtype)
+        # With processes, row 0 of this one only says what the spaces are.
+        self.held = GymnasiumRows(self.codec, self.info).extend([first])
+        if not workers:
+            self.held.extend(map(make_plant, range(1, num_envs)))
+        super().__init__(self.held, num_envs, seed, first_seed, cases, device)
+        self.rate = _rate(first.env)
+        actions = self.codec.actions
+        self.first_choices, self.own_shape = actions.first, actions.own_shape
+        self._declare_specs(name, makers, dtype)
+
+    def _declare_specs(self, id: str, controllers: Iterable[str], dtype: torch.dtype) -> None:
+        action, number = self.codec.actions.spec, Unbounded(1, dtype=dtype)
+        observation = Composite()
+        self.observation_bounds: dict[Any, tuple[torch.Tensor, torch.Tensor]] = {}
+        self.observed_choices: dict[Any, Choices] = {}
+        for entry in self.codec.entries:
+            name = entry.key[0]
+            if name in RESERVED:
+                raise ValueError(
+                    f"the observation of {id} has an entry {name!r}: rename it with a wrapper"
+                )
+            observation[entry.key] = entry.spec
+            key = entry.key if len(entry.key) > 1 else name
+            if entry.choices:
+                self.observed_choices[key] = Choices(entry.space)
+            if (bounds := entry.bounds) is not None:
+                low, high = (bound.to(self.device) for bound in bounds)
+                self.observation_bounds[key] = low, high
+        for name in self.info:
+            observation["info", name] = number.clone()
+        for name in controllers:
+            # Advice is written as given, and may be out of bounds.
+            advice = action.clone()
+            if isinstance(action, Bounded) or self.first_choices is not None:
+                advice = Unbounded(action.shape, dtype=action.dtype)
+            observation["controller", name] = advice
+        flag = Binary(1, dtype=torch.bool)
+        ends = Composite({name: flag.clone() for name in ("done", "terminated", "truncated")})
+        self.observation_spec = self._of_all_rows(observation)
+        self.done_spec = self._of_all_rows(ends)
+        self.action_spec = self._of_all_rows(action)
+        self.reward_spec = self._of_all_rows(number)
+
+    def _of_all_rows(self, spec: TensorSpec) -> TensorSpec:
+        """Return the spec of a batch from that of one row."""
+        return spec.to(self.device).expand(*self.batch_size, *spec.shape)
+
+    @property
+    def meanings(self) -> Any:
+        """What the env says about its entries, see `coil_rl.envs.meanings`."""
+        return getattr(self.held.plants[0].env.unwrapped, "meanings", None)
+
+    def render(self, row: int = 0) -> NDArray[np.uint8] | None:
+        """Return a picture, [height, width, 3]; None if there are none.
+
+        Args:
+            row: one that begins with the first of the different episodes.
+        """
+        if not self.shown:
+            return None
+        try:
+            return self.held.picture(row) if self.workers is None else self.workers.picture(row)
+        except ForeignError as error:
+            self.shown = False
+            cause = error if error.__cause__ is None else error.__cause__
+            warnings.warn(f"no pictures of the env: {shortened(str(cause))}", stacklevel=2)
+            return None
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close all envs."""
+        self.held.close()
+        if self.workers is not None:
+            self.workers.close()
+        super().close(raise_if_closed=raise_if_closed)
+
+    def begin(
+        self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]] | None = None
+    ) -> None:
+        """Begin episodes, see `Shard`; the rows are made before the first one."""
+        if not self.parts:
+            self._place_rows()
+        super().begin(seeds, actions)
+
+    def _place_rows(self) -> None:
+        """Decide in which processes the rows are, and make them there."""
+        count = self.batch_size[0]
+        if count == len(self.held.plants):
+            return
+        codec, make_plant = self.codec, self.make_plant
+
+        def make(rows: range) -> GymnasiumRows:
+            return GymnasiumRows(codec, self.info).extend(map(make_plant, rows))
+
+        seconds = partial(timed, make, codec.actions.space.sample)
+        number = choose(self.asked, count, seconds, codec.name, self.kind)
+        if number:
+            self.shard = self.workers = Workers(make, count, number, codec.name)
+        else:
+            self.held.extend(map(make_plant, range(1, count)))
+
+    def encode(self, observation: Any, *, first: bool) -> TensorDict:
+        """Return the entries of an env of one row for an observation that comes from elsewhere.
+
+        Controllers beside the env are asked too; the env itself is not stepped.
+
+        Args:
+            observation: as a Gymnasium env of this kind gives it.
+            first: whether it is the first one of an episode.
+        """
+        (plant,) = self.held.plants
+        plant.observe(observation, first=first)
+        self.parts[:] = [self.held.entries()]
+        return self._output(stepped=not first)
+
+    def decode(self, actions: torch.Tensor) -> Any:
+        """Return the action of an env of one row as a Gymnasium env of this kind takes it."""
+        (action,) = self._decode(actions.cpu().numpy())
+        return action
+
+    def _decode(self, actions: NDArray[Any]) -> NDArray[Any]:
+        return self.codec.actions.decode(actions)
+
+    def _output(self, *, stepped: bool) -> TensorDict:
+        tensors: dict[Any, torch.Tensor] = {}
+        for key in self.parts[0]:
+            if key == "reward" and not stepped:
+                continue
+            parts = [part[key] for part in self.parts]
+            value = torch.from_numpy(np.concatenate(parts) if len(parts) > 1 else parts[0])
+            if key[0] == "controller":
+                spec = self.observation_spec[key]
+                value = value.to(spec.dtype).reshape(spec.shape)
+            tensors[key] = value
+        data = TensorDict(tensors, self.batch_size)
+        return data if self.device is None or self.device.type == "cpu" else data.to(self.device)
+
+
+def _check_workers(workers: int | str) -> None:
+    """Raise a `ValueError` for what is no number of processes."""
+    whole = isinstance(workers, int) and not isinstance(workers, bool)
+    if workers != AUTO and not (whole and 0 <= int(workers) <= MOST_WORKERS):
+        raise ValueError(
+            f"workers={workers} must be auto or a whole number from 0 to {MOST_WORKERS}"
+        )
+
+
+def _rate(env: Env) -> float:
+    """Return the pictures per second of an env; NaN if it does not say."""
+    rate = metadata_of(env, "render_fps", math.nan)
+    return float(rate) if isinstance(rate, (int, float)) else math.nan

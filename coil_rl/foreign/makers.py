@@ -1,0 +1,219 @@
+"""Makers of Gymnasium envs: how one is found by its name and called, and why it cannot be."""
+
+import difflib
+import importlib
+import inspect
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from importlib.machinery import PathFinder
+from importlib.util import find_spec
+from typing import Any
+
+import gymnasium
+from gymnasium import error as errors
+from gymnasium.envs.registration import load_env_creator
+
+from coil_rl.foreign.faults import shortened, shown
+
+# What an error about a missing package mentions, and the extra of coil-rl that installs it.
+EXTRAS = {"box2d": "gym", "pygame": "gym", "mujoco": "mujoco", "minigrid": "babyai"}
+
+Env = gymnasium.Env[Any, Any]
+
+
+class ResetWith(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A wrapper that gives the same options to every reset of an env.
+
+    Args:
+        env: the env.
+        options: of `reset`; those that a call gives win.
+    """
+
+    def __init__(self, env: Env, options: Mapping[str, Any]) -> None:
+        super().__init__(env)
+        self.options = dict(options)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode with the options."""
+        return self.env.reset(seed=seed, options=self.options | (options or {}))
+
+
+def maker_of(id: str | Callable[..., Env]) -> str | Callable[..., Env]:
+    """Return the maker that MODULE:NAME names, if it is no registered name; else `id` itself."""
+    if not isinstance(id, str) or ":" not in id:
+        return id
+    module, _, name = id.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError:
+        return id  # Gymnasium says what is wrong
+    return found if callable(found) and name not in gymnasium.registry else id
+
+
+def registered_maker(id: str) -> Any:
+    """Return what makes a registered env.
+
+    Args:
+        id: as in NAME or MODULE:NAME, of which the module registers the name.
+
+    Raises:
+        gymnasium.error.Error: for a name that is not registered.
+    """
+    module, _, name = id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    maker = gymnasium.spec(name).entry_point
+    return load_env_creator(maker) if isinstance(maker, str) else maker
+
+
+def name_of(maker: str | Callable[..., Env]) -> str:
+    """Return the name of an env for messages."""
+    return maker if isinstance(maker, str) else getattr(maker, "__qualname__", repr(maker))
+
+
+def make_env(
+    maker: str | Callable[..., Env],
+    wrappers: Sequence[Callable[[Env], Env]],
+    settings: Mapping[str, Any],
+) -> Env:
+    """Return an env in its wrappers; a `ValueError` says why it cannot be made."""
+    name = name_of(maker)
+    try:
+        if isinstance(maker, str):
+            env: Env = gymnasium.make(maker, **{"disable_env_checker": True, **settings})
+        else:
+            env = _called(maker, settings)
+        if (steps := settings.get("max_episode_steps")) is not None:
+            env = _limited(env, steps)
+        for wrapper in wrappers:
+            env = wrapper(env)
+        missing = [
+            which
+            for which in ("action_space", "observation_space")
+            if isinstance(env, gymnasium.Env) and getattr(env, which, None) is None
+        ]
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"the env {name} cannot be made: {_reason(name, error)}") from error
+    if not isinstance(env, gymnasium.Env):
+        raise ValueError(
+            f"the env {name} is {shown(env)}, not an env of Gymnasium: derive its class from "
+            "gymnasium.Env"
+        )
+    if missing:
+        raise ValueError(f"the env {name} has no {missing[0]}: set it in its __init__")
+    _check_statistics(env, name)
+    return env
+
+
+def _check_statistics(env: Env, name: str) -> None:
+    """Refuse wrappers that normalise by statistics, which a new env of an evaluation lacks."""
+    layer: Any = env
+    while layer is not None:
+        kinds = {kind.__name__ for kind in type(layer).__mro__}
+        if any(kind.startswith("NormalizeObservation") for kind in kinds):
+            raise ValueError(
+                f"the env {name} has the wrapper {type(layer).__name__}, whose statistics an "
+                "evaluation begins anew; leave it out and give learner.normalise=true"
+            )
+        if any(kind.startswith("NormalizeReward") for kind in kinds):
+            raise ValueError(
+                f"the env {name} has the wrapper {type(layer).__name__}, which changes the returns "
+                "that a table shows by statistics of its own; leave it out, returns are the env's "
+                "own"
+            )
+        layer = getattr(layer, "env", None)
+
+
+def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:
+    """Return the env of a maker, which gets the options that it takes."""
+    options = dict(settings)
+    options.pop("max_episode_steps", None)
+    parameters = inspect.signature(maker).parameters.values()
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    if not takes_any and "render_mode" not in [parameter.name for parameter in parameters]:
+        options.pop("render_mode", None)
+    return maker(**options)
+
+
+def _limited(env: Env, steps: int) -> Env:
+    """Return an env whose episodes end after a number of steps, also if it had another limit."""
+    limits = time_limits_of(env)
+    for limit in limits:  # a further one could only shorten the episodes
+        limit._max_episode_steps = steps
+    return env if limits else gymnasium.wrappers.TimeLimit(env, steps)
+
+
+def time_limits_of(env: Env) -> list[gymnasium.wrappers.TimeLimit[Any, Any]]:
+    """Return the wrappers `TimeLimit` around an env."""
+    limits, layer = [], env
+    while isinstance(layer, gymnasium.Wrapper):
+        if isinstance(layer, gymnasium.wrappers.TimeLimit):
+            limits.append(layer)
+        layer = layer.env
+    return limits
+
+
+def _reason(id: str, error: BaseException) -> str:
+    """Return in a few words why an env cannot be made, with a remedy where one is known."""
+    extra = next((EXTRAS[name] for name in EXTRAS if name in f"{id} {error}".lower()), None)
+    if extra and isinstance(error, (errors.DependencyNotInstalled, ModuleNotFoundError)):
+        return f"a package is not installed: python -m pip install 'coil-rl[{extra}]'"
+    module, _, name = id.rpartition(":")
+    package = module.partition(".")[0]
+    if package and isinstance(error, ModuleNotFoundError) and find_spec(package) is None:
+        return f"there is no module {package}; install its package, or add its folder to PYTHONPATH"
+    if not isinstance(error, errors.Error):  # of the env itself
+        text = shortened(re.split(r" was raised from", str(error).strip())[0])
+        return f"it raised {type(error).__name__}: {text}" if text else type(error).__name__
+    first_line = re.split(r"\n| was raised from", str(error).strip())[0].rstrip(".")
+    if not id:
+        return "env.id is empty; write env.id=MODULE:NAME, or the id of a registered env"
+    if not isinstance(error, (errors.NameNotFound, errors.NamespaceNotFound)):
+        return first_line or type(error).__name__
+    if module:
+        hint = _similar(module, name)
+        return f"{module} has no env {name}, and registers none of this name{hint}"
+    outer, _, last = id.rpartition(".")
+    if outer and last and _is_module(outer):
+        return f"a module and a name in it have a colon between them; write {outer}:{last}"
+    # Gymnasium may have a suggestion of its own: "Did you mean ...".
+    if "mean" in first_line:
+        return first_line
+    return f"{first_line}; if a package registers it, write PACKAGE:{id}"
+
+
+def _similar(module: str, name: str) -> str:
+    """Return `; did you mean X?` with the most similar env of a module, or an empty string.
+
+    Args:
+        module: that was imported.
+        name: which it does not have.
+    """
+    things = vars(sys.modules[module]) if module in sys.modules else {}
+    known = [each for each, thing in things.items() if callable(thing)]
+    similar = difflib.get_close_matches(name, [*known, *gymnasium.registry], n=1)
+    return f"; did you mean {similar[0]}?" if similar else ""
+
+
+def _is_module(name: str) -> bool:
+    """Return whether a module exists, without importing it or its packages."""
+    first, *others = name.split(".")
+    with suppress(ImportError, ValueError):
+        spec = find_spec(first)
+        for count in range(1, len(others) + 1):
+            if spec is None or spec.submodule_search_locations is None:
+                return False
+            full = ".".join([first, *others[:count]])
+            spec = PathFinder.find_spec(full, spec.submodule_search_locations)
+        return spec is not None
+    return False
+
+
+def metadata_of(env: Env, key: str, default: Any) -> Any:
+    """Return an entry of the metadata of an env, which may have none."""
+    metadata = getattr(env, "metadata", None)
+    return (metadata.get(key) or default) if isinstance(metadata, Mapping) else default

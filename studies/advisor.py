@@ -1,0 +1,103 @@
+"""ADVISOR (Weihs et al. 2021): PPO where imitation of the guide cannot work, else imitation.
+
+An auxiliary policy pi_aux with the agent's observation learns by imitation only. Where it cannot
+predict the guide's action g, the guide knows something that the agent does not see, and the agent
+learns from reward. For each step
+
+    loss = w * (-log pi(g | s)) + (1 - w) * loss of PPO,  w = exp(-alpha D),
+
+with D = -log pi_aux(g | s) for discrete actions, and for numbers the largest distance of g from the
+mode of pi_aux.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Unpack
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from coil_rl.learners import networks
+from coil_rl.learners.advantages import standardise
+from coil_rl.learners.encoders import Mlp
+from coil_rl.learners.kickstart import KickstartLoss
+from coil_rl.learners.ppo import PPO, PPOSettings
+from coil_rl.ranges import NonNegative, checked
+
+
+@checked
+class Advisor(PPO):
+    """The ADVISOR learner; errors are those of `PPO`.
+
+    Args:
+        env: the env, with advice.
+        in_keys: entries that the policies and the critic observe.
+        alpha: the larger, the better a step must be imitated to be learned by imitation.
+        guide: index of the guide in the advice.
+        settings: further ones of `PPO`; a network without a memory.
+    """
+
+    with_memory = False
+    parts = (*PPO.parts, "imitator")
+
+    def __init__(
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey] = ("observation",),
+        *,
+        alpha: NonNegative = 8.0,
+        guide: int = 0,
+        **settings: Unpack[PPOSettings],
+    ) -> None:
+        self.alpha, self.imitation = alpha, KickstartLoss(guide=guide)
+        super().__init__(env, in_keys, **settings)
+        self.keys += self.imitation.keys
+        self.minibatch_keys += self.imitation.keys
+
+    def build_policy(
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey],
+        network: Mlp,
+        make_actor: Callable[..., ProbabilisticTensorDictSequential],
+    ) -> ProbabilisticTensorDictSequential:
+        """Return the policy, and make the auxiliary one."""
+        self.imitator = networks.actor(env, in_keys, network, inputs=self.inputs)
+        return super().build_policy(env, in_keys, network, make_actor)
+
+    def parameter_groups(self) -> list[list[nn.Parameter]]:
+        """Return the parameters that the optimiser updates."""
+        return [*super().parameter_groups(), [*self.imitator.parameters()]]
+
+    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return the losses of `PPO` with another `loss_objective`, `loss_imitation`, and `weight`.
+
+        `loss_objective` is the weighted sum of both losses, `weight` the mean of w, and
+        `loss_imitation` the loss of the auxiliary policy.
+        """
+        losses = super().losses(minibatch)
+        predicted = self.imitation.each(self.imitator, minibatch)
+        weight = (-self.alpha * self.distance(minibatch, predicted.detach())).exp()
+        log_ratio = (
+            self.head.get_dist(minibatch).log_prob(minibatch["action"])
+            - minibatch["action_log_prob"]
+        )
+        advantage = standardise(minibatch["advantage"]).squeeze(-1)
+        clipped = log_ratio.clamp(*self.loss._clip_bounds)
+        gain = torch.minimum(log_ratio.exp() * advantage, clipped.exp() * advantage)
+        mixed = weight * self.imitation.each(self.head, minibatch) - (1 - weight) * gain
+        losses["loss_imitation"] = predicted.mean()
+        losses["loss_objective"] = mixed.mean() + losses["loss_imitation"]
+        losses["weight"] = weight.mean()
+        return losses
+
+    @torch.no_grad()
+    def distance(self, minibatch: TensorDictBase, surprise: Tensor) -> Tensor:
+        """Return D [N]; `surprise` is -log pi_aux(g | s)."""
+        if not minibatch["action"].is_floating_point():
+            return surprise
+        mode = self.imitator.get_dist(minibatch.select(*self.imitator.in_keys)).deterministic_sample
+        difference: Tensor = minibatch["guide_action"][..., self.imitation.guide, :] - mode
+        return difference.abs().flatten(1).amax(1)

@@ -1,0 +1,443 @@
+"""What envs and controllers of others do wrong is one sentence with its place, or no harm."""
+
+import decimal
+import fractions
+import itertools
+import sys
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from torch import nn
+from torchrl.envs import TransformedEnv
+
+from coil_rl import GymnasiumEnv
+from coil_rl.foreign.faults import ForeignError
+from coil_rl.guides import ControllerGuide, PerRow
+from coil_rl.transforms import GuideActions
+
+STEP = 3  # at which a plant or controller does what it is told
+BOX, PLANE = spaces.Box(-np.inf, np.inf, (2,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
+BYTES, NAN = spaces.Box(0, 255, (2,), np.uint8), float("nan")
+DICT = spaces.Dict({"a": BOX, "in": spaces.Dict({"b": spaces.Discrete(3, start=5)})})
+TWO = spaces.Tuple([spaces.Discrete(2), BOX])
+ARRAY = "not an array of numbers"
+
+
+class Plant(gymnasium.Env):
+    """Answers as Gymnasium wants it, but for one answer."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(self, space=BOX, answer=None, reset=None, action=PLANE, render_mode=None):
+        self.observation_space, self.action_space = space, action
+        self.answer, self.first, self.render_mode = answer, reset, render_mode
+
+    def good(self):
+        return self.observation_space.sample()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        self.time = 0
+        return (self.good(), {}) if self.first is None else self.first(self.good())
+
+    def step(self, action):
+        self.time += 1
+        answer = [self.good(), 1.0, False, self.time == 20, {}]
+        return self.answer(answer) if self.answer and self.time == STEP else tuple(answer)
+
+
+def put(index, value):
+    """Return what replaces one of the five values of a step."""
+    return lambda answer: (*answer[:index], value, *answer[index + 1 :])
+
+
+def fail(error):
+    def change(*_):
+        raise error
+
+    return change
+
+
+seen, reward, end, cut, info = (partial(put, index) for index in range(5))
+
+
+def stepped(guide=None, rows=2, id=None, **plant):
+    """Return the entries before each step; row 0 begins with the seed 7."""
+    beside = plant.pop("controllers", None)
+    env = GymnasiumEnv(id or (lambda **_: Plant(**plant)), rows, first_seed=7, controllers=beside)
+    if guide is not None:
+        env = TransformedEnv(env, GuideActions({"theirs": guide}))
+    return env.rollout(STEP + 2, break_when_any_done=False)
+
+
+def is_one_sentence(caught, length=400):
+    return "\n" not in str(caught.value) and len(str(caught.value)) < length
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda a: None, "step returned None, not the five of Gymnasium"),
+        (lambda a: tuple(a[:4]), "step returned 4 values, not the five"),
+        (lambda a: (*a, 1), "step returned 6 values, not the five"),
+        (lambda a: np.zeros(5), r"step returned \[0.0, 0.0, .*, not the five"),
+        (lambda a: dict(enumerate(a)), "step returned {0: .*, not the five"),
+        (lambda a: (a[0], a[1], a[4], a[2], a[3]), "info of step is False, not a dictionary"),
+        (reward(None), "the reward is None, not one number"),
+        (reward(np.zeros(1)), r"the reward is \[0.0\], not one number"),
+        (reward(torch.zeros(2)), r"the reward is \[0.0, 0.0\], not one number"),
+        (reward("1.0"), "the reward is '1.0', not one number"),
+        (reward(b"a"), "the reward is b'a', not one number"),
+        (reward(1 + 2j), "the reward is .*, not one number"),
+        (reward({"a": 1}), "the reward is {'a': 1}, not one number"),
+        (reward(10**400), "the reward is 1000.*, not one number"),
+        (reward(NAN), "the reward is nan, not a finite number"),
+        (reward(-np.inf), "the reward is -inf, not a finite number"),
+        (reward(1e300), r"the reward is 1e\+300, not a finite number of float32"),
+        (end(None), "terminated is None, not True or False"),
+        (end("False"), "terminated is 'False', not True or False"),
+        (cut(0.5), "truncated is 0.5, not True or False"),
+        (cut(np.array([True, False])), r"truncated is \[True, False\], not True"),
+        (info(None), "info of step is None, not a dictionary"),
+        (info([("a", 1)]), "info of step is .*, not a dictionary"),
+        (seen(None), f"the observation is None, {ARRAY}"),
+        (seen(np.zeros((1, 2))), r"has the shape \[1, 2\], but its space has \[2\]"),
+        (seen(0.5), r"the observation has the shape \[\]"),
+        (seen(["a", "b"]), ARRAY),
+        (seen([0.0, [1.0]]), ARRAY),
+        (seen(np.array([None, 1], object)), ARRAY),
+        (seen(np.zeros(2, complex)), ARRAY),
+        (seen(np.ma.array([0.0, 1.0], mask=[True, False])), ARRAY),
+        (seen({1}), ARRAY),
+        (seen([0.0, NAN]), "the observation holds nan, not a finite number"),
+        (seen([0.0, 1e300]), r"the observation holds 1e\+300, not a finite number of float32"),
+        (fail(KeyError("pump")), "step raised KeyError: 'pump'"),
+        (fail(ZeroDivisionError()), "step raised ZeroDivisionError: without a text"),
+        (fail(ValueError("two\n\nlines  " + 500 * "x")), "step raised ValueError: two lines"),
+        (fail(SystemExit(0)), "step raised SystemExit: 0"),
+        (fail(StopIteration()), "step raised StopIteration"),
+    ],
+)
+def test_fault_in_a_step_has_its_place(answer, message):
+    with pytest.raises(
+        ForeignError, match=rf"^the env .*row 0, seed 7, step 3\): .*{message}"
+    ) as e:
+        stepped(answer=answer)
+    assert is_one_sentence(e)
+
+
+def test_exception_of_an_env_is_chained():
+    error = KeyError("pump")
+    with pytest.raises(ForeignError) as caught:
+        stepped(answer=fail(error))
+    assert caught.value.__cause__ is error
+
+
+@pytest.mark.parametrize(
+    ("reset", "message"),
+    [
+        (lambda x: None, r"reset returned None, not the two of Gymnasium \(observation, info\)"),
+        (lambda x: x, r"reset returned \[.*\], not the two"),  # two numbers, which would unpack
+        (lambda x: (x, {}, 1), "reset returned 3 values, not the two"),
+        (lambda x: (x, 0.0), "info of reset is 0.0, not a dictionary"),
+        (lambda x: (x[:1], {}), r"the observation has the shape \[1\]"),
+        (lambda x: (x * np.nan, {}), "the observation holds nan"),
+        (fail(RuntimeError("no key")), "reset raised RuntimeError: no key"),
+    ],
+)
+def test_fault_in_a_reset_has_its_place(reset, message):
+    with pytest.raises(ForeignError, match=r"\(row 0, seed 7, step 0\): " + message):
+        stepped(reset=reset)
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "message"),
+    [
+        (spaces.Box(-1, 1, (2, 3)), np.zeros((3, 2)), r"shape \[3, 2\], but .* has \[2, 3\]"),
+        (spaces.Box(-1, 1, (2, 3)), np.zeros(6), r"shape \[6\], but its space has \[2, 3"),
+        (spaces.Box(-1, 1, (3,)), np.zeros((3, 1)), r"has the shape \[3, 1\]"),
+        (BYTES, [0.5, 0.25], "the observation holds 0.5, which is not"),
+        (BYTES, [0, 256], "the observation holds 256, which is not"),
+        (BYTES, [0, -1], "the observation holds -1, which is not in"),
+        (spaces.MultiBinary(2), [0, 2], "the observation holds 2, which is not in MultiBinary"),
+        (spaces.Discrete(3), 3, "the observation holds 3, which is not in Discrete"),
+        (spaces.Discrete(3, start=5), 2, "the observation holds 2, which is not in Discrete"),
+        (spaces.Discrete(3), 1.5, "the observation holds 1.5, which is not in Discrete"),
+        (spaces.Discrete(3), [0, 1], r"has the shape \[2\], but its space has \[\]"),
+        (spaces.MultiDiscrete([2, 3]), [2, 0], "the observation holds 2, which is not in Multi"),
+        (DICT, {"a": np.zeros(2)}, r"observation.in.b is missing: the observation has \['a'\]"),
+        (DICT, {"a": np.zeros(2), "in": {"c": 5}}, r"in.b is missing: .* has \['c'\], but .* 'b'"),
+        (DICT, np.zeros(2), "the observation.a is missing"),
+        (TWO, (1,), "the observation.1 is missing: the observation is .*, not the tuple"),
+        (TWO, {"0": 1}, "the observation.0 is missing"),
+    ],
+)
+def test_observation_that_is_not_in_its_space_is_refused(space, value, message):
+    with pytest.raises(ForeignError, match=rf"row 0, seed 7, step 3\): .*{message}"):
+        stepped(space=space, answer=seen(value))
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "expected"),
+    [
+        (BOX, (1.0, np.float64(2)), [1.0, 2.0]),
+        (BOX, torch.tensor([1.0, 2.0], requires_grad=True), [1.0, 2.0]),
+        (BOX, np.array([True, False]), [1.0, 0.0]),
+        (spaces.Box(-1, 1, ()), [0.5], [0.5]),
+        (spaces.Box(-1, 1, (1,)), 0.5, [0.5]),
+        (BYTES, [1.0, 255], [1, 255]),
+        (spaces.Discrete(3), np.array([2]), [0, 0, 1]),
+        (spaces.Discrete(2), True, [0, 1]),
+        (spaces.MultiDiscrete([2, 3]), [1, 2], [0, 1, 0, 0, 1]),
+        (spaces.MultiBinary(2), [True, False], [1, 0]),
+    ],
+)
+def test_observation_in_another_dress_is_taken(space, value, expected):
+    data = stepped(space=space, answer=seen(value))
+    assert data["next", "observation"][0, STEP - 1].tolist() == expected
+
+
+ODD_NUMBERS = [2, True, np.int64(2), np.array(0.5), torch.tensor(2.0), np.bool_(True)]
+
+
+@pytest.mark.parametrize("value", [*ODD_NUMBERS, fractions.Fraction(1, 2), decimal.Decimal("0.5")])
+def test_every_kind_of_number_is_a_reward(value):
+    rewards = stepped(answer=reward(value))["next", "reward"]
+    assert rewards[:, STEP - 1].tolist() == [[float(value)]] * 2
+
+
+@pytest.mark.parametrize("flag", [True, np.True_, 1, np.array(True), torch.tensor(True), 1.0, 0])
+def test_every_kind_of_flag_ends_an_episode_where_it_is_true(flag):
+    ends = stepped(answer=end(flag))["next", "terminated"]
+    assert ends[:, STEP - 1].tolist() == [[bool(flag)]] * 2
+
+
+def test_buffer_that_all_envs_share_is_harmless():
+    buffer = np.zeros(2, np.float32)
+
+    class Own(Plant):
+        def good(self):
+            return self.np_random.uniform(size=2).astype(np.float32)
+
+    class Shared(Own):
+        def good(self):
+            buffer[:] = super().good()
+            return buffer
+
+    def act(env, observation):
+        return observation[:1]
+
+    shared, own = (stepped(id=lambda: kind(), controllers={"own": act}) for kind in (Shared, Own))  # noqa: B023
+    entries = [(each["observation"], each["controller", "own"]) for each in (shared, own)]
+    assert all(torch.equal(one, other) for one, other in zip(*entries, strict=True))
+
+
+def bounded(low, high):
+    space = spaces.Box(-1, 1, (1,))
+    space.low, space.high = np.array([low]), np.array([high])
+    return space
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (spaces.Box(np.array([-1, 2.0]), np.array([1, 2.0])), "number 1 of .* bounds 2.0 and 2.0"),
+        (bounded(NAN, 1.0), r"number 0 of the action of .* has the bounds nan"),
+        (bounded(1.0, -1.0), r"number 0 of the action of .* has the bounds 1.0 and -1.0"),
+        (spaces.Box(-1, 1, (0,)), r"has the shape \[0\]: it has no number"),
+        (spaces.Box(0, 10**6, (1,), np.int64), "which are choices, but only up to 32 of each"),
+        (3, "the action_space of .* is 3, not a space of Gymnasium"),
+        (None, "has no action_space: set it in its __init__"),
+        (spaces.Text(3), "is a Text space: replace it with a wrapper"),
+        (TWO, "is a Tuple space: replace it with a wrapper"),
+        (spaces.Sequence(BOX), "is a Sequence space: replace it with a wrapper"),
+    ],
+)
+def test_action_that_leaves_no_choice_is_refused(action, message):
+    with pytest.raises(ValueError, match=message):
+        stepped(action=action, rows=1)
+
+
+ONE, SIZES = Plant(), itertools.count(1)
+
+
+class Broken(Plant):
+    action_space = property(fail(NotImplementedError("later")), lambda self, space: None)
+
+
+@pytest.mark.parametrize(
+    ("maker", "message"),
+    [
+        (lambda: None, "the env .* is None, not an env of Gymnasium"),
+        (lambda: {}["valve"], "the env .* cannot be made: it raised KeyError: 'valve'"),
+        (lambda: Broken(), "the env .* cannot be made: it raised NotImplementedError: later"),
+        (lambda: sys.exit(3), "the env .* cannot be made: it raised SystemExit: 3"),
+        (gymnasium.Env, "the env Env has no action_space: set it in its __init__"),
+        (lambda: Plant(space=None), "the env .* has no observation_space"),
+        (lambda: Plant(space=[1]), r"the observation_space of .* is \[1\], not a space"),
+        (lambda: ONE, "the maker of .* returned one env twice"),
+        (
+            lambda: Plant(action=spaces.Box(-1, 1, (next(SIZES),))),
+            r"the action_space of .* is Box.* in row 1, but Box.* in row 0",
+        ),
+    ],
+)
+def test_maker_without_envs_is_refused(maker, message):
+    with pytest.raises(ValueError, match=message):
+        GymnasiumEnv(maker, 2)
+
+
+def test_action_that_is_no_number_does_not_reach_the_env():
+    env = GymnasiumEnv(lambda: Plant())
+    carrier = env.reset().set("action", torch.full((1, 1), torch.nan))
+    with pytest.raises(ForeignError, match="holds a number that is not finite: the policy or its"):
+        env.step(carrier)
+
+
+PICTURES = [np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8), np.zeros(7, np.uint8), "x", None]
+LATER = [np.zeros((4, 4, 3), np.uint8), np.zeros((5, 4, 3), np.uint8)]  # of another size
+
+
+@pytest.mark.parametrize("pictures", [*([each] for each in PICTURES), LATER])
+def test_garbage_of_render_is_a_warning_and_the_env_runs_on(pictures, monkeypatch):
+    given = iter(pictures)
+    monkeypatch.setattr(Plant, "render", lambda self: next(given), raising=False)
+    env = GymnasiumEnv(Plant, render=True)
+    env.reset()
+    assert all(env.render() is not None for _ in pictures[1:])
+    with pytest.warns(UserWarning, match="no pictures of the env: render returned"):
+        assert env.render() is None
+    assert env.render() is None
+    env.rollout(3)
+
+
+@pytest.mark.parametrize("metadata", [None, {}, {"render_fps": "fast"}, {"render_modes": None}])
+def test_metadata_may_be_anything(metadata, monkeypatch):
+    monkeypatch.setattr(Plant, "metadata", metadata)
+    assert np.isnan(GymnasiumEnv(Plant, render=True).rate)
+
+
+def test_env_that_cannot_be_closed_is_a_warning(monkeypatch):
+    monkeypatch.setattr(Plant, "close", fail(OSError("the port is gone")))
+    env = GymnasiumEnv(Plant)
+    with pytest.warns(UserWarning, match=r"cannot be closed \(OSError: the port is gone\)"):
+        env.close()
+
+
+class Late:
+    """Acts well until a step."""
+
+    def __init__(self, answer):
+        self.answer, self.calls = answer, -1
+
+    def reset(self):
+        self.calls = -1
+
+    def act(self, observation):
+        self.calls += 1
+        return self.answer() if self.calls == STEP else observation[:1]
+
+
+@pytest.mark.parametrize("beside", [False, True], ids=["guide", "beside its env"])
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda: None, f"None, {ARRAY}|gave None, not an action"),
+        (lambda: np.nan, "nan.* not finite|gave nan, not an action"),
+        (lambda: "left", f"'left', {ARRAY}|gave 'left', not an action"),
+        (lambda: (np.zeros(1), None), "the tuple .*; return the action alone|gave .*, not an act"),
+        (lambda: (torch.zeros(1), ()), "the tuple .*; return the action alone|gave .*, not an act"),
+        (lambda: {"action": 1}, f"{ARRAY}|gave .*, not an action"),
+        (lambda: [0.5, [1.0]], f"{ARRAY}|gave .*, not an action"),
+        (lambda: 1j, f"{ARRAY}|gave 1j, not an action"),
+        (fail(IndexError("no joint 7")), "raised IndexError: no joint 7"),
+        (fail(SystemExit(1)), "raised SystemExit: 1"),
+        (lambda: [0.5, 0.5], r"the shape \[2\]|gave \[0.5, 0.5\], not an action"),
+        (lambda: [], r"the shape \[0\]|gave \[\], not an action"),
+    ],
+)
+def test_fault_of_a_controller_has_its_place(answer, message, beside):
+    makers = iter([Late(lambda: [0.5]), Late(answer)])
+    given = {"controllers": {"pid": Late(answer)}}
+    if not beside:
+        given = {"guide": PerRow(lambda: next(makers), title="PID")}
+    with pytest.raises(ForeignError, match=message) as caught:
+        stepped(**given)
+    place = r"row 0, seed 7, step 3" if beside else "the controller PID (row 1, step 3): "
+    assert place in str(caught.value)
+    assert is_one_sentence(caught)
+
+
+class Raises(nn.Module):
+    def forward(self, x):
+        raise RuntimeError("no weights\nat all")
+
+
+@pytest.mark.parametrize(
+    ("id", "controller", "message"),
+    [
+        ("Pendulum-v1", lambda x: None, "the action is None"),
+        ("Pendulum-v1", lambda x: (x[..., :1], None), "the action is the tuple"),
+        ("Pendulum-v1", lambda x: x / "a", "it raised TypeError: "),
+        ("Pendulum-v1", lambda x: {}["gain"], "it raised KeyError: 'gain'"),
+        ("Pendulum-v1", lambda x: x[..., :1] * np.nan, "is not finite"),
+        ("Pendulum-v1", lambda x: x, r"has the shape \[2, 3\], but must have \[2, 1\]"),
+        ("Pendulum-v1", nn.Identity(), r"Identity: its action has the shape .* but must have"),
+        ("Pendulum-v1", Raises(), "Raises: it raised RuntimeError: no weights at"),
+        ("CartPole-v1", lambda x: 2, "is neither an index below 2 nor a one-hot vector"),
+        ("CartPole-v1", lambda x: 0.5, "is no whole number, but must be the number of a choice"),
+        ("CartPole-v1", lambda x: -1, "is neither an index below 2 nor a one-hot vector"),
+    ],
+)
+def test_fault_of_what_all_rows_share_is_one_sentence(id, controller, message):
+    with pytest.raises(ForeignError, match=f"^the controller .*{message}") as caught:
+        stepped(ControllerGuide(controller), id=id)
+    assert is_one_sentence(caught)
+
+
+class Gives:
+    def __init__(self, *answers):
+        self.answers = answers
+
+    def reset(self):
+        self.calls = -1
+
+    def act(self, observation):
+        self.calls += 1
+        return self.answers[min(self.calls, len(self.answers) - 1)]
+
+
+@pytest.mark.parametrize(
+    ("action", "answers", "message"),
+    [
+        (PLANE, ([1.0, 2.0],), r"step 0\): act returned \[1.0, 2.0\], .* \[2\], but must have \[1"),
+        (spaces.Discrete(2), (0, 1, 2), r"step 2\): act returned \[2\], which is neither an index"),
+        (spaces.Discrete(3, start=5), (0.5,), r"neither a number from \[5\] to \[7\] nor a one-"),
+        (spaces.Discrete(3, start=-1), (7,), r"neither a number from \[-1\] to \[1\] nor a one-"),
+        (spaces.MultiBinary(2), (6,), r"returned \[6\], which has the shape \[1\], but must have"),
+        (
+            spaces.MultiDiscrete([3, 2], start=[1, 10]),
+            ([1, 1],),
+            r"from \[1, 10\] to \[3, 11\] nor",
+        ),
+        (spaces.Box(-2, 2, (2, 2)), ([1, 1],), r"has the shape \[2\], but must have \[2, 2\]"),
+        (spaces.Box(-1, 1, (2, 3)), (np.zeros((3, 2)),), r"shape \[3, 2\], but must have \[2, 3\]"),
+    ],
+)
+def test_action_that_does_not_fit_is_told_as_it_was_returned(action, answers, message):
+    with pytest.raises(ForeignError, match=rf"the controller Gives \(row 0, .*{message}"):
+        stepped(ControllerGuide(Gives(*answers)), action=action)
+
+
+def test_what_a_controller_does_with_its_observation_changes_nothing():
+    def spoils(*given):
+        given[-1][...] = 0.0
+        return given[-1][..., :1]
+
+    data = stepped(ControllerGuide(spoils), controllers={"careless": spoils})
+    assert (data["observation"] != 0).all()

@@ -1,0 +1,666 @@
+import math
+import warnings
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from torchrl.data import Bounded, Categorical, MultiCategorical, Unbounded
+from worlds import drive, reloaded, same
+
+from coil_rl import GymnasiumEnv
+from coil_rl.testing import check_env
+
+LIMIT = 7  # steps of an episode of `Echo`
+
+
+class Echo(gymnasium.Env):
+    """Shows its last action and the time, in spaces of all kinds."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+
+    def __init__(self, action_space=None, leak=0.0, render_mode=None):
+        self.action_space = action_space or spaces.Box(-2.0, 3.0, (2,), np.float64)
+        self.leak, self.resets, self.render_mode = leak, 0, render_mode
+        self.observation_space = spaces.Dict(
+            {
+                "real": spaces.Box(-np.inf, np.inf, (3,), np.float64),
+                "image": spaces.Box(0, 255, (4, 5, 3), np.uint8),
+                "place": spaces.Discrete(LIMIT + 1, start=10),
+                "inner": spaces.Dict(
+                    {"pair": spaces.MultiDiscrete([2, 3]), "bits": spaces.MultiBinary(3)}
+                ),
+                "both": spaces.Tuple([spaces.Discrete(2), spaces.Box(0, 1, (), np.float32)]),
+                "mission": spaces.Text(8),
+            }
+        )
+
+    def observe(self):
+        return {
+            "real": np.array([self.time, self.noise, np.sum(self.last)]),
+            "image": np.full((4, 5, 3), self.time, np.uint8),
+            "place": 10 + self.time,
+            "inner": {"pair": np.array([1, self.time % 3]), "bits": np.array([0, 1, 1], np.int8)},
+            "both": (1, np.float32(0.25)),
+            "mission": "go",
+        }
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time, self.last = 0, np.zeros(1)
+        self.noise = self.np_random.uniform() + self.leak * self.resets
+        self.resets += 1
+        return self.observe(), {}
+
+    def step(self, action):
+        assert self.time < LIMIT, "stepped after its end"
+        assert self.action_space.contains(np.asarray(action)), action
+        self.time, self.last = self.time + 1, action
+        return (
+            self.observe(),
+            1.0,
+            self.time == LIMIT,
+            False,
+            {"success": self.time > 3, "words": "x"},
+        )
+
+    def render(self):
+        return np.full((2, 2, 3), self.time, np.uint8)
+
+
+gymnasium.register("Echo-v0", Echo)
+
+
+class Counter:
+    """Controller whose action is the number of its calls in this episode, in steps of `size`."""
+
+    def __init__(self, env, size=1.0):
+        self.size, self.shape = size, env.action_space.shape
+
+    def reset(self):
+        self.calls = 0
+
+    def act(self, observation):
+        self.calls += 1
+        return np.full(self.shape, self.calls * self.size)
+
+
+def first_real(env, observation):
+    return observation["real"][:2] * (env.unwrapped.time >= 0)
+
+
+def act(env, observation):
+    return 11 - 10 * (observation["place"] > 12)
+
+
+ENVS = {
+    "CartPole-v1": {},
+    "Pendulum-v1": {},
+    "Echo-v0": {"info": ["success"], "controllers": {"count": Counter}},
+    "LunarLander-v3": {"options": {"continuous": True}},
+    "BipedalWalker-v3": {"fresh": True},
+}
+
+
+def build(id, num_envs=3, **arguments):
+    if id in ("LunarLander-v3", "BipedalWalker-v3"):
+        pytest.importorskip("Box2D", reason="Box2D is not installed")
+    return GymnasiumEnv(id, num_envs, **(ENVS.get(id, {}) | arguments))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("id", ENVS)
+def test_env_fits_its_specs(id, dtype):
+    check_env(build(id, dtype=dtype), steps=30)
+
+
+@pytest.mark.parametrize("id", ENVS)
+def test_seed_determines_all_episodes(id):
+    one, other, third = (drive(build(id, seed=seed), 60)[0] for seed in (1, 1, 2))
+    assert same(one, other)
+    assert not same(one, third)
+
+
+@pytest.mark.parametrize("id", ENVS)
+def test_saved_env_goes_on_to_the_bit(id):
+    env = build(id, 4, seed=5)
+    _, carrier = drive(env, 45)
+    state, start = reloaded(env.state_dict()), carrier.clone()
+    later = drive(env, 60, carrier, seed=1)[0]
+    other = build(id, 4, seed=6)
+    drive(other, 10)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        other.load_state_dict(state)
+    assert other.continues
+    assert same(later, drive(other, 60, start, seed=1)[0])
+
+
+@pytest.mark.parametrize("id", ENVS)
+def test_env_saved_at_its_first_reset_goes_on_to_the_bit(id):
+    env, other = build(id, seed=5), build(id, seed=6)
+    carrier = env.reset()
+    other.load_state_dict(reloaded(env.state_dict()))
+    assert other.continues
+    assert same(drive(env, 30, carrier.clone())[0], drive(other, 30, carrier)[0])
+
+
+def test_env_saved_before_its_first_reset_draws_the_same_episodes():
+    env, other = build("CartPole-v1", seed=5), build("CartPole-v1", seed=6)
+    other.load_state_dict(reloaded(env.state_dict()))
+    assert same(drive(env, 30)[0], drive(other, 30)[0])
+
+
+def test_env_that_keeps_something_at_a_reset_is_noticed():
+    env = build("Echo-v0", options={"leak": 0.5})
+    drive(env, 2 * LIMIT + 2)
+    other = build("Echo-v0", options={"leak": 0.5})
+    with pytest.warns(
+        UserWarning, match=r"cannot go on with its running episodes to the bit.*fresh=true"
+    ) as caught:
+        other.load_state_dict(reloaded(env.state_dict()))
+    assert len(caught) == 1
+    assert not other.continues
+    drive(other, 5)
+    fresh, other = (build("Echo-v0", options={"leak": 0.5}, fresh=True) for _ in range(2))
+    drive(fresh, 2 * LIMIT + 2)
+    other.load_state_dict(reloaded(fresh.state_dict()))
+    assert other.continues
+
+
+def test_episode_longer_than_the_memory_is_not_repeated(monkeypatch):
+    monkeypatch.setattr("coil_rl.foreign.batch.REMEMBERED", 20)
+    env = build("Pendulum-v1")
+    drive(env, 25)
+    with pytest.warns(UserWarning, match="cannot go on"):
+        env.load_state_dict(reloaded(env.state_dict()))
+
+
+def test_actions_are_kept_for_running_episodes_only():
+    env = build("Echo-v0")
+    drive(env, 5 * LIMIT + 2)
+    assert len(env.actions) == 2
+
+
+def test_rows_begin_with_the_seeds_of_their_cases():
+    env = build("Pendulum-v1", 5, first_seed=40, cases=2)
+    alone = [gymnasium.make("Pendulum-v1").reset(seed=seed)[0] for seed in (40, 41, 40, 41, 40)]
+    for _ in range(2):
+        np.testing.assert_array_equal(env.reset()["observation"].numpy(), alone)
+    drawn = build("Pendulum-v1", 5)
+    assert not torch.equal(drawn.reset()["observation"], drawn.reset()["observation"])
+
+
+def test_numbers_are_those_of_gymnasium():
+    env, single = build("Pendulum-v1", 1, first_seed=3), gymnasium.make("Pendulum-v1")
+    carrier, _ = env.reset(), single.reset(seed=3)
+    for action in np.linspace(-3, 3, 20, dtype=np.float32):  # beyond the bounds, which are 2
+        after = env.step(carrier.set("action", torch.full((1, 1), float(action))))["next"]
+        carrier = after.clone()
+        observation, reward, *_ = single.step(np.clip([action], -2, 2))
+        np.testing.assert_array_equal(after["observation"][0].numpy(), observation)
+        assert after["reward"].item() == np.float32(reward)
+
+
+def test_spaces_become_entries():
+    env = build("Echo-v0", dtype=torch.float64)
+    after = drive(env, 4)[0][-1]
+    real, place, pair = after["real"], after["place"], after["inner", "pair"]
+    assert real.dtype == place.dtype == pair.dtype == after["inner", "bits"].dtype == torch.float64
+    assert real[:, 0].tolist() == [4.0] * 3
+    assert after["image"].dtype == torch.uint8
+    assert after["image"].shape == (3, 4, 5, 3)
+    assert after["image"].unique().tolist() == [4]
+    assert place.tolist() == [[0, 0, 0, 0, 1, 0, 0, 0]] * 3
+    assert pair.tolist() == [[0, 1, 0, 1, 0]] * 3  # 1 of 2, 1 of 3
+    assert after["inner", "bits"].tolist() == [[0, 1, 1]] * 3
+    assert after["both", "0"].tolist() == [[0, 1]] * 3
+    assert after["both", "1"].tolist() == [[0.25]] * 3
+    assert "mission" not in after
+    assert after["info", "success"].tolist() == [[1.0]] * 3
+    assert env.reset()["info", "success"].isnan().all(), "a reset has no info here"
+    assert build("Echo-v0").reset()["real"].dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("space", "spec", "shape"),
+    [
+        (spaces.Box(-2.0, 3.0, (2,), np.float64), Bounded, (2,)),
+        (spaces.Box(-1, 1, (), np.float32), Bounded, (1,)),
+        (spaces.Box(-np.inf, np.inf, (2, 2), np.float32), Unbounded, (4,)),
+        (spaces.Discrete(3, start=5), Categorical, ()),
+        (spaces.MultiDiscrete([2, 4]), MultiCategorical, (2,)),
+        (spaces.MultiBinary(3), torch.int8, (3,)),
+    ],
+)
+def test_actions_of_a_space_reach_the_env(space, spec, shape):
+    # `Echo` verifies that what arrives is in its space.
+    env = GymnasiumEnv("Echo-v0", 2, options={"action_space": space})
+    assert (
+        env.action_spec.dtype == spec
+        if isinstance(spec, torch.dtype)
+        else isinstance(env.action_spec, spec)
+    )
+    assert env.action_spec.shape == (2, *shape)
+    carrier = env.reset()
+    action = env.rand_action()["action"]
+    given = action.double().reshape(2, -1).sum(-1) + float(np.sum(getattr(space, "start", 0)))
+    torch.testing.assert_close(
+        env.step(carrier.set("action", action))["next", "real"][:, 2].double(), given
+    )
+
+
+class Place(gymnasium.Env):
+    """Moves a millimetre a step, from an offset on."""
+
+    action_space, observation_space = spaces.Discrete(2), spaces.Box(-np.inf, np.inf, (1,), float)
+
+    def __init__(self, offset, step=0.001, dtype=float):
+        self.offset, self.step_size, self.dtype = offset, step, dtype
+
+    def reset(self, *, seed=None, options=None):
+        self.place = self.offset
+        return np.array([self.place], self.dtype), {}
+
+    def step(self, action):
+        self.place += self.step_size
+        return np.array([self.place], self.dtype), 0.0, False, False, {}
+
+
+def said_of_coarse_numbers(env):
+    """Return the warnings of numbers that are too fine for float32, in 300 steps."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        env.rollout(300, break_when_any_done=False)
+    return [str(each.message) for each in said if "float32 has steps of" in str(each.message)]
+
+
+@pytest.mark.parametrize(
+    ("offset", "step", "coarse"),
+    [
+        (5_412_345.67, 0.001, True),
+        (1000.0, 0.001, False),
+        (5e6, 0.0, False),
+        (293.15, 1e-13, False),
+    ],
+)
+def test_numbers_too_fine_for_the_dtype_are_said(offset, step, coarse):
+    found = said_of_coarse_numbers(GymnasiumEnv(partial(Place, offset, step), max_steps=1000))
+    assert bool(found) == coarse
+    assert not coarse or "number 0 of the observation goes from 5412345.67" in found[0]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "own", "expected"),
+    [
+        (1e7, 1e7 + 10, np.float64, torch.float64),
+        (-1e9 - 1, -1e9, np.float64, torch.float64),
+        (1e7, 1e7 + 10, np.float32, torch.float32),
+        (0, 1e7, np.float64, torch.float32),
+        (1e7, np.inf, np.float64, torch.float64),
+        (-np.inf, 1e7, np.float64, torch.float64),
+        (-1, np.inf, np.float64, torch.float32),
+        (-1e38, 1e38, np.float64, torch.float32),
+    ],
+)
+def test_actions_too_fine_for_the_dtype_keep_their_own(low, high, own, expected):
+    class Acts(Place):
+        action_space = spaces.Box(low, high, (2,), own)
+
+        def step(self, action):
+            self.got = action
+            return super().step(action)
+
+    edge = low if np.isfinite(low) else high - 1
+    env = GymnasiumEnv(partial(Acts, 0.0), controllers={"same": lambda env, seen: [edge, edge]})
+    assert env.action_spec.dtype == expected
+    state = env.reset()
+    assert state["controller", "same"].dtype == expected
+    wish = torch.tensor([[edge + 0.125, edge + 0.875]], dtype=torch.float64)
+    env.step(state.set("action", wish.to(expected)))
+    if expected == torch.float64:
+        assert torch.equal(torch.as_tensor(env.held.plants[0].env.unwrapped.got), wish[0])
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint32, np.int64, float])
+def test_whole_numbers_too_large_for_the_dtype_are_said(dtype):
+    make = partial(Place, 1_700_000_000, 1, dtype)
+    assert said_of_coarse_numbers(GymnasiumEnv(make, max_steps=1000))
+
+
+def test_pixels_stay_whole_numbers_and_other_small_numbers_do_not():
+    class Counts(gymnasium.Env):
+        action_space = spaces.Discrete(2)
+        observation_space = spaces.Dict(
+            {
+                "image": spaces.Box(0, 10, (4, 5, 3), np.uint8),
+                "pixels": spaces.Box(0, 255, (2,), np.uint8),
+                "cars": spaces.Box(0, 3, (2,), np.uint8),
+            }
+        )
+
+        def reset(self, *, seed=None, options=None):
+            return self.observation_space.sample() | {"cars": np.array([3, 1], np.uint8)}, {}
+
+        def step(self, action):
+            return self.reset()[0], 0.0, False, False, {}
+
+    first = GymnasiumEnv(Counts, max_steps=3).reset()
+    assert first["image"].dtype == first["pixels"].dtype == torch.uint8
+    assert first["cars"][0].tolist() == [3.0, 1.0]
+    assert first["cars"].dtype == torch.float32
+
+
+@pytest.mark.parametrize(("offset", "coarse"), [(1e8, True), (-1e6, True), (100.0, False)])
+def test_rewards_too_fine_for_the_dtype_are_said(offset, coarse):
+    class Offset(Place):
+        def step(self, action):
+            observation, *others = super().step(action)
+            return observation, offset + math.sin(self.place), *others[1:]
+
+    env = GymnasiumEnv(partial(Offset, 0.0, 0.1), num_envs=2, max_steps=1000)
+    found = said_of_coarse_numbers(env)
+    assert bool(found) == coarse
+    assert not coarse or ": the reward goes from " in found[0]
+
+
+def test_controller_beside_an_env_gets_a_copy_of_its_observation():
+    class Own(Place):
+        def step(self, action):
+            _, *others = super().step(action)
+            self.state[:] = self.place
+            return self.state, *others
+
+        def reset(self, **options):
+            observation, info = super().reset(**options)
+            self.state = observation
+            return self.state, info
+
+    def careless(env, observation):
+        observation[:] = 7.0
+        return 0
+
+    env = GymnasiumEnv(partial(Own, 0.0, 0.5), controllers={"careless": careless})
+    seen = env.rollout(3)["next", "observation"]
+    assert seen.flatten().tolist() == [0.5, 1.0, 1.5]
+    assert env.held.plants[0].observation.tolist() == [1.5]
+
+
+def test_matrix_is_a_vector_of_which_controllers_give_the_matrix():
+    class Matrix(Place):
+        action_space = spaces.Box(-1, 1, (2, 3), np.float64)
+
+        def step(self, action):
+            self.received = action
+            return super().step(action)
+
+    def ones(env, observation):
+        return np.arange(6.0).reshape(2, 3) / 10
+
+    env = GymnasiumEnv(partial(Matrix, 0.0, 0.5), num_envs=2, controllers={"ones": ones})
+    data = env.reset()
+    assert env.action_spec.shape == (2, 6)
+    assert env.own_shape == (2, 3)
+    action = data["controller", "ones"]
+    assert action.shape == (2, 6)
+    env.step(data.set("action", action))
+    assert np.allclose(env.held.plants[1].env.unwrapped.received, ones(None, None))
+
+
+@pytest.mark.parametrize(("name", "said"), [("success", False), ("sucess", True)])
+def test_name_that_is_never_in_info_is_said(name, said):
+    class Ends(Place):
+        def step(self, action):
+            observation, reward, *_ = super().step(action)
+            over = self.place > 0.0025
+            return observation, reward, over, False, {"success": True} if over else {}
+
+    env = GymnasiumEnv(partial(Ends, 0.0), info=[name])
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        env.rollout(10)
+    texts = [str(each.message) for each in found]
+    expected = (
+        "had no sucess in the info of an episode, so it is NaN there, a number without a value"
+    )
+    found = [text for text in texts if expected in text]
+    assert bool(found) == said
+    assert all(text.endswith("; at its end info has success") for text in found)
+
+
+class Rare(Place):
+    """Place that has its step number in info in every second step only."""
+
+    def __init__(self):
+        super().__init__(0.0, step=1.0)
+
+    def step(self, action):
+        observation, reward, *ends, _ = super().step(action)
+        return observation, reward, *ends, {} if self.place % 2 else {"time": self.place}
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_number_that_is_missing_in_a_step_has_no_value_there(workers):
+    env = GymnasiumEnv(Rare, 2, info=["time"], workers=workers)
+    times = env.rollout(5)["next", "info", "time"].squeeze(-1)
+    env.close()
+    nan = float("nan")
+    assert np.array_equal(times, 2 * [[nan, 2, nan, 4, nan]], equal_nan=True)
+
+
+def test_env_whose_info_lacks_numbers_fits_the_contract():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of no limit of steps
+        check_env(GymnasiumEnv(Rare, 2, info=["time"]))
+
+
+def test_mask_of_actions_is_said_not_to_be_used():
+    class Masked(Place):
+        def reset(self, **options):
+            return super().reset(**options)[0], {"action_mask": np.ones(2)}
+
+    with pytest.warns(UserWarning, match="has action_mask in info, which is not used"):
+        GymnasiumEnv(partial(Masked, 0.0)).reset()
+
+
+def test_observation_without_numbers_is_refused():
+    class Blind(Place):
+        observation_space = spaces.Box(-1, 1, (0,))
+
+        def __init__(self):
+            super().__init__(0.0)
+            self.observation_space = spaces.Box(-1, 1, (0,))
+
+    with pytest.raises(ValueError, match="which has no numbers; observe at least one"):
+        GymnasiumEnv(Blind)
+
+
+def test_finished_row_stays_as_it_is():
+    env = build("Echo-v0")
+    carrier = env.reset()
+    for _ in range(LIMIT + 3):  # Echo refuses to be stepped after its end
+        after = env.step(env.rand_action(carrier))["next"]
+        carrier = after.clone()
+    assert after["terminated"].all()
+    assert after["real"][:, 0].tolist() == [LIMIT] * 3
+    assert after["reward"].tolist() == [[0.0]] * 3
+
+
+def test_time_limit_truncates():
+    env = GymnasiumEnv("Pendulum-v1", 2, max_steps=5)
+    ends = env.rollout(5, break_when_any_done=False)["next"]
+    assert ends["truncated"][:, -1].all()
+    assert not ends["terminated"].any()
+    assert ends["done"].sum() == 2
+
+
+@pytest.mark.parametrize("steps", [3, 9])
+def test_own_number_of_steps_replaces_that_of_the_maker(steps):
+    def limited():
+        inner = gymnasium.wrappers.TimeLimit(gymnasium.make("Pendulum-v1"), 6)
+        return gymnasium.wrappers.OrderEnforcing(inner)
+
+    env = GymnasiumEnv(limited, max_steps=steps)
+    assert env.rollout(20)["next", "truncated"].flatten().tolist() == [False] * (steps - 1) + [True]
+
+
+def test_own_number_of_steps_replaces_that_of_a_registered_maker():
+    def limited(**options):
+        return gymnasium.wrappers.TimeLimit(gymnasium.make("Pendulum-v1", **options), 6)
+
+    gymnasium.register("LimitedInside-v0", limited)
+    try:
+        env = GymnasiumEnv("LimitedInside-v0", max_steps=9)
+        assert env.rollout(20).shape == (1, 9)
+    finally:
+        del gymnasium.registry["LimitedInside-v0"]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_episodes_begin_with_the_options_of_reset(workers):
+    env = GymnasiumEnv(
+        "CartPole-v1", 2, reset_options={"low": 0.2, "high": 0.21}, seed=1, workers=workers
+    )
+    for _ in range(3):  # also after an episode
+        first = env.rollout(200, break_when_any_done=True)["observation"][:, 0]
+        assert ((first >= 0.2) & (first <= 0.21)).all()
+    env.close()
+
+
+def test_wrappers_are_applied_in_order():
+    double, shift = (
+        partial(gymnasium.wrappers.TransformReward, func=func)
+        for func in (lambda r: 2 * r, lambda r: r + 3)
+    )
+    after = drive(build("Echo-v0", wrappers=[double, shift]), 1)[0][0]
+    assert after["reward"].tolist() == [[5.0]] * 3
+
+
+def test_controllers_act_beside_their_envs():
+    controllers = {"count": Counter, "fast": partial(Counter, size=10), "real": first_real}
+    env = build("Echo-v0", controllers=controllers)
+    carrier = env.reset()
+    for steps in range(LIMIT - 1):
+        assert carrier["controller", "count"].tolist() == [[steps + 1.0] * 2] * 3
+        assert (
+            carrier["controller", "fast"].tolist() == [[steps * 10 + 10.0] * 2] * 3
+        )  # out of bounds, as given
+        assert torch.equal(carrier["controller", "real"], carrier["real"][:, :2])
+        step, carrier = env.step_and_maybe_reset(env.rand_action(carrier))
+        assert torch.equal(step["next", "controller", "count"], carrier["controller", "count"])
+    step, carrier = env.step_and_maybe_reset(env.rand_action(carrier))
+    assert step["next", "terminated"].all()
+    assert step["next", "controller", "count"].tolist() == [[float(LIMIT)] * 2] * 3
+    assert carrier["controller", "count"].tolist() == [[1.0] * 2] * 3
+
+
+def test_heuristic_of_gymnasium_lands():
+    path = "gymnasium.envs.box2d.lunar_lander:heuristic"
+    env = build("LunarLander-v3", 4, first_seed=0, controllers={"heuristic": path})
+    carrier, total = env.reset(), torch.zeros(4, 1)
+    while not carrier["done"].all():
+        carrier = env.step(carrier.set("action", carrier["controller", "heuristic"]))["next"]
+        total += carrier["reward"]
+    assert (total > 200).all()  # 280 with a standard deviation of 15
+
+
+def test_discrete_controller_gives_indices():
+    env = GymnasiumEnv(
+        "Echo-v0", 2, options={"action_space": spaces.Discrete(12)}, controllers={"a": act}
+    )
+    assert env.reset()["controller", "a"].tolist() == [11, 11]
+    assert drive(env, 4)[0][-1]["controller", "a"].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("advice", [[0.0], [0.0, float("nan")], None])
+def test_wrong_advice_names_the_controller(advice):
+    env = GymnasiumEnv("Echo-v0", controllers={"broken": lambda env, observation: advice})
+    with pytest.raises(ValueError, match=r"controller broken gave .*, not an action of Box"):
+        env.reset()
+
+
+def test_pictures_show_the_first_row():
+    env = build("Echo-v0", render=True)
+    drive(env, 3)
+    assert env.rate == 20
+    assert env.render().tolist() == np.full((2, 2, 3), 3).tolist()
+    assert build("Echo-v0").render() is None
+    assert [plant.env.render_mode for plant in env.held.plants] == ["rgb_array", None, None]
+
+
+def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
+    def fail(self):
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(Echo, "render", fail)
+    env = build("Echo-v0", render=True)
+    drive(env, 1)
+    with pytest.warns(UserWarning, match="no pictures of the env: no display"):
+        assert env.render() is None
+    assert env.render() is None
+
+
+@pytest.mark.parametrize(
+    ("id", "arguments", "message"),
+    [
+        ("CartPol-v1", {}, "the env CartPol-v1 cannot be made: .*Did you mean: `CartPole`"),
+        ("MyPlant-v0", {}, "write PACKAGE:MyPlant-v0"),
+        ("cart_poles.Cart", {}, "colon between them; write cart_poles:Cart$"),
+        ("outside_package.install.Room", {}, "write outside_package.install:Room$"),
+        ("outside_package.nothing.Room", {}, "write PACKAGE:outside_package.nothing.Room$"),
+        ("odd_parts:Plan", {}, "registers none of this name; did you mean Plain\\?$"),
+        ("gymnasium:CartPol-v1", {}, "; did you mean CartPole-v1\\?$"),
+        ("no_such_module:X-v0", {}, "there is no module no_such_module; install its package"),
+        ("CartPole-v1", {"options": {"colour": 1}}, "unexpected keyword argument 'colour'$"),
+        ("CartPole-v1", {"num_envs": 0}, "num_envs=0 must be at least 1"),
+        ("CartPole-v1", {"max_steps": 0}, "max_steps=0 must be at least 1"),
+        ("CartPole-v1", {"cases": 3}, "cases=3 needs first_seed"),
+        (
+            "CartPole-v1",
+            {"controllers": {"pid": "math:PID"}},
+            "controller pid: 'math:PID' cannot be imported",
+        ),
+        (
+            "CartPole-v1",
+            {"controllers": {"pid": "builtins:str"}},
+            r"controller pid: str needs a method act\(obs",
+        ),
+        (
+            "CartPole-v1",
+            {"controllers": {"pid": "fractions:Fraction"}},
+            "controller pid cannot be made with its env",
+        ),
+        (
+            "Echo-v0",
+            {"options": {"action_space": spaces.Text(3)}},
+            "the action of Echo-v0 is a Text space",
+        ),
+    ],
+)
+def test_mistake_is_one_sentence(id, arguments, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        GymnasiumEnv(id, **arguments)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["reward", "info"])
+def test_reserved_entry_is_refused(key):
+    def rename(env):
+        space = spaces.Dict({key: env.observation_space})
+        return gymnasium.wrappers.TransformObservation(
+            env, lambda observation: {key: observation}, space
+        )
+
+    with pytest.raises(ValueError, match=f"has an entry '{key}'"):
+        GymnasiumEnv("CartPole-v1", wrappers=[rename])
+
+
+def test_missing_package_is_named(monkeypatch):
+    def fail(*args, **settings):
+        raise gymnasium.error.DependencyNotInstalled("MuJoCo is not installed")
+
+    monkeypatch.setattr(gymnasium, "make", fail)
+    with pytest.raises(ValueError, match=r"python -m pip install 'coil-rl\[mujoco\]'"):
+        GymnasiumEnv("Ant-v5")

@@ -1,0 +1,623 @@
+"""Whatever acts as a guide: objects, functions, networks, models of other libraries."""
+
+import importlib
+import itertools
+import textwrap
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from sklearn.linear_model import LinearRegression
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.envs import Compose, TransformedEnv
+from worlds import continued
+
+from coil_rl import GymnasiumEnv
+from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.foreign.faults import ForeignError, Predictor, predicts
+from coil_rl.guides import ControllerGuide, FollowAdvice, PerRow
+from coil_rl.learners import PPO
+from coil_rl.run.rollout import Rollout
+from coil_rl.transforms import GuideActions
+
+SOURCE = """
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+class Net(torch.nn.Module):
+    def __init__(self, size=1):
+        super().__init__()
+        self.layer = torch.nn.Linear(20, size)
+
+    def forward(self, x):
+        return torch.tanh(self.layer(x))
+
+class Guide(TensorDictModuleBase):
+    in_keys, out_keys, pure = ["steering"], ["action"], True
+
+    def __init__(self, gain=1.0):
+        super().__init__()
+        self.gain = gain
+
+    def forward(self, tensordict):
+        return tensordict.set("action", self.gain * tensordict["steering"])
+
+class Counter:
+    def __init__(self, step=0.01):
+        self.step, self.count = step, 0
+
+    def reset(self):
+        self.count = 0
+
+    def act(self, observation):
+        assert observation.shape == (20,)
+        self.count += 1
+        return self.step * self.count
+
+    def state_dict(self):
+        return {"count": self.count}
+
+    def load_state_dict(self, state):
+        self.count = state["count"]
+
+class Other:
+    pass
+
+def half(observation, gain=0.5):
+    return gain * observation[..., :1]
+
+number = 3
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def control(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "my_control.py").write_text(textwrap.dedent(SOURCE))
+    (folder / "my_needy.py").write_text("import no_such_package\n")
+    (folder / "my_broken.py").write_text("1 / 0\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        yield importlib.import_module("my_control")
+
+
+def cones(guide, cars=6, seed=0):
+    env = ConeTrackEnv(shipped_tracks("test"), cars, rate=6, seed=seed)
+    return TransformedEnv(env, Compose(GuideActions({"theirs": guide}))).train()
+
+
+def driven(env, steps=80):
+    torch.manual_seed(1)
+    rollout = env.rollout(steps, break_when_any_done=False)
+    assert rollout["next", "done"].sum() > 3, (
+        "random driving should have crashed, so that resets are covered"
+    )
+    return rollout, rollout["guide_action"][:, :, 0]
+
+
+def steps_of_episode(rollout):
+    """Number of each step in its episode, from 1, [B, T]."""
+    done, number = rollout["next", "done"].squeeze(-1), torch.zeros(len(rollout), dtype=torch.long)
+    numbers = []
+    for step in range(rollout.shape[1]):
+        number = number + 1
+        numbers.append(number)
+        number = torch.where(done[:, step], 0, number)
+    return torch.stack(numbers, 1)
+
+
+def test_class_of_guides_is_the_guide():
+    rollout, advice = driven(cones(ControllerGuide("my_control:Guide", options={"gain": 0.5})))
+    assert torch.equal(advice, rollout["steering"] / 2)
+
+
+def test_network_and_function_act_on_the_batch():
+    guide = ControllerGuide("my_control:Net")
+    rollout, advice = driven(cones(guide))
+    with torch.no_grad():
+        torch.testing.assert_close(advice, guide.guide.module(rollout["observation"]))
+    rollout, advice = driven(
+        cones(ControllerGuide("my_control:half", ["steering"], {"gain": 0.25}))
+    )
+    assert torch.equal(advice, rollout["steering"] / 4)
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_network_that_is_an_object_is_copied(wrapped):
+    network = torch.nn.Linear(2, 1)
+    module = TensorDictModule(network, ["observation"], ["action"]) if wrapped else network
+    guide, ones = ControllerGuide(module), torch.ones(1, 2)
+    action = guide(TensorDict({"observation": ones}, [1]))["action"]
+    torch.testing.assert_close(action, network(ones))
+    before = network.weight.clone()
+    with torch.no_grad():
+        for parameter in guide.parameters():
+            parameter.add_(1.0)
+    assert torch.equal(network.weight, before)
+
+
+def test_python_objects_are_one_a_row_and_reset_with_their_episodes():
+    rollout, advice = driven(cones(ControllerGuide("my_control:Counter", options={"step": 0.001})))
+    torch.testing.assert_close(advice.squeeze(-1), 0.001 * steps_of_episode(rollout))
+
+
+class Static:
+    @staticmethod
+    def act(observation):
+        return -0.5
+
+
+class OfClass:
+    gain = 0.25
+
+    @classmethod
+    def act(cls, observation):
+        return cls.gain
+
+
+class Plain:
+    def __init__(self, gain, sign=1):
+        self.gain, self.sign = gain, sign
+
+    def act(self, observation):
+        return self.sign * self.gain
+
+
+@pytest.mark.parametrize(
+    ("of", "options", "action"),
+    [
+        (Static, {}, -0.5),
+        (Static(), {}, -0.5),
+        (OfClass, {}, 0.25),
+        (OfClass(), {}, 0.25),
+        (partial(Plain, 0.125), {}, 0.125),
+        (partial(Plain, gain=0.125), {"sign": -1}, -0.125),
+        (partial(partial(Plain, sign=-1), 0.125), {}, -0.125),
+        (partial(lambda observation, gain: gain, gain=0.125), {}, 0.125),
+    ],
+)
+def test_class_and_object_act_however_their_act_is_defined(of, options, action):
+    guide = ControllerGuide(of, options=options)
+    assert cones(guide).reset()["guide_action"].unique().tolist() == [action]
+
+
+def test_partial_of_a_class_with_a_wrong_argument_is_refused():
+    with pytest.raises(ValueError, match=r"^Plain takes \(gain, .*\(gian=\): .* mean gain"):
+        ControllerGuide(partial(Plain), options={"gian": 1})
+
+
+def test_object_without_reset_is_made_anew_for_each_episode():
+    class Forgetful:
+        count = 0
+
+        def act(self, observation, steering):
+            observation[:], self.count = 9.0, self.count + 1
+            return np.float32(self.count / 1000)
+
+    rollout, advice = driven(cones(PerRow(Forgetful, ["observation", "steering"])))
+    torch.testing.assert_close(advice.squeeze(-1), 0.001 * steps_of_episode(rollout))
+    assert (rollout["observation"] < 9).all(), (
+        "what a controller does with its array should not change the data"
+    )
+
+
+def test_states_of_the_objects_are_in_the_checkpoint():
+    def rollout(seed):
+        policy = TensorDictModule(lambda x: torch.tanh(x[:, :1]), ["observation"], ["action"])
+        return Rollout(cones(ControllerGuide("my_control:Counter"), seed=seed), policy, 8)
+
+    expected, resumed = continued(rollout)
+    assert (expected == resumed).all()
+    assert expected["guide_action"][:, 0].max() > 0.02, "episodes should go on"
+
+
+class Stateless:
+    def act(self, observation):
+        return 0.0
+
+
+def test_state_that_a_checkpoint_cannot_hold_is_refused():
+    class Stateful(Stateless):
+        def state_dict(self):
+            return {"x": np.zeros(2)}
+
+        def load_state_dict(self, state):
+            pass
+
+    env = cones(PerRow(Stateful), cars=2)
+    env.rollout(2)
+    with pytest.raises(
+        ValueError,
+        match=r"state_dict\(\) of the controller Stateful may hold numbers, .*; convert NumPy",
+    ):
+        env.state_dict()
+
+
+def test_new_episodes_begin_if_a_controller_cannot_save_its_state():
+    guide = PerRow(Stateless)
+    env = cones(guide, cars=2)
+    env.rollout(2)
+    with pytest.warns(UserWarning, match="the controller Stateless has no state_dict"):
+        env.load_state_dict(env.state_dict())
+    assert not guide.continues
+
+
+@pytest.mark.parametrize(
+    ("of", "options", "message"),
+    [
+        ("my_control", {}, "of=my_control must be MODULE:NAME, such as my_package.control:MyPID"),
+        (
+            "my_contrl:Net",
+            {},
+            "there is no module my_contrl; install its package, or add its folder to PYTHONPATH",
+        ),
+        ("my_needy:Net", {}, "my_needy needs no_such_package, which is missing; install it"),
+        (
+            "my_broken:Net",
+            {},
+            r"my_broken cannot be imported \(ZeroDivisionError: division by zero\)",
+        ),
+        ("my_control:Conter", {}, "my_control has no Conter; did you mean Counter"),
+        ("my_control:number", {}, "my_control:number is int; name a class, a function, an object"),
+        (
+            "my_control:Other",
+            {},
+            r"is a class without act\(observation\); give it this method, or name a function",
+        ),
+        (
+            "my_control:Counter",
+            {"stpe": 1},
+            r"takes \(step=0.01\), but is called with \(stpe=\): .* mean step",
+        ),
+        (
+            "my_control:half",
+            {"k": 1},
+            r"takes \(observation, gain=0.5\), but is called with \(observation, k=\)",
+        ),
+        (
+            "my_control:Guide",
+            {"k": 1},
+            r"my_control:Guide takes \(gain=1.0\), but is called with \(k=\)",
+        ),
+    ],
+)
+def test_controller_that_cannot_be_used_is_refused_in_one_sentence(of, options, message):
+    with pytest.raises(ValueError, match=message) as error:
+        ControllerGuide(of, options=options)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("of", "message"),
+    [
+        (
+            "my_control:Counter",
+            r"my_control:Counter.act takes \(self, observation\), but is called with \(a, b\)",
+        ),
+        (
+            "my_control:Guide",
+            r"of=my_control:Guide has its own in_keys=\['steering'\]; leave in_keys out",
+        ),
+    ],
+)
+def test_entries_that_a_controller_does_not_take_are_refused(of, message):
+    with pytest.raises(ValueError, match=message):
+        ControllerGuide(of, ["a", "b"])
+
+
+class Matrix(gymnasium.Env):
+    """Its action is a matrix, and its reward the sum of the first row."""
+
+    action_space = spaces.Box(-1, 1, (2, 3), np.float64)
+    observation_space = spaces.Box(-1, 1, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2), {}
+
+    def step(self, action):
+        return np.zeros(2), action[0].sum(), False, False, {}
+
+
+class GivesMatrix:
+    def __init__(self, shape=(2, 3)):
+        self.shape = shape
+
+    def act(self, observation):
+        return np.arange(6.0).reshape(self.shape) / 10
+
+
+def test_matrix_of_a_controller_is_the_matrix_that_the_env_gets():
+    env = TransformedEnv(GymnasiumEnv(Matrix, 2), GuideActions({"theirs": PerRow(GivesMatrix)}))
+    data = env.reset()
+    assert data["guide_action"].shape == (2, 1, 6)
+    for guide in (0, [0, 0]):
+        stepped = env.step(FollowAdvice(env, guide)(data.clone()))
+        assert stepped["next", "reward"].flatten().tolist() == pytest.approx([0.3, 0.3])
+    other = PerRow(partial(GivesMatrix, (3, 2)))
+    env = TransformedEnv(GymnasiumEnv(Matrix, 2), GuideActions({"theirs": other}))
+    with pytest.raises(ForeignError, match=r"has the shape \[3, 2\], but must have \[2, 3\]"):
+        env.reset()
+
+
+class Shelf(gymnasium.Env):
+    """Choices to observe, numbered as the env numbers them."""
+
+    action_space = spaces.Box(-9.0, 9.0, (2,))
+
+    def __init__(self, observation_space):
+        self.observation_space = observation_space
+        self.seen = []  # what it returned
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observe(), {}
+
+    def step(self, action):
+        return self.observe(), 0.0, False, False, {}
+
+    def observe(self):
+        self.seen.append(self.observation_space.sample())
+        return self.seen[-1]
+
+
+def first_two(numbers):
+    """Return two of the numbers of an observation, as an action."""
+    return np.resize(np.ravel(numbers), 2)
+
+
+class Reader:
+    def act(self, observation):
+        assert isinstance(observation, (np.ndarray, np.int64))
+        return first_two(observation)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Discrete(5, start=-2),
+        spaces.MultiDiscrete([7, 4], start=[-3, 1]),
+        spaces.MultiDiscrete([[3, 2], [2, 4]]),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize(
+    "controller",
+    [Reader, Reader(), first_two, lambda batch: batch.view(len(batch), -1)[:, [0, -1]]],
+    ids=["class", "object", "function", "batch"],
+)
+def test_controller_reads_choices_as_the_env_numbers_them(space, controller):
+    made = []
+
+    def make():
+        made.append(Shelf(space))
+        return made[-1]
+
+    env = GymnasiumEnv(make, num_envs=1)
+    advised = TransformedEnv(env, GuideActions({"reader": ControllerGuide(controller)}))
+    advice = advised.rollout(5)["guide_action"].reshape(-1, 2)
+    batched = not isinstance(controller, (type, Reader)) and controller is not first_two
+    seen = [np.ravel(each) for each in made[0].seen[-6:-1]]
+    expected = [each[[0, -1]] if batched else first_two(each) for each in seen]
+    assert np.array_equal(advice.numpy(), np.array(expected, np.float32))
+
+
+def test_network_reads_choices_as_one_hot_vectors():
+    env = GymnasiumEnv(partial(Shelf, spaces.MultiDiscrete([2, 3])), num_envs=2)
+    advised = TransformedEnv(env, GuideActions({"net": ControllerGuide(torch.nn.Linear(5, 2))}))
+    data = advised.rollout(3)
+    assert torch.equal(data["observation"].sum(-1), torch.full((2, 3), 2.0))
+
+
+STEPS = 5
+
+
+def advised(guide, id="Pendulum-v1", rows=2, **arguments):
+    """Return the steps of an env with advice of a guide."""
+    env = TransformedEnv(GymnasiumEnv(id, rows, **arguments), GuideActions({"theirs": guide}))
+    return env.rollout(STEPS, break_when_any_done=False)
+
+
+class Squeezed(nn.Module):
+    def forward(self, observation):
+        return 2.0 * observation[..., 0]
+
+
+def predictor(targets):
+    x = np.eye(3)
+    return LinearRegression(fit_intercept=False).fit(x, 2.0 * x[:, :1].repeat(targets, 1)).predict
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [
+        LinearRegression(fit_intercept=False).fit(np.eye(3), [2.0, 0.0, 0.0]).predict,  # gives [B]
+        predictor(1),  # gives [B, 1]
+        Squeezed(),
+        lambda x: 2.0 * x[..., 0],
+    ],
+)
+def test_one_number_for_each_row_is_an_action_of_one_number(controller):
+    data = advised(ControllerGuide(controller), "Pendulum-v1")
+    expected = (2.0 * data["observation"][..., :1]).clamp(-2.0, 2.0)
+    torch.testing.assert_close(data["guide_action"][..., 0, :], expected)
+
+
+def test_numbers_that_are_not_one_for_each_row_are_refused():
+    for controller in (predictor(2), predictor(3)):
+        with pytest.raises(ForeignError, match="but must have"):
+            advised(ControllerGuide(controller), "Pendulum-v1")
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        lambda x: -x[0],  # of two entries that are 0 at first
+        lambda x: (x - x.mean())[..., :1],
+        lambda x: (x / max(1.0, float(abs(x).max())))[..., :1],
+    ],
+    ids=["first entry", "less the mean", "scaled by the largest"],
+)
+def test_function_of_one_observation_does_not_mix_the_rows(action):
+    guide = ControllerGuide(action)
+    guide(TensorDict({"observation": torch.zeros(1, 2)}, [1]))
+    observations = torch.tensor([[1.0, 2.0], [40.0, -70.0]])
+    found = guide(TensorDict({"observation": observations}, [2]))["action"].flatten()
+    torch.testing.assert_close(found, torch.tensor([float(action(each)) for each in observations]))
+
+
+@pytest.mark.parametrize(
+    ("id", "action", "for_batch"),
+    [
+        ("Pendulum-v1", lambda x: -x[..., 0], False),
+        ("Pendulum-v1", lambda x: 1 * (x[..., 0] > 0), False),
+        ("Pendulum-v1", lambda x: -x[..., :1], True),
+        ("CartPole-v1", lambda x: 1 * (x[..., 2] > 0), True),
+        ("CartPole-v1", lambda x: 1.0 * (x[..., 2] > 0), True),
+    ],
+)
+def test_function_is_for_a_batch_only_if_its_answer_has_the_form_of_actions(id, action, for_batch):
+    guide = ControllerGuide(action)
+    rollout = advised(guide, id)
+    assert guide.guide.for_batch is for_batch
+    found = rollout["guide_action"][:, :, 0]
+    found = found[..., 1] if id == "CartPole-v1" else found[..., 0]
+    expected = action(rollout["observation"]).reshape(found.shape)
+    torch.testing.assert_close(found, expected.to(found.dtype))
+
+
+def test_function_that_remembers_is_refused():
+    calls = itertools.count()
+    for action in (lambda x: float(next(calls)), lambda x: x[:, :1] * 0 + next(calls)):
+        with pytest.raises(ForeignError, match=r"for the same observation: .* a class"):
+            advised(ControllerGuide(action))
+
+
+class Model:
+    """As a model of Stable-Baselines3 with a memory: its action is the number of the call."""
+
+    observation_space = spaces.Box(-10, 10, (3,), np.float32)
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        assert observation.shape == (3,)
+        assert deterministic
+        count = np.zeros(1) if state is None or episode_start[0] else state[0]
+        return np.float32(count / 10), (count + 1,)
+
+
+def test_model_of_another_library_is_a_controller():
+    advice = advised(ControllerGuide(Model()), max_steps=4)["guide_action"]
+    torch.testing.assert_close(advice[..., 0, 0], torch.tensor([[0, 0.1, 0.2, 0.3, 0]] * 2))
+    assert (advised(ControllerGuide(Model), max_steps=4)["guide_action"] == advice).all()
+
+
+def test_memory_of_a_model_is_in_the_checkpoint():
+    def rollout(seed):
+        env = GymnasiumEnv("Pendulum-v1", 2, seed=seed, max_steps=7)
+        env = TransformedEnv(env, GuideActions({"model": ControllerGuide(Model())}))
+        return Rollout(env, PPO(env, ["observation", "guide_action"]).policy, 5)
+
+    expected, resumed = continued(rollout)
+    torch.testing.assert_close(expected["guide_action"], resumed["guide_action"])
+    assert expected["guide_action"].max() > 0.5
+
+
+def test_model_gets_choices_and_dictionaries_as_its_spaces_have_them():
+    seen = []
+
+    class Reads:
+        observation_space = spaces.Dict(
+            {"place": spaces.Discrete(4, start=2), "pair": spaces.MultiDiscrete([2, 3])}
+        )
+
+        def predict(self, observation, deterministic=True):
+            seen.append(observation)
+            return 0, None
+
+    class Grid(gymnasium.Env):
+        observation_space = Reads.observation_space
+        action_space = spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return {"place": 4, "pair": np.array([1, 2])}, {}
+
+        def step(self, action):
+            return {"place": 5, "pair": np.array([0, 1])}, 0.0, False, False, {}
+
+    advised(ControllerGuide(Reads()), lambda: Grid(), 1)
+    assert seen[0]["place"] == 4
+    assert seen[0]["pair"].tolist() == [1, 2]
+    assert seen[1]["place"] == 5
+
+
+def test_object_with_a_predict_of_another_kind_is_refused():
+    class Regressor:
+        def predict(self, x):
+            return x
+
+    with pytest.raises(ValueError, match=r"or a model with predict\(observation, deterministic=T"):
+        ControllerGuide(Regressor())
+    with pytest.raises(ValueError, match="is an object, which takes no options"):
+        ControllerGuide(Model(), options={"gain": 1})
+
+
+def test_saved_model_of_stable_baselines3_is_a_guide(tmp_path):
+    """Its advice is what the library itself computes."""
+    sb3 = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+    for algorithm, id in ((sb3.PPO, "CartPole-v1"), (sb3.SAC, "Pendulum-v1")):
+        algorithm("MlpPolicy", id, seed=0, device="cpu").save(tmp_path / "model")
+        model = algorithm.load(tmp_path / "model", device="cpu")
+        rollout = advised(ControllerGuide(model), id)
+        observations = rollout["observation"].reshape(-1, rollout["observation"].shape[-1])
+        expected, _ = model.predict(observations.numpy(), deterministic=True)
+        advice = rollout["guide_action"].reshape(len(observations), -1)
+        if id == "CartPole-v1":
+            assert advice.argmax(-1).tolist() == expected.tolist()
+        else:
+            np.testing.assert_allclose(advice.numpy(), expected, atol=1e-5)
+
+
+class Recurrent:
+    """As a model of Stable-Baselines3, recurrent; it knows its batches of rows by their calls."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        count = np.zeros(1) if state is None or episode_start[0] else state[0]
+        assert deterministic
+        return np.float32(observation[:1] * 0 + count), (count + 1,)
+
+
+def test_model_with_predict_is_a_controller_beside_its_env():
+    env = GymnasiumEnv("Pendulum-v1", 2, max_steps=4, controllers={"model": Recurrent()})
+    advice = env.rollout(6, break_when_any_done=False)["controller", "model"]
+    assert advice[..., 0].tolist() == [[0, 1, 2, 3, 0, 1]] * 2
+
+
+def test_predictor_hands_the_state_on():
+    controller = Predictor(Recurrent())
+    for _ in range(2):
+        controller.reset()
+        assert [controller.act(np.zeros(2)).item() for _ in range(3)] == [0, 1, 2]
+
+
+def test_only_models_with_deterministic_predict():
+    class Regressor:
+        def predict(self, x):
+            return x
+
+    class Both(Recurrent):
+        def act(self, x):
+            return x
+
+    assert [predicts(each) for each in (Recurrent(), Recurrent, Regressor(), Both(), 3)] == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]

@@ -1,0 +1,107 @@
+"""Actions from a file, and from an entry of the env."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, TransformedEnv
+
+from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.guides import EntryGuide, RecordedGuide
+from coil_rl.transforms import GuideActions
+
+
+def cones(guide, cars=6, seed=0):
+    env = ConeTrackEnv(shipped_tracks("test"), cars, rate=6, seed=seed)
+    return TransformedEnv(env, Compose(GuideActions({"theirs": guide}))).train()
+
+
+def driven(env, steps=80):
+    torch.manual_seed(1)
+    rollout = env.rollout(steps, break_when_any_done=False)
+    assert rollout["next", "done"].sum() > 3, (
+        "random driving should have crashed, so that resets are covered"
+    )
+    return rollout, rollout["guide_action"][:, :, 0]
+
+
+def steps_of_episode(rollout):
+    """Number of each step in its episode, from 1, [B, T]."""
+    done, number = rollout["next", "done"].squeeze(-1), torch.zeros(len(rollout), dtype=torch.long)
+    numbers = []
+    for step in range(rollout.shape[1]):
+        number = number + 1
+        numbers.append(number)
+        number = torch.where(done[:, step], 0, number)
+    return torch.stack(numbers, 1)
+
+
+def test_entry_of_the_env_is_advice():
+    guide = EntryGuide(["controller", "theirs"])
+    data = TensorDict({"controller": {"theirs": torch.rand(3, 2)}}, [3])
+    assert torch.equal(guide(data)["action"], data["controller", "theirs"])
+    assert guide.sees == "env"
+    rollout, advice = driven(cones(EntryGuide("steering")))
+    assert torch.equal(advice, rollout["steering"])
+
+
+@pytest.mark.parametrize("header", ["", "steering\n"])
+def test_recording_begins_with_each_episode_and_holds_its_last_action(header, tmp_path):
+    file = tmp_path / "actions.csv"
+    file.write_text(header + "".join(f"{step / 100:e}\n" for step in range(10)))
+    rollout, advice = driven(cones(RecordedGuide(file)))
+    expected = (steps_of_episode(rollout) - 1).clamp(max=9) / 100
+    torch.testing.assert_close(advice.squeeze(-1), expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "actions.csv cannot be read as numbers"),
+        (
+            "0.1\nleft\n",
+            r"actions.csv cannot be read as numbers with commas \(could not convert string to "
+            "float: 'left'",
+        ),
+        ("", "must hold at least one line of finite numbers"),
+        ("a,b\n", "must hold at least one line of finite numbers"),
+        ("0.1\n0.1,0.2\n", r"cannot be read as numbers with commas \(its lines have 1 and 2"),
+        ("nan\n0.1\n", "must hold at least one line of finite numbers"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_file_without_actions_is_refused(text, message, tmp_path):
+    file = tmp_path / "actions.csv"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        RecordedGuide(file)
+
+
+@pytest.mark.parametrize(
+    ("text", "actions"),
+    [
+        ("\ufeff0.1\n0.2\n", [[0.1], [0.2]]),
+        ("\ufeffpower\n0.1\n", [[0.1]]),
+        ("\u22120.1,\u20130.2\n", [[-0.1, -0.2]]),
+        ("# of Tuesday\n0.1,0.2 # the first\n\n# end\n", [[0.1, 0.2]]),
+        ("0.1;0.2\n", [[0.1, 0.2]]),
+        ("a;b\n0,1;-0,2\n", [[0.1, -0.2]]),
+        ("0.1 0.2\n0.3\t0.4\n", [[0.1, 0.2], [0.3, 0.4]]),
+        ('"0.1" , "0.2"\r\n', [[0.1, 0.2]]),
+        ("1e-1\n", [[0.1]]),
+    ],
+)
+def test_actions_of_a_file_in_another_dress(text, actions, tmp_path):
+    file = tmp_path / "actions.csv"
+    file.write_bytes(text.encode())
+    torch.testing.assert_close(RecordedGuide(file).actions, torch.tensor(actions))
+
+
+@pytest.mark.parametrize(
+    "text", ["0.1,0.2\n0.1;0.2;0.3\n", "a,0.1\n0.1,0.2\n", "0.1,,0.2\n", "\x00"]
+)
+def test_file_that_is_no_table_of_numbers_is_refused(text, tmp_path):
+    file = tmp_path / "actions.csv"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=r"actions.csv (cannot be read|must hold)"):
+        RecordedGuide(file)
