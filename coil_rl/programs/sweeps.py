@@ -1,9 +1,13 @@
-"""What a sweep is going to do: its runs, their frames and time, and the words that they read."""
+"""Sweeps: what they are going to do, and how a job that fails leaves the others alone."""
 
 import contextlib
-import statistics
-import time
-from collections.abc import Iterator, Mapping, Sequence
+import math
+import shlex
+import shutil
+import sys
+import traceback
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -17,20 +21,17 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from coil_rl.config.sentences import is_no_bug, refuse, sentence
 from coil_rl.config.written import Job, keep_written
-from coil_rl.errors import UserError
+from coil_rl.errors import RunningError, UserError
+from coil_rl.files import FAILED_JOBS
 from coil_rl.output import say
-from coil_rl.programs.app import refuse
-
-TIMED = 5.0  # s of training, at least, from which the time of a sweep is estimated
-UPDATES = 8  # at least
-BASIC = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"  # one job after the other
-_frames: list[int] = []  # of each run of the sweep of this program
-_said: list[str] = []  # folders of the sweeps whose time was estimated
 
 
 class Plan(Callback):
-    """Say before a sweep how many runs it has, or refuse it in an env that it is not made for.
+    """Say before a sweep what it is going to do, and after it which of its jobs failed.
+
+    A sweep, or a run, is refused in an env that its experiment is not made for.
 
     Args:
         only_in: classes of envs, one of which the env of the sweep must be; empty for any env.
@@ -48,20 +49,36 @@ class Plan(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Refuse what the runs cannot use, and say how many there are and what some do not read."""
-        _frames.clear()
-        _said.clear()
-        if "existing" not in config:  # the jobs are no runs
+        if "existing" in config:  # the jobs are runs, which go on where they were stopped
+            self._check(config)
+            runs: list[Job] = []
+            # Hydra raises the errors of the composition next.
+            with contextlib.suppress(HydraException, OmegaConfBaseException, UserError):
+                runs.extend(_planned(config))
+            if len(runs) > 1:
+                say(described(list(map(_frames_of, runs))), error=True)
+            if runs:
+                _check_words(config, runs)
+            command = command_of(sys.argv, config.hydra.sweep.dir)
+            say(f"if this sweep is stopped, go on with: {command}", error=True)
+        Path(config.hydra.sweep.dir, FAILED_JOBS).unlink(missing_ok=True)
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """End the program with exit code 2 if jobs have failed."""
+        folder = Path(config.hydra.sweep.dir)
+        if not (folder / FAILED_JOBS).is_file():
             return
-        self._check(config)
-        runs: list[Job] = []
-        # Hydra raises the errors of the composition next.
-        with contextlib.suppress(HydraException, OmegaConfBaseException, UserError):
-            runs.extend(_planned(config))
-        _frames.extend(map(_frames_of, runs))
-        if len(_frames) > 1:
-            say(described(_frames), error=True)
-        if runs:
-            _check_words(config, runs)
+        # Several programs may do the same sweep, and a job fails in each of them.
+        lines = dict.fromkeys((folder / FAILED_JOBS).read_text(encoding="utf-8").splitlines())
+        remove_unused(folder)
+        count = "1 job" if len(lines) == 1 else f"{len(lines)} jobs"
+        refuse(
+            str(config.hydra.job.name),
+            UserError(
+                f"{count} of this sweep failed: {_by_reason(list(lines))}; correct the cause, and "
+                f"do what is missing by {command_of(sys.argv, str(folder))}"
+            ),
+        )
 
     def _check(self, config: DictConfig) -> None:
         target = OmegaConf.select(config, "env._target_", throw_on_missing=False)
@@ -161,8 +178,8 @@ def _check_words(config: DictConfig, runs: Sequence[Job]) -> None:
         sentences = check_sweep(_words(config), different)
     except UserError as error:
         refuse(str(config.hydra.job.name), error)
-    for sentence in sentences:
-        say(sentence, error=True)
+    for said in sentences:
+        say(said, error=True)
 
 
 def _plain(config: DictConfig, kind: str) -> list[str]:
@@ -171,85 +188,97 @@ def _plain(config: DictConfig, kind: str) -> list[str]:
     return list(texts)
 
 
-class Pace:
-    """Estimates the time of a sweep by the first seconds of a training; a callback of a run.
+def remove_unused(folder: Path) -> None:
+    """Remove the folder of a sweep none of whose jobs has begun.
 
     Args:
-        frames: of each update.
+        folder: of the sweep.
+    """
+    of_sweep = ("multirun.yaml", FAILED_JOBS)
+    if all(path.is_dir() or path.name in of_sweep for path in folder.rglob("*")):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def is_sweep() -> bool:
+    """Return whether this is a job of a sweep."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+class Jobs:
+    """The jobs of a sweep, which may run in other processes.
+
+    One that fails leaves the others alone.
+
+    A job that fails writes a line into a file in the folder of the sweep.
+
+    Args:
+        name: of the program.
     """
 
-    names: Sequence[str] = ()
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.arguments = list(sys.argv)  # those of a process of its own are others
 
-    def __init__(self, frames: int) -> None:
-        self.frames = frames
-        self.last: float | None = None  # time of the last update
-        self.seconds: list[float] = []  # of each update
+    @property
+    def command(self) -> str:
+        """The command that continues the sweep, as a shell reads it."""
+        return command_of(self.arguments, HydraConfig.get().sweep.dir)
 
-    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
-        """Return whether the time of this sweep was not estimated yet."""
-        return not _said
+    def fail(self, error: Exception) -> float:
+        """Note that a job failed, and return NaN, its result.
 
-    def after_update(self, update: int) -> dict[str, float]:
-        """Estimate the time as soon as a few seconds and updates of training are over.
+        A job whose run another process is working on has not failed: it is left to that process,
+        so that several programs can share a sweep.
 
         Args:
-            update: number of updates so far.
+            error: a mistake of the user, or a bug, whose traceback is printed.
         """
-        now = time.monotonic()
-        if self.last is not None:
-            self.seconds.append(now - self.last)
-        self.last = now
-        if sum(self.seconds) >= TIMED and len(self.seconds) >= UPDATES:
-            # The first updates may take much longer: machine code is made in them.
-            a_frame = statistics.median(self.seconds) / self.frames
-            _said.append(HydraConfig.get().sweep.dir)
-            say(f"\n{estimated(a_frame, _frames)}", error=True)
-        return {}
+        hydra_config = HydraConfig.get()
+        job = f"job {hydra_config.job.num} ({' '.join(hydra_config.overrides.task)})"
+        if isinstance(error, RunningError):
+            say(f"{self.name}: {job} is left to the process that works on it", error=True)
+            return math.nan
+        reason = sentence(error)
+        if not is_no_bug(error):
+            traceback.print_exception(error)
+            reason = f"{type(error).__name__}: {reason}"
+        line = f"{job}: {reason}"
+        say(f"{self.name}: {line}; the other jobs go on", error=True)
+        with contextlib.suppress(OSError):  # it is empty
+            Path(hydra_config.runtime.output_dir).rmdir()
+        path = Path(hydra_config.sweep.dir, FAILED_JOBS)
+        # Another program of the same sweep, all of whose jobs failed, may have removed the folder.
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:
+            file.write(f"{line}\n")
+        return math.nan
 
 
-def pace(config: DictConfig) -> Pace | None:
-    """Return the callback that estimates the time of a sweep, for the jobs that may say it.
-
-    Where jobs run side by side, that is the first one.
-    """
-    if not HydraConfig.initialized():
-        return None
-    hydra_config = HydraConfig.get()
-    if hydra_config.mode != RunMode.MULTIRUN:
-        return None
-    alone = hydra_config.launcher.get("_target_") == BASIC
-    if not alone and hydra_config.job.num != 0:
-        return None
-    return Pace(config.budget.num_envs * config.budget.steps)
-
-
-def estimated(a_frame: float, frames: Sequence[int]) -> str:
-    """Return how long a sweep takes at the pace of its first run.
+def _by_reason(lines: Sequence[str]) -> str:
+    """Return the lines of failed jobs in one, each reason once.
 
     Args:
-        a_frame: seconds of training for a frame.
-        frames: of each run; empty if unknown, as in a process that does a part of the jobs.
+        lines: such as "job 0 (method=ppo seed=0): the env ...".
     """
-    if not frames:
-        return (
-            f"at this pace 100,000 frames of training take about {duration(a_frame * 100_000)}, "
-            "and the evaluations come on top"
-        )
-    return (
-        f"at this pace the training of all {len(frames)} runs takes about "
-        f"{duration(a_frame * sum(frames))}, one after the other; other methods have another pace, "
-        "and the evaluations come on top"
-    )
+    jobs: dict[str, list[str]] = {}
+    for line in lines:
+        job, _, reason = line.partition("): ")
+        jobs.setdefault(reason, []).append(f"{job})")
+    parts = []
+    for reason, failed in jobs.items():
+        numbers = ", ".join(job.split()[1] for job in failed)
+        parts.append(f"{failed[0]}: {reason}" if len(failed) == 1 else f"jobs {numbers}: {reason}")
+    return "; ".join(parts)
 
 
-def duration(seconds: float) -> str:
-    """Return a duration in words, rounded: 40 s, 12 min, 3.5 h.
+def command_of(arguments: Sequence[str], folder: str) -> str:
+    """Return the command that continues a sweep, as a shell reads it.
 
     Args:
-        seconds: the duration.
+        arguments: of the program that began it, its own path first.
+        folder: of the sweep.
     """
-    if seconds < 90:
-        return f"{max(seconds, 1):.0f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"
+    program, *others = arguments
+    if not any(argument.startswith("hydra.sweep.dir=") for argument in others):
+        others.append(f"hydra.sweep.dir={folder}")
+    return shlex.join([f"coil-{Path(program).stem.removeprefix('coil-')}", *others])
