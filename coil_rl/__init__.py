@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from coil_rl.guides import PerRow as PerRow
     from coil_rl.guides import RandomGuide as RandomGuide
     from coil_rl.guides import RecordedGuide as RecordedGuide
-    from coil_rl.guides import RecordingGuide as RecordingGuide
     from coil_rl.guides import SplineGuide as SplineGuide
     from coil_rl.guides import ZeroGuide as ZeroGuide
     from coil_rl.guides.advice_observation import AdviceObservation as AdviceObservation
@@ -97,7 +96,7 @@ _NAMES = {
     "coil_rl.export": "ExportedGuide ExportedPolicy export_policy",
     "coil_rl.files": "write_text",
     "coil_rl.guides": "ConstantGuide ControllerGuide EntryGuide PerRow RandomGuide RecordedGuide "
-    "RecordingGuide SplineGuide ZeroGuide",
+    "SplineGuide ZeroGuide",
     "coil_rl.config.learned_guide": "LearnedGuide",
     "coil_rl.guides.advice_observation": "AdviceObservation",
     "coil_rl.imitation": "Imitation",

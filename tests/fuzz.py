@@ -128,7 +128,7 @@ OF_RECORDINGS = [
     "reproduce table=6 budget=smoke results.table_6.recordings=[drive.mcap]",
 ]
 CLASSIFIER = (
-    "env.perception.classifier._target_=coil_rl.robot.classifier.load_classifier"
+    "env.perception.classifier._target_=coil_robot.load_classifier"
     " +env.perception.classifier.path=cones.json"
 )
 OF_CLASSIFIER = [

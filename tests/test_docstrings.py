@@ -25,10 +25,11 @@ from programs import CONF, ROOT
 
 import coil_paper
 import coil_rl
+import coil_robot
 
 MODULES = [
     module.name
-    for package in (coil_rl, coil_paper)
+    for package in (coil_rl, coil_paper, coil_robot)
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
     if ">>>" in (importlib.util.find_spec(module.name).loader.get_source(module.name) or "")
 ]

@@ -1,23 +1,22 @@
 """Validation of YAML nodes against the signatures of the classes and functions that they call."""
 
 import inspect
-import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Number
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin
 
 import numpy as np
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ValidationError
 from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
 
 from coil_rl.config.hints import similar
 from coil_rl.errors import UserError
+from coil_rl.ranges import adapter, settings_of, validation_message
 
 PLAIN = (bool, int, float, str, NoneType)
 HOLDERS = (np.ndarray, tuple, list, Sequence)  # of numbers, in annotations
-STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
 def check_arguments(
@@ -122,7 +121,7 @@ def _check_type(value: Any, annotation: Any, name: str) -> None:
     if annotation is inspect.Parameter.empty or isinstance(annotation, str):
         return
     try:
-        adapter: TypeAdapter[Any] = TypeAdapter(annotation, config=STRICT)
+        allowed = adapter(annotation)
     except (PydanticUserError, SchemaError):  # an annotation that cannot be checked
         return
     if (known := _known(value, list)) is _TARGET:
@@ -130,10 +129,10 @@ def _check_type(value: Any, annotation: Any, name: str) -> None:
             raise UserError(f"{name} must be a plain value, not a node with _target_")
         return
     try:
-        adapter.validate_python(known)
+        allowed.validate_python(known)
     except ValidationError as error:
         try:  # strict pydantic accepts no list for a tuple, and YAML has no tuples
-            adapter.validate_python(_known(value, tuple))
+            allowed.validate_python(_known(value, tuple))
         except ValidationError:
             raise UserError(validation_message(error, known, name)) from None
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
@@ -162,44 +161,6 @@ def _known(value: Any, sequence: type[list[Any]] | type[tuple[Any, ...]]) -> Any
     return value
 
 
-def validation_message(error: ValidationError, value: Any, name: str = "") -> str:
-    """Return `KEY=VALUE must be ...` for the most deeply nested error in a value.
-
-    `name` is the key of the value.
-    """
-    details = [(_path(detail["loc"], value), detail) for detail in error.errors(include_url=False)]
-    path = max((path for path, _ in details), key=len)
-    expected = []
-    for other, detail in details:
-        is_list = (
-            detail["type"] == "sequence_str" or detail.get("ctx", {}).get("class") == "Sequence"
-        )
-        if other == path:
-            expected.append("a list" if is_list else detail["msg"].removeprefix("Input should be "))
-    for part in path:
-        name = f"{name}[{part}]" if isinstance(part, int) else f"{name}.{part}".lstrip(".")
-        value = value[part]
-    return f"{name}={yaml_text(value)} must be {' or '.join(dict.fromkeys(expected))}"
-
-
-def yaml_text(value: Any) -> str:
-    """Return a short text of a value as in YAML."""
-    if value is None or isinstance(value, bool):
-        return "null" if value is None else str(value).lower()
-    return textwrap.shorten(repr(value), 100, placeholder=" ...")
-
-
-def _path(location: Iterable[int | str], value: Any) -> tuple[int | str, ...]:
-    """Drop pydantic's tags of union members from the location of an error."""
-    path: list[int | str] = []
-    for part in location:
-        is_index = isinstance(value, (list, tuple)) and isinstance(part, int) and part < len(value)
-        if is_index or (isinstance(value, Mapping) and part in value):
-            path.append(part)
-            value = value[part]
-    return tuple(path)
-
-
 def _parameters(target: Callable[..., Any]) -> list[inspect.Parameter] | None:
     """Return the parameters of a target.
 
@@ -223,8 +184,9 @@ def _parameters(target: Callable[..., Any]) -> list[inspect.Parameter] | None:
     if base is None:
         return own
     names = {parameter.name for parameter in own}
+    settings = [known for p in own if (known := settings_of(p)) is not None]
     return [p for p in own if p.kind is not p.VAR_KEYWORD] + [
-        p for p in base if p.name not in names
+        p for p in base if p.name not in names and all(p.name in known for known in settings)
     ]
 
 

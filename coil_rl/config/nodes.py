@@ -11,8 +11,9 @@ import hydra.utils
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from torchrl.envs import Transform
 
-from coil_rl.config.arguments import check_arguments, converted, yaml_text
+from coil_rl.config.arguments import check_arguments, converted
 from coil_rl.errors import UserError
+from coil_rl.ranges import yaml_text
 
 # Largest numbers of arguments of other libraries, by class: memory grows with them, and the
 # libraries do not check them.

@@ -17,11 +17,12 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf, open_dict
 from tensordict.nn import TensorDictModuleBase
 
-from coil_rl.config.arguments import is_foreign, yaml_text
+from coil_rl.config.arguments import is_foreign
 from coil_rl.config.nodes import build, find_target
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.controllers import ControllerGuide, PerRow, load
 from coil_rl.guides import classic
+from coil_rl.ranges import yaml_text
 from coil_rl.run.tuned_run import read_tuned
 from coil_rl.run.tuning import Number
 
@@ -29,7 +30,7 @@ from coil_rl.run.tuning import Number
 OTHERS = ("seed", "size")
 # Words of the annotation of a whole number, or of a list of such, besides int.
 AROUND_INT = frozenset(
-    ["None", "Optional", "Union", "Sequence", "list", "List", "tuple", "Tuple"],
+    ["None", "Annotated", "Optional", "Union", "Sequence", "list", "List", "tuple", "Tuple"],
 ).union(["typing", "collections", "abc"])
 
 
@@ -207,7 +208,8 @@ def _parameters(target: Any) -> Mapping[str, inspect.Parameter]:
 def _is_whole(annotation: Any) -> bool:
     """Return whether an annotation is of whole numbers, such as `int | None` or `list[int]`."""
     text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
-    return {*re.findall(r"\w+", text)} - AROUND_INT == {"int"}
+    words = {*re.findall(r"\w+", re.sub(r"\w+\([^()]*\)", "", text))}  # without ranges
+    return words - AROUND_INT == {"int"}
 
 
 def _is_number(value: Any) -> bool:

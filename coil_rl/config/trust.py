@@ -20,7 +20,6 @@ on the list may read a file that its arguments name, but must not write one.
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import fields
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
@@ -29,7 +28,7 @@ from typing import Any, NamedTuple
 import hydra.utils
 from omegaconf import DictConfig, OmegaConf
 
-from coil_rl.config.schema import TrainConfig
+from coil_rl.config.guest_files import packages
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.run.stopping import remember_trust
 
@@ -243,18 +242,17 @@ def _check_origin(entry: _Entry, package: str) -> None:
 
 @cache
 def _shipped_targets() -> frozenset[str]:
-    """Return all targets that the shipped configuration names in the groups of a run.
+    """Return all targets that the files of coil-rl and of its guests name in their groups.
 
     Loggers are not among them, because what they write and where is up to their arguments.
     """
-    conf = resources.files("coil_rl.conf")
     found: set[str] = set()
-    others = ("cases", "network", "robot", "transform")
-    for name in (*(field.name for field in fields(TrainConfig)), *others):
-        group = conf / name
-        if name == "logger" or not group.is_dir():
-            continue
-        for file in group.iterdir():
-            if ".yaml" in file.name:
-                found |= set(re.findall(r"_target_: ([\w.]+)", file.read_text(encoding="utf-8")))
+    for package in packages():
+        for group in resources.files(package).iterdir():
+            if group.name in ("hydra", "logger") or not group.is_dir():
+                continue
+            for file in group.iterdir():
+                if ".yaml" in file.name:
+                    text = file.read_text(encoding="utf-8")
+                    found |= set(re.findall(r"_target_: ([\w.]+)", text))
     return frozenset(found)

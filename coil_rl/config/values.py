@@ -9,10 +9,10 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from pydantic import TypeAdapter, ValidationError
 
-from coil_rl.config.arguments import validation_message
 from coil_rl.config.hints import similar
 from coil_rl.config.measured import complete_measures
 from coil_rl.errors import UserError
+from coil_rl.ranges import validation_message
 
 LARGEST_BATCH = 2**28  # frames
 

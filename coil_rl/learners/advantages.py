@@ -6,9 +6,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives.value import GAE
 
-from coil_rl.envs.limits import check_range
+from coil_rl.ranges import Share, checked
 
 
+@checked
 class Advantages:
     """Generalised advantage estimation (Schulman et al. 2016) with one critic evaluation per state.
 
@@ -23,8 +24,7 @@ class Advantages:
             rewards to the end of the episode.
     """
 
-    def __init__(self, critic: TensorDictModuleBase, gamma: float, gae_lambda: float) -> None:
-        check_range(0, 1, gamma=gamma, gae_lambda=gae_lambda)
+    def __init__(self, critic: TensorDictModuleBase, gamma: Share, gae_lambda: Share) -> None:
         self.critic = critic
         self.estimate = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, vectorized=False)
 

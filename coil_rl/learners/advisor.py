@@ -11,7 +11,7 @@ mode of pi_aux.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -19,17 +19,15 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
 from coil_rl.learners.advantages import standardise
-from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.encoders import Mlp
-from coil_rl.learners.extension import Extension
 from coil_rl.learners.kickstart import KickstartLoss
-from coil_rl.learners.ppo import PPO
-from coil_rl.schedules import Linear, Schedule
+from coil_rl.learners.ppo import PPO, PPOSettings
+from coil_rl.ranges import NonNegative, checked
 
 
+@checked
 class Advisor(PPO):
     """The ADVISOR learner; errors are those of `PPO`.
 
@@ -38,30 +36,7 @@ class Advisor(PPO):
         in_keys: entries that the policies and the critic observe.
         alpha: the larger, the better a step must be imitated to be learned by imitation.
         guide: index of the guide in the advice.
-        hidden: widths of the hidden layers of all networks, without `network`.
-        network: architecture of the networks, without a memory; None: `Mlp(hidden)`.
-        normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
-            the entries to normalise, see `Normaliser`.
-        scale_rewards: whether rewards are divided by the running deviation of returns, see
-            `RewardScale`.
-        action_scale: initial standard deviation of the policy.
-        action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
-            everywhere.
-        squash: whether bounded actions are squashed by tanh; otherwise samples beyond the bounds
-            are clipped.
-        learning_rate: of Adam, a number or a schedule.
-        gamma: discount.
-        gae_lambda: lambda of generalised advantage estimation.
-        clip: clipping range of the probability ratio.
-        epochs: passes over each batch.
-        minibatches: minibatches per pass.
-        entropy: coefficient of the entropy bonus, a number or a schedule.
-        critic: coefficient of the critic's loss.
-        max_grad_norm: gradients are scaled down to this norm.
-        compile: whether to compile the update, see `GradientStep`.
-        anchor: makes the policy start as its guide.
-        auxiliary: further extensions, such as losses of the policy (`KickstartLoss`).
-        seed: of the order of minibatches.
+        settings: further ones of `PPO`; a network without a memory.
     """
 
     with_memory = False
@@ -72,55 +47,12 @@ class Advisor(PPO):
         env: EnvBase,
         in_keys: Sequence[NestedKey] = ("observation",),
         *,
-        alpha: float = 8.0,
+        alpha: NonNegative = 8.0,
         guide: int = 0,
-        hidden: Sequence[int] = (64, 64),
-        network: Mlp | None = None,
-        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
-        scale_rewards: bool = False,
-        action_scale: float = 0.5,
-        action_gain: float = 0.01,
-        squash: bool = True,
-        learning_rate: float | Schedule = Linear(1e-3, 0.0),
-        gamma: float = 0.99,
-        gae_lambda: float = 0.95,
-        clip: float = 0.2,
-        epochs: int = 5,
-        minibatches: int = 16,
-        entropy: float | Schedule = 0.0,
-        critic: float = 0.5,
-        max_grad_norm: float = 0.5,
-        compile: bool | Literal["auto"] = "auto",
-        anchor: Anchor | None = None,
-        auxiliary: Sequence[Extension] = (),
-        seed: int = 0,
+        **settings: Unpack[PPOSettings],
     ) -> None:
-        check_range(0, alpha=alpha)
         self.alpha, self.imitation = alpha, KickstartLoss(guide=guide)
-        super().__init__(
-            env,
-            in_keys,
-            hidden=hidden,
-            network=network,
-            normalise=normalise,
-            scale_rewards=scale_rewards,
-            action_scale=action_scale,
-            action_gain=action_gain,
-            squash=squash,
-            learning_rate=learning_rate,
-            gamma=gamma,
-            gae_lambda=gae_lambda,
-            clip=clip,
-            epochs=epochs,
-            minibatches=minibatches,
-            entropy=entropy,
-            critic=critic,
-            max_grad_norm=max_grad_norm,
-            compile=compile,
-            anchor=anchor,
-            auxiliary=auxiliary,
-            seed=seed,
-        )
+        super().__init__(env, in_keys, **settings)
         self.keys += self.imitation.keys
         self.minibatch_keys += self.imitation.keys
 

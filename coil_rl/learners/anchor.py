@@ -25,17 +25,17 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from coil_rl.envs.limits import check_range
 from coil_rl.learners.learner import Callback, Cases
 from coil_rl.learners.normaliser import Normaliser
 from coil_rl.learners.sampling import UNCLIPPED, Sample
+from coil_rl.ranges import Interval, Positive, Share, checked
 from coil_rl.transforms.action_space import ActionSpace
 
 TIE = 1e-6  # decides between equal values
@@ -50,6 +50,7 @@ GAIN_CASES = (4, 12)  # numbers of cases after which the comparison of gains may
 GAIN_ERRORS = 1.0  # standard errors by which a lower gain must be better: any of them is usable
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class Anchor:
     """Settings of anchored COIL.
@@ -68,17 +69,11 @@ class Anchor:
         ValueError: for a value out of range.
     """
 
-    reach: float = 1.0
-    gains: Sequence[float] = (0.75, 0.5)
-    choice_weight: float = 0.5
-    share: float = 0.05
+    reach: Positive = 1.0
+    gains: Sequence[Annotated[float, Interval(gt=0, le=1)]] = (0.75, 0.5)
+    choice_weight: Positive = 0.5
+    share: Share = 0.05
     advice_key: NestedKey = "guide_action"
-
-    def __post_init__(self) -> None:
-        check_range(0, above=True, reach=self.reach, choice_weight=self.choice_weight)
-        check_range(0, 1, share=self.share)
-        for gain in self.gains:
-            check_range(0, 1, above=True, gains=gain)
 
 
 class Hold(nn.Module):

@@ -7,7 +7,7 @@ terminated. Q' is a target network that follows Q slowly. The policy is epsilon-
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Unpack
 
 import torch
 from tensordict import TensorDictBase
@@ -18,17 +18,18 @@ from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueModule
 from torchrl.objectives import DQNLoss
 
-from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
-from coil_rl.learners.anchor import Anchor, AnchoredInputs, AnchoredValues, hold_of
+from coil_rl.learners.anchor import AnchoredInputs, AnchoredValues, hold_of
 from coil_rl.learners.encoders import Mlp, ObservationNetwork, without_memory
-from coil_rl.learners.off_policy import OffPolicy
+from coil_rl.learners.off_policy import OffPolicy, Ratio, ReplaySettings
+from coil_rl.ranges import NonNegative, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.action_space import nested_key
 
 HELD_EPSILON = 0.3  # largest probability of a random action of a policy that holds a guide
 
 
+@checked
 class DQN(OffPolicy):
     """The DQN learner.
 
@@ -44,24 +45,9 @@ class DQN(OffPolicy):
         epsilon: probability of a random action, a number or a schedule; 0 for deterministic
             actions.
         double: whether the network, not the target network, selects the next action.
-        normalise: whether to normalise what is observed, or the entries to normalise, see
-            `Normaliser`. Steps are stored as they are.
-        scale_rewards: whether rewards are divided by the running deviation of returns, see
-            `RewardScale`.
         tau: step of the target networks towards the networks after each minibatch, as a fraction.
         ratio: how often a step is sampled, on average over the run.
-        learning_rate: of Adam, a number or a schedule.
-        gamma: discount.
-        max_grad_norm: gradients are scaled down to this norm, over all networks together.
-        capacity: maximum number of stored steps; the newest replace the oldest.
-        batch_size: N, steps in a minibatch.
-        starts: number of stored steps before learning starts.
-        prior: share of each minibatch that is sampled from the steps of guides, which are then
-            stored apart: the symmetric sampling of RLPD (Ball et al. 2023) with 0.5. With 0 all
-            steps are sampled alike.
-        compile: whether to compile the update, see `GradientStep`.
-        anchor: makes the policy start as its guide.
-        seed: of the samples.
+        settings: further ones of `OffPolicy`.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -84,49 +70,18 @@ class DQN(OffPolicy):
         *,
         hidden: Sequence[int] = (128, 128),
         network: Mlp | None = None,
-        action_gain: float = 1.0,
-        epsilon: float | Schedule = Linear(1.0, 0.05, until=0.3),
+        action_gain: NonNegative = 1.0,
+        epsilon: Share | Schedule = Linear(1.0, 0.05, until=0.3),
         double: bool = True,
-        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
-        scale_rewards: bool = False,
-        tau: float = 0.01,
-        ratio: float = 16.0,
-        learning_rate: float | Schedule = Linear(1e-3, 0.0),
-        gamma: float = 0.99,
-        max_grad_norm: float = 10.0,
-        capacity: int = 100_000,
-        batch_size: int = 256,
-        starts: int = 5_000,
-        prior: float = 0.0,
-        compile: bool | Literal["auto"] = "auto",
-        anchor: Anchor | None = None,
-        seed: int = 0,
+        tau: Share = 0.01,
+        ratio: Ratio = 16.0,
+        **settings: Unpack[ReplaySettings],
     ) -> None:
         self.epsilon = schedule(epsilon)
-        check_range(0, action_gain=action_gain)
-        for progress in (0, 1):
-            check_range(0, 1, epsilon=self.epsilon(progress))
         check_actions(env)
         in_keys = [nested_key(key) for key in in_keys]
         network = without_memory(network or Mlp(hidden, "relu"), "DQN")
-        super().__init__(
-            env,
-            in_keys,
-            normalise=normalise,
-            scale_rewards=scale_rewards,
-            tau=tau,
-            ratio=ratio,
-            learning_rate=learning_rate,
-            gamma=gamma,
-            max_grad_norm=max_grad_norm,
-            capacity=capacity,
-            batch_size=batch_size,
-            starts=starts,
-            prior=prior,
-            compile=compile,
-            anchor=anchor,
-            seed=seed,
-        )
+        super().__init__(env, in_keys, tau=tau, ratio=ratio, **settings)
         single = env.action_spec_unbatched  # the network is evaluated on batches of any size
         numbers = ObservationNetwork(
             env, in_keys, network, single.space.n, action_gain, dtype=env.reward_spec.dtype
@@ -135,7 +90,7 @@ class DQN(OffPolicy):
         values = networks.FastTensorDictModule(numbers, keys, ["action_value"])
         self.network = TensorDictSequential(values, QValueModule(spec=single))
         first = float(self.epsilon(0))
-        if anchor is not None:  # of the first batch; whether a guide is held is not known yet
+        if self.anchor is not None:  # of the first batch; whether a guide is held is not known yet
             first = min(first, HELD_EPSILON)
         self.explorer = EGreedyModule(single, eps_init=first, eps_end=0.0, device=env.device)
         self.policy = self.build_policy(env)

@@ -8,7 +8,7 @@ shrinks from each phase to the next of its kind.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, astuple, dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -17,11 +17,9 @@ from torch import nn
 from torch.func import functional_call
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.limits import LARGEST_SEED, check_choice, check_range
-from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.encoders import Mlp
-from coil_rl.learners.extension import Extension
-from coil_rl.learners.ppo import PPO
+from coil_rl.learners.ppo import PPO, PPOSettings
+from coil_rl.ranges import Count, Interval, NonNegative, Seed, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.action_space import ChoicesError
 from coil_rl.transforms.guide_actions import Guides
@@ -47,6 +45,7 @@ class Phase:
 StopRule = Callable[[int, Sequence[float]], bool]
 
 
+@checked
 @dataclass(frozen=True)
 class AfterFrames:
     """Stop rule for phases of fixed length.
@@ -55,16 +54,14 @@ class AfterFrames:
         frames: of a phase; it ends with the update that completes them.
     """
 
-    frames: int
-
-    def __post_init__(self) -> None:
-        check_range(1, frames=self.frames)
+    frames: Count
 
     def __call__(self, frames: int, rewards: Sequence[float]) -> bool:
         """Return whether the phase is complete."""
         return frames >= self.frames
 
 
+@checked
 @dataclass(frozen=True)
 class AtConvergence:
     """Stop rule: a phase ends when some evaluations have not improved on the best one before.
@@ -77,15 +74,9 @@ class AtConvergence:
         frames: maximum length of the phase; None: unlimited.
     """
 
-    evaluations: int = 5
-    improvement: float = 0.0
-    frames: int | None = None
-
-    def __post_init__(self) -> None:
-        check_range(
-            1, evaluations=self.evaluations, frames=1 if self.frames is None else self.frames
-        )
-        check_range(0, improvement=self.improvement)
+    evaluations: Count = 5
+    improvement: NonNegative = 0.0
+    frames: Count | None = None
 
     def __call__(self, frames: int, rewards: Sequence[float]) -> bool:
         """Return whether the reward has converged, or the maximum length is reached."""
@@ -97,6 +88,7 @@ class AtConvergence:
         return since >= self.evaluations
 
 
+@checked
 @dataclass(eq=False)
 class PhaseSchedule:
     """The order of the phases.
@@ -118,19 +110,15 @@ class PhaseSchedule:
         rewards: mean reward per step of each update in the present phase.
     """
 
-    guides: int
+    guides: Count
     _: KW_ONLY
     order: Literal["alternate", "joint", "agent", "guide"] = "alternate"
     choice: Literal["sequential", "stochastic"] = "sequential"
     agent_phase: StopRule = AfterFrames(131_072)
     guide_phase: StopRule = AfterFrames(65_536)
-    seed: int = 0
+    seed: Seed = 0
 
     def __post_init__(self) -> None:
-        check_choice(("alternate", "joint", "agent", "guide"), order=self.order)
-        check_choice(("sequential", "stochastic"), choice=self.choice)
-        check_range(1, guides=self.guides)
-        check_range(0, LARGEST_SEED, seed=self.seed)
         self.generator = torch.Generator().manual_seed(self.seed)
         self.number, self.frames = 0, 0
         self.rewards: list[float] = []
@@ -179,6 +167,7 @@ class PhaseSchedule:
         self.generator.set_state(state["generator"])
 
 
+@checked
 class DynamicCoil(PPO):
     """The learner of Dynamic COIL: PPO with guides in front of the agent, and a phase schedule.
 
@@ -193,30 +182,7 @@ class DynamicCoil(PPO):
         guide_learning_rate: of the guides, a number or a schedule.
         shrink: factor on the learning rate from each phase to the next of its kind.
         critic_phases: phases in which the critic learns: "both", "agent" or "guide".
-        hidden: widths of the hidden layers of agent and critic, without `network`.
-        network: architecture of agent and critic, without a memory; None: `Mlp(hidden)`.
-        normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
-            the entries to normalise, see `Normaliser`.
-        scale_rewards: whether rewards are divided by the running deviation of returns, see
-            `RewardScale`.
-        action_scale: initial standard deviation of the agent.
-        action_gain: initial scale of the last weights of the agent; with 0 its mean is 0
-            everywhere.
-        squash: whether bounded actions are squashed by tanh; otherwise samples beyond the bounds
-            are clipped.
-        learning_rate: of agent and critic by Adam, a number or a schedule.
-        gamma: discount.
-        gae_lambda: lambda of generalised advantage estimation.
-        clip: clipping range of the probability ratio.
-        epochs: passes over each batch.
-        minibatches: minibatches per pass.
-        entropy: coefficient of the entropy bonus, a number or a schedule.
-        critic: coefficient of the critic's loss.
-        max_grad_norm: gradients are scaled down to this norm.
-        compile: "auto" or false; the update cannot be compiled.
-        anchor: makes the agent start as its guide.
-        auxiliary: further extensions, such as losses of the agent (`KickstartLoss`).
-        seed: of the order of minibatches.
+        settings: further ones of `PPO`; a network without a memory, and no compilation.
     """
 
     kind = "guides"
@@ -230,38 +196,16 @@ class DynamicCoil(PPO):
         *,
         guides: Mapping[str, TensorDictModuleBase],
         phases: Callable[[int], PhaseSchedule] = PhaseSchedule,
-        guide_learning_rate: float | Schedule = Linear(3e-4, 0.0),
-        shrink: float = 0.9,
+        guide_learning_rate: NonNegative | Schedule = Linear(3e-4, 0.0),
+        shrink: Annotated[float, Interval(gt=0, le=1)] = 0.9,
         critic_phases: Literal["both", "agent", "guide"] = "both",
-        hidden: Sequence[int] = (64, 64),
-        network: Mlp | None = None,
-        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
-        scale_rewards: bool = False,
-        action_scale: float = 0.5,
-        action_gain: float = 0.01,
-        squash: bool = True,
-        learning_rate: float | Schedule = Linear(1e-3, 0.0),
-        gamma: float = 0.99,
-        gae_lambda: float = 0.95,
-        clip: float = 0.2,
-        epochs: int = 5,
-        minibatches: int = 16,
-        entropy: float | Schedule = 0.0,
-        critic: float = 0.5,
-        max_grad_norm: float = 0.5,
-        compile: bool | Literal["auto"] = "auto",
-        anchor: Anchor | None = None,
-        auxiliary: Sequence[Extension] = (),
-        seed: int = 0,
+        **settings: Unpack[PPOSettings],
     ) -> None:
-        check_range(0, 1, above=True, shrink=shrink)
-        check_choice(("both", "agent", "guide"), critic_phases=critic_phases)
         if not env.action_spec.dtype.is_floating_point:
             raise ChoicesError(
                 "Dynamic COIL needs continuous actions, but this env has discrete ones"
             )
         self.guide_learning_rate = schedule(guide_learning_rate)
-        check_range(0, guide_learning_rate=self.guide_learning_rate(0))
         self.advice = Guides(guides, trainable=True)
         self.advice.units = given_units(env)
         parameters = [parameter for guide in guides.values() for parameter in guide.parameters()]
@@ -277,30 +221,7 @@ class DynamicCoil(PPO):
         ]
         self.phases = phases(len(guides))
         self.shrink, self.critic_phases = shrink, critic_phases
-        super().__init__(
-            env,
-            in_keys,
-            hidden=hidden,
-            network=network,
-            normalise=normalise,
-            scale_rewards=scale_rewards,
-            action_scale=action_scale,
-            action_gain=action_gain,
-            squash=squash,
-            learning_rate=learning_rate,
-            gamma=gamma,
-            gae_lambda=gae_lambda,
-            clip=clip,
-            epochs=epochs,
-            minibatches=minibatches,
-            entropy=entropy,
-            critic=critic,
-            max_grad_norm=max_grad_norm,
-            compile=compile,
-            anchor=anchor,
-            auxiliary=auxiliary,
-            seed=seed,
-        )
+        super().__init__(env, in_keys, **settings)
 
     def build_policy(
         self,

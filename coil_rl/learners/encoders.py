@@ -5,7 +5,7 @@ A YAML file names an architecture by `learner.network`.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 from tensordict import NestedKey
@@ -15,10 +15,13 @@ from torchrl.data import Binary, Categorical, MultiCategorical, TensorSpec, Unbo
 from torchrl.envs import EnvBase, InitTracker, TensorDictPrimer, Transform
 from torchrl.modules import MLP, ConvNet
 
-from coil_rl.envs.limits import check_choice, check_range
 from coil_rl.learners.activations import ACTIVATIONS, ORTHOGONAL
+from coil_rl.ranges import Interval, Len, checked
 from coil_rl.transforms.action_space import written_key
 
+Width = Annotated[int, Interval(ge=1, le=4096)]
+Hidden = Annotated[Sequence[Width], Len(0, 16)]
+Activation = Literal["tanh", "relu", "elu", "silu", "fast_tanh"]
 Shapes = Mapping[NestedKey, torch.Size]
 ADDED = ("episode_reward", "task_reward", "limit_count")  # entries that no env has by itself
 STATE = "policy_state"  # what an env carries for a network with a memory
@@ -172,6 +175,7 @@ class ConcatObservations(nn.Module):
         return torch.cat(flat, -1) if len(flat) > 1 else flat[0]
 
 
+@checked
 @dataclass(frozen=True)
 class Mlp:
     """A network that reads concatenated entries.
@@ -185,15 +189,9 @@ class Mlp:
         layer_norm: whether the numbers of a hidden layer are normalised before its activation.
     """
 
-    hidden: Sequence[int] = (64, 64)
-    activation: str = "tanh"
+    hidden: Hidden = (64, 64)
+    activation: Activation = "tanh"
     layer_norm: bool = field(default=False, kw_only=True)
-
-    def __post_init__(self) -> None:
-        check_choice(tuple(ACTIVATIONS), activation=self.activation)
-        check_range(0, 16, hidden_layers=len(self.hidden))
-        for width in self.hidden:
-            check_range(1, 4096, hidden=width)
 
     def layers(
         self, inputs: int, outputs: int, gain: float, device: torch.device | None = None
@@ -226,6 +224,7 @@ class Mlp:
         return layers
 
 
+@checked
 @dataclass(frozen=True)
 class Cnn(Mlp):
     """A network that reads images by convolutions, and other entries beside what these give.
@@ -241,25 +240,22 @@ class Cnn(Mlp):
         strides: step of each convolution.
     """
 
-    hidden: Sequence[int] = (512,)
-    activation: str = "relu"
-    channels: Sequence[int] = (32, 64, 64)
-    kernels: Sequence[int] = (8, 4, 3)
-    strides: Sequence[int] = (4, 2, 1)
+    hidden: Hidden = (512,)
+    activation: Activation = "relu"
+    channels: Sequence[Width] = (32, 64, 64)
+    kernels: Sequence[Width] = (8, 4, 3)
+    strides: Sequence[Width] = (4, 2, 1)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         lengths = {name: len(getattr(self, name)) for name in ("channels", "kernels", "strides")}
         if len(set(lengths.values())) > 1 or not self.channels:
             raise ValueError(
                 "channels, kernels and strides must have one number for each convolution, "
                 f"not {lengths}"
             )
-        for name in lengths:
-            for number in getattr(self, name):
-                check_range(1, 4096, **{name: number})
 
 
+@checked
 @dataclass(frozen=True)
 class Gru(Mlp):
     """A network with a memory: a gated recurrent unit (GRU), and hidden layers that read its state.
@@ -284,12 +280,8 @@ class Gru(Mlp):
         torch.Size([64, 1, 32])
     """
 
-    hidden: Sequence[int] = (64,)
-    state: int = 64
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range(1, 4096, state=self.state)
+    hidden: Hidden = (64,)
+    state: Width = 64
 
     @property
     def after(self) -> Mlp:

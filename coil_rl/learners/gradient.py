@@ -11,13 +11,14 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from coil_rl.compiled import Compiled
-from coil_rl.envs.limits import check_choice
 from coil_rl.errors import UserError
 from coil_rl.learners.state import Stateful
+from coil_rl.ranges import checked
 
 ENOUGH = 4_000  # steps of a run, for which compilation pays in the second run of the same sizes
 
 
+@checked
 @dataclass(eq=False)
 class GradientStep(Stateful):
     """One step of Adam on the weighted losses of a minibatch.
@@ -52,7 +53,6 @@ class GradientStep(Stateful):
     compilable: bool = True
 
     def __post_init__(self) -> None:
-        check_choice(("true", "false", "auto"), compile=str(self.compile).lower())
         self.required = self.compile is True
         if self.required and not self.compilable:
             raise ValueError(

@@ -13,7 +13,7 @@ an edit by a second policy.
 
 from collections.abc import Sequence
 from functools import cached_property, partial
-from typing import Any, Literal
+from typing import Any, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -24,17 +24,16 @@ from torch.distributions import Categorical
 from torchrl.envs import EnvBase, ExplorationType, exploration_type, set_exploration_type
 from torchrl.objectives import LossModule, SACLoss
 
-from coil_rl.envs.limits import check_range
 from coil_rl.learners.critics import Critics
 from coil_rl.learners.encoders import Mlp
-from coil_rl.learners.extension import Extension
-from coil_rl.learners.sac import SAC
-from coil_rl.schedules import Linear, Schedule
+from coil_rl.learners.sac import SAC, SACSettings
+from coil_rl.ranges import NonNegative, checked
 from coil_rl.transforms.action_space import ActionSpace
 
 ADVICE = "guide_action"
 
 
+@checked
 class IBRL(SAC):
     """The IBRL learner.
 
@@ -50,38 +49,8 @@ class IBRL(SAC):
         edit: largest change of the guide's action by the third proposal, as a fraction of half the
             range of the action, as in EXPO; 0: there is none.
         guide: index of the guide in the advice.
-        hidden: widths of the hidden layers of all networks, without `network`.
-        network: architecture of all networks; None: `Mlp(hidden)`.
-        action_scale: initial standard deviation of the policy, before squashing.
-        action_gain: initial scale of the last weights of the policy; with 0 its mean is 0.
-        temperature: initial alpha.
-        target_entropy: of the policy, for actions in the unit of the env; None: minus the number of
-            its dimensions.
-        critics: number of critics.
-        target_critics: must be None: all critics are compared.
-        critic_layer_norm: whether the critics normalise their layers, which bounds the values of
-            actions never tried.
-        uncertainty: must be false.
-        auxiliary: extensions, such as losses of the policy (`KickstartLoss`).
-        normalise: whether to normalise what is observed, or the entries to normalise, see
-            `Normaliser`. Steps are stored as they are.
-        scale_rewards: whether rewards are divided by the running deviation of returns, see
-            `RewardScale`.
-        tau: step of the target networks towards the networks after each minibatch, as a fraction.
-        ratio: how often a step is sampled, on average over the run.
-        learning_rate: of Adam, a number or a schedule.
-        gamma: discount.
-        max_grad_norm: gradients are scaled down to this norm, over all networks together. Take a
-            large one for returns in the hundreds, as of a pendulum: otherwise the gradients of the
-            critics dominate those of the policy.
-        capacity: maximum number of stored steps; the newest replace the oldest.
-        batch_size: N, steps in a minibatch.
-        starts: number of stored steps before learning starts.
-        prior: share of each minibatch that is sampled from the steps of guides, which are then
-            stored apart: the symmetric sampling of RLPD (Ball et al. 2023) with 0.5. With 0 all
-            steps are sampled alike.
-        compile: whether to compile the update, see `GradientStep`.
-        seed: of the samples.
+        settings: further ones of `SAC`, but `target_critics`, `uncertainty` and `anchor`: all
+            critics are compared, and the guide acts from the first step on.
     """
 
     reported = (*SAC.reported, "guide_share")
@@ -91,69 +60,22 @@ class IBRL(SAC):
         env: EnvBase,
         in_keys: Sequence[NestedKey] = ("observation",),
         *,
-        sharpness: float | None = None,
-        edit: float = 0.0,
+        sharpness: NonNegative | None = None,
+        edit: NonNegative = 0.0,
         guide: int = 0,
-        hidden: Sequence[int] = (64, 64),
-        network: Mlp | None = None,
-        action_scale: float = 0.5,
-        action_gain: float = 0.01,
-        temperature: float = 0.2,
-        target_entropy: float | None = None,
-        critics: int = 2,
-        target_critics: int | None = None,
-        critic_layer_norm: bool = False,
-        uncertainty: bool = False,
-        auxiliary: Sequence[Extension] = (),
-        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
-        scale_rewards: bool = False,
-        tau: float = 0.02,
-        ratio: float = 8.0,
-        learning_rate: float | Schedule = Linear(1e-3, 0.0),
-        gamma: float = 0.99,
-        max_grad_norm: float = 10.0,
-        capacity: int = 100_000,
-        batch_size: int = 256,
-        starts: int = 5_000,
-        prior: float = 0.0,
-        compile: bool | Literal["auto"] = "auto",
-        seed: int = 0,
+        **settings: Unpack[SACSettings],
     ) -> None:
-        check_range(0, sharpness=sharpness or 0, edit=edit)
-        if target_critics is not None or uncertainty:
-            raise ValueError("IBRL compares all critics; leave target_critics and uncertainty out")
+        if any(settings.get(name) for name in ("target_critics", "uncertainty", "anchor")):
+            raise ValueError(
+                "IBRL compares all critics; leave target_critics, uncertainty and anchor out"
+            )
         if ADVICE not in env.observation_spec:
             raise KeyError(
                 f"IBRL chooses between actions, but the env has no {ADVICE}; "
                 "put GuideActions before it"
             )
         self.choice = partial(Proposals, guide=guide, sharpness=sharpness, edit=edit)
-        super().__init__(
-            env,
-            in_keys,
-            hidden=hidden,
-            network=network,
-            action_scale=action_scale,
-            action_gain=action_gain,
-            temperature=temperature,
-            target_entropy=target_entropy,
-            critics=critics,
-            critic_layer_norm=critic_layer_norm,
-            auxiliary=auxiliary,
-            normalise=normalise,
-            scale_rewards=scale_rewards,
-            tau=tau,
-            ratio=ratio,
-            learning_rate=learning_rate,
-            gamma=gamma,
-            max_grad_norm=max_grad_norm,
-            capacity=capacity,
-            batch_size=batch_size,
-            starts=starts,
-            prior=prior,
-            compile=compile,
-            seed=seed,
-        )
+        super().__init__(env, in_keys, **settings)
         self.also_store(ADVICE)
 
     def build_loss(

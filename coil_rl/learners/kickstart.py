@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.distributions import Categorical, Normal, kl_divergence
 from torchrl.modules import TanhNormal
 
-from coil_rl.envs.limits import check_choice, check_range
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.heads import Choices
+from coil_rl.ranges import Positive, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 
 # Minimum distance of a guide's action from the bounds, as a fraction of half the range. A policy
@@ -29,6 +29,7 @@ class ActionValues(Protocol):
         """Return the values of the entry `action` of steps [N] by each critic, [critics, N]."""
 
 
+@checked
 @dataclass(eq=False)
 class KickstartLoss(Extension):
     """A further loss of a policy: its distance from the action g of a guide.
@@ -53,13 +54,11 @@ class KickstartLoss(Extension):
 
     coefficient: float | Schedule = Linear(1.0, 0.0, until=0.5)
     kind: Literal["likelihood", "divergence"] = "likelihood"
-    scale: float = 0.2
+    scale: Positive = 0.2
     guide: int = 0
     advice_key: NestedKey = "guide_action"
 
     def __post_init__(self) -> None:
-        check_choice(("likelihood", "divergence"), kind=self.kind)
-        check_range(0, above=True, scale=self.scale)
         self.coefficient_at = schedule(self.coefficient)
         self.critics: ActionValues | None = None
 
@@ -119,6 +118,7 @@ class KickstartLoss(Extension):
         return divergence.flatten(1).sum(-1)
 
 
+@checked
 @dataclass(eq=False)
 class FilteredKickstartLoss(KickstartLoss):
     """As `KickstartLoss`, but weighted by what critics think of g.

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, TypedDict
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -11,7 +11,6 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule, SoftUpdate
 
-from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import Anchor, start_tests
 from coil_rl.learners.extension import Extension
@@ -23,11 +22,32 @@ from coil_rl.learners.normaliser import RawObservations, normaliser
 from coil_rl.learners.reward_scale import RewardScale
 from coil_rl.learners.sampling import UNCLIPPED
 from coil_rl.learners.state import Stateful
+from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Seed, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
 from coil_rl.transforms.guide_transform import GuideTransform
 
+Ratio = Annotated[float, Interval(ge=0, le=10_000)]
 
+
+class ReplaySettings(TypedDict, total=False):
+    """Arguments that every learner with replay takes as `OffPolicy` does."""
+
+    normalise: bool | Literal["auto"] | Sequence[NestedKey]
+    scale_rewards: bool
+    learning_rate: NonNegative | Schedule
+    gamma: Share
+    max_grad_norm: Positive
+    capacity: int
+    batch_size: Count
+    starts: Index
+    prior: Share
+    compile: bool | Literal["auto"]
+    anchor: Anchor | None
+    seed: Seed
+
+
+@checked
 class OffPolicy(Stateful, Learner):
     """Replay buffer, optimiser, target networks and update.
 
@@ -97,29 +117,23 @@ class OffPolicy(Stateful, Learner):
         *,
         normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         scale_rewards: bool = False,
-        tau: float,
-        ratio: float,
-        learning_rate: float | Schedule = Linear(1e-3, 0.0),
-        gamma: float = 0.99,
-        max_grad_norm: float = 10.0,
+        tau: Share,
+        ratio: Ratio,
+        learning_rate: NonNegative | Schedule = Linear(1e-3, 0.0),
+        gamma: Share = 0.99,
+        max_grad_norm: Positive = 10.0,
         capacity: int = 100_000,
-        batch_size: int = 256,
-        starts: int = 5_000,
-        prior: float = 0.0,
+        batch_size: Count = 256,
+        starts: Index = 5_000,
+        prior: Share = 0.0,
         compile: bool | Literal["auto"] = "auto",
         anchor: Anchor | None = None,
-        seed: int = 0,
+        seed: Seed = 0,
     ) -> None:
         self.anchor, self.compile = anchor, compile
         self.learning_rate = schedule(learning_rate)
-        check_range(0, 1, gamma=gamma, tau=tau, prior=prior)
-        check_range(0, learning_rate=self.learning_rate(0), starts=starts)
-        check_range(0, 10_000, ratio=ratio)
-        check_range(0, above=True, max_grad_norm=max_grad_norm)
-        check_range(1, batch_size=batch_size)
         if not max(starts, 1) <= capacity:
             raise ValueError(f"capacity={capacity} must be at least 1 and at least starts={starts}")
-        check_range(0, LARGEST_SEED, seed=seed)
         check_replay(env, type(self).__name__)
         self.normaliser = normaliser(env, in_keys, normalise)
         self.reward_scale = RewardScale(gamma) if scale_rewards else None

@@ -9,7 +9,7 @@ near the policy that collected the batch:
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypedDict
 
 from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
@@ -18,7 +18,6 @@ from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
-from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.learners import networks
 from coil_rl.learners.advantages import Advantages
 from coil_rl.learners.anchor import Anchor, start_tests
@@ -35,10 +34,42 @@ from coil_rl.learners.normaliser import normaliser
 from coil_rl.learners.reward_scale import RewardScale
 from coil_rl.learners.sampling import UNCLIPPED
 from coil_rl.learners.state import Stateful
+from coil_rl.ranges import Count, NonNegative, Positive, Seed, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.action_space import nested_key
 
 
+class OnPolicySettings(TypedDict, total=False):
+    """Arguments that every on-policy learner takes as `PPO` does."""
+
+    hidden: Sequence[int]
+    network: Mlp | None
+    normalise: bool | Literal["auto"] | Sequence[NestedKey]
+    scale_rewards: bool
+    action_scale: Positive
+    action_gain: NonNegative
+    squash: bool
+    gamma: Share
+    minibatches: Count
+    max_grad_norm: Positive
+    anchor: Anchor | None
+    auxiliary: Sequence[Extension]
+    seed: Seed
+
+
+class PPOSettings(OnPolicySettings, total=False):
+    """All settings of `PPO`."""
+
+    learning_rate: NonNegative | Schedule
+    gae_lambda: Share
+    clip: Positive
+    epochs: Count
+    entropy: NonNegative | Schedule
+    critic: NonNegative
+    compile: bool | Literal["auto"]
+
+
+@checked
 class PPO(Stateful, Learner):
     """The PPO learner, and the base class of the other on-policy learners.
 
@@ -107,31 +138,24 @@ class PPO(Stateful, Learner):
         network: Mlp | None = None,
         normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         scale_rewards: bool = False,
-        action_scale: float = 0.5,
-        action_gain: float = 0.01,
+        action_scale: Positive = 0.5,
+        action_gain: NonNegative = 0.01,
         squash: bool = True,
-        learning_rate: float | Schedule = Linear(1e-3, 0.0),
-        gamma: float = 0.99,
-        gae_lambda: float = 0.95,
-        clip: float = 0.2,
-        epochs: int = 5,
-        minibatches: int = 16,
-        entropy: float | Schedule = 0.0,
-        critic: float = 0.5,
-        max_grad_norm: float = 0.5,
+        learning_rate: NonNegative | Schedule = Linear(1e-3, 0.0),
+        gamma: Share = 0.99,
+        gae_lambda: Share = 0.95,
+        clip: Positive = 0.2,
+        epochs: Count = 5,
+        minibatches: Count = 16,
+        entropy: NonNegative | Schedule = 0.0,
+        critic: NonNegative = 0.5,
+        max_grad_norm: Positive = 0.5,
         compile: bool | Literal["auto"] = "auto",
         anchor: Anchor | None = None,
         auxiliary: Sequence[Extension] = (),
-        seed: int = 0,
+        seed: Seed = 0,
     ) -> None:
         self.learning_rate, self.entropy = schedule(learning_rate), schedule(entropy)
-        check_range(0, action_gain=action_gain, learning_rate=self.learning_rate(0))
-        check_range(0, critic=critic, entropy=self.entropy(0))
-        check_range(
-            0, above=True, action_scale=action_scale, clip=clip, max_grad_norm=max_grad_norm
-        )
-        check_range(1, epochs=epochs, minibatches=minibatches)
-        check_range(0, LARGEST_SEED, seed=seed)
         in_keys = [nested_key(key) for key in in_keys]
         network = network or Mlp(hidden)
         if not self.with_memory:

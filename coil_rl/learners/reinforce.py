@@ -12,49 +12,33 @@ episodes alone would give a bias, because their length depends on the actions.
 """
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.limits import check_choice
 from coil_rl.learners.a2c import A2C
-from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.encoders import Mlp
-from coil_rl.learners.extension import Extension
+from coil_rl.learners.ppo import OnPolicySettings
+from coil_rl.ranges import NonNegative, checked
 from coil_rl.schedules import Linear, Schedule
 
 
+@checked
 class Reinforce(A2C):
     """The REINFORCE learner: A2C with the whole return, lambda = 1.
 
     Args:
         env: the env, for its specs.
         in_keys: entries that policy and critic observe.
-        hidden: widths of the hidden layers of both networks, without `network`.
-        network: architecture of both networks; None: `Mlp(hidden)`.
-        normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
-            the entries to normalise, see `Normaliser`.
-        scale_rewards: whether rewards are divided by the running deviation of returns, see
-            `RewardScale`.
-        action_scale: initial standard deviation of the policy.
-        action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
-            everywhere.
-        squash: whether bounded actions are squashed by tanh; otherwise samples beyond the bounds
-            are clipped.
-        learning_rate: of Adam, a number or a schedule.
-        gamma: discount.
-        minibatches: minibatches per pass.
-        max_grad_norm: gradients are scaled down to this norm.
-        compile: whether to compile the update, see `GradientStep`.
-        anchor: makes the policy start as its guide.
-        auxiliary: further extensions, such as losses of the policy (`KickstartLoss`).
         baseline: "critic", a network that is trained on the returns, or "none".
+        learning_rate: of Adam, a number or a schedule.
+        compile: whether to compile the update, see `GradientStep`.
         standardise: whether to standardise G - b in a minibatch. The coefficients of other losses
             then do not depend on the scale of the reward.
-        seed: of the order of minibatches.
+        settings: further ones of `PPO`.
     """
 
     def __init__(
@@ -62,48 +46,23 @@ class Reinforce(A2C):
         env: EnvBase,
         in_keys: Sequence[NestedKey] = ("observation",),
         *,
-        hidden: Sequence[int] = (64, 64),
-        network: Mlp | None = None,
-        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
-        scale_rewards: bool = False,
-        action_scale: float = 0.5,
-        action_gain: float = 0.01,
-        squash: bool = True,
-        learning_rate: float | Schedule = Linear(1e-3, 0.0),
-        gamma: float = 0.99,
-        minibatches: int = 16,
-        max_grad_norm: float = 0.5,
-        compile: bool | Literal["auto"] = "auto",
-        anchor: Anchor | None = None,
-        auxiliary: Sequence[Extension] = (),
         baseline: Literal["critic", "none"] = "critic",
+        learning_rate: NonNegative | Schedule = Linear(1e-3, 0.0),
+        compile: bool | Literal["auto"] = "auto",
         standardise: bool = True,
-        seed: int = 0,
+        **settings: Unpack[OnPolicySettings],
     ) -> None:
-        check_choice(("critic", "none"), baseline=baseline)
         self.baseline = baseline
         super().__init__(
             env,
             in_keys,
-            hidden=hidden,
-            network=network,
-            normalise=normalise,
-            scale_rewards=scale_rewards,
-            action_scale=action_scale,
-            action_gain=action_gain,
-            squash=squash,
             learning_rate=learning_rate,
-            gamma=gamma,
-            minibatches=minibatches,
-            max_grad_norm=max_grad_norm,
-            compile=compile,
-            anchor=anchor,
-            auxiliary=auxiliary,
-            seed=seed,
-            standardise=standardise,
             gae_lambda=1.0,
             entropy=0.0,
             critic=float(baseline == "critic"),
+            compile=compile,
+            standardise=standardise,
+            **settings,
         )
 
     def build_critic(

@@ -14,7 +14,7 @@ minibatch (Ball et al. 2023).
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Annotated, Any, Unpack
 
 import torch
 from tensordict import TensorDictBase
@@ -23,18 +23,35 @@ from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule, REDQLoss, SACLoss
 
-from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
-from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.critics import Critics
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.kickstart import KickstartLoss
-from coil_rl.learners.off_policy import OffPolicy
-from coil_rl.schedules import Linear, Schedule
+from coil_rl.learners.off_policy import OffPolicy, Ratio, ReplaySettings
+from coil_rl.ranges import Interval, NonNegative, Positive, Share, checked
 from coil_rl.transforms.action_space import ChoicesError, nested_key
 
 
+class SACSettings(ReplaySettings, total=False):
+    """All settings of `SAC`."""
+
+    hidden: Sequence[int]
+    network: Mlp | None
+    action_scale: Positive
+    action_gain: NonNegative
+    temperature: Positive
+    target_entropy: float | None
+    critics: Annotated[int, Interval(ge=2, le=1_000)]
+    target_critics: int | None
+    critic_layer_norm: bool
+    uncertainty: bool
+    auxiliary: Sequence[Extension]
+    tau: Share
+    ratio: Ratio
+
+
+@checked
 class SAC(OffPolicy):
     """The SAC learner.
 
@@ -59,26 +76,11 @@ class SAC(OffPolicy):
         uncertainty: whether the policy writes that of the critics, see `Critics`, for
             `AdaptiveMixedAction`.
         auxiliary: extensions, such as losses of the policy (`KickstartLoss`).
-        normalise: whether to normalise what is observed, or the entries to normalise, see
-            `Normaliser`. Steps are stored as they are.
-        scale_rewards: whether rewards are divided by the running deviation of returns, see
-            `RewardScale`.
         tau: step of the target networks towards the networks after each minibatch, as a fraction.
         ratio: how often a step is sampled, on average over the run.
-        learning_rate: of Adam, a number or a schedule.
-        gamma: discount.
-        max_grad_norm: gradients are scaled down to this norm, over all networks together. Take a
-            large one for returns in the hundreds, as of a pendulum: otherwise the gradients of the
-            critics dominate those of the policy.
-        capacity: maximum number of stored steps; the newest replace the oldest.
-        batch_size: N, steps in a minibatch.
-        starts: number of stored steps before learning starts.
-        prior: share of each minibatch that is sampled from the steps of guides, which are then
-            stored apart: the symmetric sampling of RLPD (Ball et al. 2023) with 0.5. With 0 all
-            steps are sampled alike.
-        compile: whether to compile the update, see `GradientStep`.
-        anchor: makes the policy start as its guide.
-        seed: of the samples.
+        settings: further ones of `OffPolicy`. Take a large `max_grad_norm` for returns in the
+            hundreds, as of a pendulum: otherwise the gradients of the critics dominate those of
+            the policy.
     """
 
     minimised = ("loss_actor", "loss_qvalue", "loss_alpha")
@@ -91,38 +93,24 @@ class SAC(OffPolicy):
         *,
         hidden: Sequence[int] = (64, 64),
         network: Mlp | None = None,
-        action_scale: float = 0.5,
-        action_gain: float = 0.01,
-        temperature: float = 0.2,
+        action_scale: Positive = 0.5,
+        action_gain: NonNegative = 0.01,
+        temperature: Positive = 0.2,
         target_entropy: float | None = None,
-        critics: int = 2,
+        critics: Annotated[int, Interval(ge=2, le=1_000)] = 2,
         target_critics: int | None = None,
         critic_layer_norm: bool = False,
         uncertainty: bool = False,
         auxiliary: Sequence[Extension] = (),
-        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
-        scale_rewards: bool = False,
-        tau: float = 0.02,
-        ratio: float = 8.0,
-        learning_rate: float | Schedule = Linear(1e-3, 0.0),
-        gamma: float = 0.99,
-        max_grad_norm: float = 10.0,
-        capacity: int = 100_000,
-        batch_size: int = 256,
-        starts: int = 5_000,
-        prior: float = 0.0,
-        compile: bool | Literal["auto"] = "auto",
-        anchor: Anchor | None = None,
-        seed: int = 0,
+        tau: Share = 0.02,
+        ratio: Ratio = 8.0,
+        **settings: Unpack[ReplaySettings],
     ) -> None:
-        check_range(2, 1_000, critics=critics)
         if target_critics is not None and not 1 <= target_critics < critics:
             raise ValueError(
                 f"target_critics={target_critics} must be at least 1 and less than "
                 f"critics={critics}"
             )
-        check_range(0, action_gain=action_gain)
-        check_range(0, above=True, action_scale=action_scale, temperature=temperature)
         if not env.action_spec.dtype.is_floating_point:
             raise ChoicesError(
                 "SAC needs continuous actions, but this env has discrete ones; use "
@@ -130,24 +118,7 @@ class SAC(OffPolicy):
             )
         in_keys = [nested_key(key) for key in in_keys]
         network = without_memory(network or Mlp(hidden), "SAC")
-        super().__init__(
-            env,
-            in_keys,
-            normalise=normalise,
-            scale_rewards=scale_rewards,
-            tau=tau,
-            ratio=ratio,
-            learning_rate=learning_rate,
-            gamma=gamma,
-            max_grad_norm=max_grad_norm,
-            capacity=capacity,
-            batch_size=batch_size,
-            starts=starts,
-            prior=prior,
-            compile=compile,
-            anchor=anchor,
-            seed=seed,
-        )
+        super().__init__(env, in_keys, tau=tau, ratio=ratio, **settings)
         self.action_scale, self.action_gain = action_scale, action_gain
         self.actor = self.build_actor(env, in_keys, network)
         if target_entropy is None:

@@ -8,7 +8,7 @@ sure that the objective improved and that the bound holds.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -19,20 +19,18 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torchrl.envs import EnvBase
 from torchrl.modules import TanhNormal
 
-from coil_rl.envs.limits import check_range
 from coil_rl.learners.advantages import standardise
-from coil_rl.learners.anchor import Anchor
-from coil_rl.learners.encoders import Mlp
-from coil_rl.learners.extension import Extension
 from coil_rl.learners.guided_steps import of_agent
 from coil_rl.learners.heads import Choices
-from coil_rl.learners.ppo import PPO
+from coil_rl.learners.ppo import PPO, OnPolicySettings
+from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Share, checked
 from coil_rl.schedules import Linear, Schedule
 
 # Returns the total loss, the divergence from the policy before the step, and each loss by name.
 Surrogate = Callable[[], tuple[Tensor, Tensor, dict[str, Tensor]]]
 
 
+@checked
 class TRPO(PPO):
     """The TRPO learner. The optimiser, its passes and its minibatches are for the critic only.
 
@@ -44,27 +42,11 @@ class TRPO(PPO):
         iterations: of the conjugate gradients.
         backtracks: how often the line search may shorten a step.
         shrink: factor by which it shortens a step.
-        hidden: widths of the hidden layers of both networks, without `network`.
-        network: architecture of both networks, without a memory; None: `Mlp(hidden)`.
-        normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
-            the entries to normalise, see `Normaliser`.
-        scale_rewards: whether rewards are divided by the running deviation of returns, see
-            `RewardScale`.
-        action_scale: initial standard deviation of the policy.
-        action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
-            everywhere.
-        squash: whether bounded actions are squashed by tanh; otherwise samples beyond the bounds
-            are clipped.
         learning_rate: of the critic by Adam, a number or a schedule.
-        gamma: discount.
         gae_lambda: lambda of generalised advantage estimation.
         epochs: passes of the critic over each batch.
-        minibatches: of the critic per pass.
-        max_grad_norm: gradients of the critic are scaled down to this norm.
-        anchor: makes the policy start as its guide.
-        auxiliary: further extensions, such as losses of the policy (`KickstartLoss`), which are
-            part of the objective.
-        seed: of the order of minibatches.
+        settings: further ones of `PPO`; a network without a memory. Minibatches and `max_grad_norm`
+            are those of the critic, and losses of `auxiliary` are part of the objective.
     """
 
     with_memory = False
@@ -74,54 +56,26 @@ class TRPO(PPO):
         env: EnvBase,
         in_keys: Sequence[NestedKey] = ("observation",),
         *,
-        max_kl: float = 0.03,
-        damping: float = 0.1,
-        iterations: int = 10,
-        backtracks: int = 10,
-        shrink: float = 0.8,
-        hidden: Sequence[int] = (64, 64),
-        network: Mlp | None = None,
-        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
-        scale_rewards: bool = False,
-        action_scale: float = 0.5,
-        action_gain: float = 0.01,
-        squash: bool = True,
-        learning_rate: float | Schedule = Linear(1e-3, 0.0),
-        gamma: float = 0.99,
-        gae_lambda: float = 0.95,
-        epochs: int = 5,
-        minibatches: int = 16,
-        max_grad_norm: float = 0.5,
-        anchor: Anchor | None = None,
-        auxiliary: Sequence[Extension] = (),
-        seed: int = 0,
+        max_kl: Positive = 0.03,
+        damping: NonNegative = 0.1,
+        iterations: Count = 10,
+        backtracks: Index = 10,
+        shrink: Annotated[float, Interval(gt=0, le=1)] = 0.8,
+        learning_rate: NonNegative | Schedule = Linear(1e-3, 0.0),
+        gae_lambda: Share = 0.95,
+        epochs: Count = 5,
+        **settings: Unpack[OnPolicySettings],
     ) -> None:
-        check_range(0, above=True, max_kl=max_kl)
-        check_range(0, 1, above=True, shrink=shrink)
-        check_range(0, damping=damping, backtracks=backtracks)
-        check_range(1, iterations=iterations)
         super().__init__(
             env,
             in_keys,
-            hidden=hidden,
-            network=network,
-            normalise=normalise,
-            scale_rewards=scale_rewards,
-            action_scale=action_scale,
-            action_gain=action_gain,
-            squash=squash,
             learning_rate=learning_rate,
-            gamma=gamma,
             gae_lambda=gae_lambda,
             epochs=epochs,
-            minibatches=minibatches,
-            max_grad_norm=max_grad_norm,
-            anchor=anchor,
-            auxiliary=auxiliary,
-            seed=seed,
             entropy=0.0,
             critic=1.0,
             compile=False,
+            **settings,
         )
         self.max_kl, self.damping, self.iterations = max_kl, damping, iterations
         self.backtracks, self.shrink = backtracks, shrink

@@ -12,11 +12,11 @@ from coil_rl.errors import UserError
 from coil_rl.foreign.controllers import RecordedGuide
 from coil_rl.learners.dynamic_coil import PhaseSchedule
 from coil_rl.report.runs import read_runs
-from coil_rl.robot.classifier import load_classifier
 from coil_rl.run import checkpoint
 from coil_rl.run.folder import report_changed_versions
 from coil_rl.run.judge import report_outcome
 from coil_rl.run.metrics import Metrics
+from coil_robot.classifier import load_classifier
 
 
 @pytest.fixture(params=["pipe", "device", "sparse"])

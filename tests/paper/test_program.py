@@ -173,7 +173,7 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
         ("table=1 budget=small", "budget=small must be one of smoke, paper, full"),
         (
             "table=1 budgets.paper.seeds=0",
-            "budgets.paper.seeds=0 must be greater than or equal to 1",
+            "budgets.paper.seeds=0 must be at least 1",
         ),
         ("-m table=1,4", "leave out -m, and request several as in table=[1,4]"),
     ],

@@ -38,7 +38,7 @@ WORDS = [  # of a run of PPO in env=gym env.id=odd_parts:Plain
     ("observes=[speed]", "the env has no entry speed to observe; it has observation"),
     ("budget.frames=1.5", "budget.frames=1.5 must be a whole number"),
     ("budget.frames=many", "budget.frames=many must be a whole number"),
-    ("budget.steps=100000000", "budget.steps=100000000 must be less than or equal to 65536"),
+    ("budget.steps=100000000", "budget.steps=100000000 must be at most 65536"),
     ("training.noise_correlation=much", "training.noise_correlation=much must be a number"),
     ("compile=maybe", "compile=maybe must be true or false"),
     ("seed=one", "seed=one must be a whole number"),

@@ -321,7 +321,7 @@ def test_policy_with_a_memory_is_a_guide(tmp_path):
             "DynamicCoil cannot train a network with a memory",
         ),
         (lambda: Gru(state=0), "state=0 must be at least 1"),
-        (lambda: Gru([0]), "hidden=0 must be at least 1"),
+        (lambda: Gru([0]), r"hidden\[0\]=0 must be at least 1"),
     ],
 )
 def test_unusable_memory_is_refused(make, message):
@@ -356,7 +356,7 @@ def test_more_minibatches_than_envs_are_refused():
             marks=pytest.mark.slow,
         ),
         (["learner=trpo"], "learner: TRPO cannot train a network with a memory"),
-        (["learner.network.state=0"], "learner.network: state=0 must be at least 1"),
+        (["learner.network.state=0"], "learner.network.state=0 must be at least 1"),
     ],
 )
 def test_mistake_in_the_configuration_is_one_sentence(overrides, message, tmp_path):

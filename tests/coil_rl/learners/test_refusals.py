@@ -53,18 +53,18 @@ OUT_OF_RANGE = {
 def test_values_out_of_range_are_refused(kind):
     env = worlds.pendulum(*([DiscreteActions(5)] if kind is DQN else []))
     for name, value in OUT_OF_RANGE[kind].items():
-        with pytest.raises(ValueError, match=f"{name}=.* must be"):
+        with pytest.raises(ValueError, match=rf"{name}.*=.* must be"):
             kind(env, ["th"], **{name: value})
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: KickstartLoss(kind="mse"), "kind='mse' must be one of likelihood, divergence"),
+        (lambda: KickstartLoss(kind="mse"), "kind='mse' must be 'likelihood' or 'divergence'"),
         (lambda: KickstartLoss(scale=0), "scale=0 must be more than 0"),
         (lambda: PhaseSchedule(0), "guides=0 must be at least 1"),
-        (lambda: PhaseSchedule(2, order="both"), "order='both' must be one of alternate"),
-        (lambda: PhaseSchedule(2, choice="first"), "choice='first' must be one of sequential"),
+        (lambda: PhaseSchedule(2, order="both"), "order='both' must be 'alternate', 'joint'"),
+        (lambda: PhaseSchedule(2, choice="first"), "choice='first' must be 'sequential' or"),
         (lambda: AfterFrames(0), "frames=0 must be at least 1"),
         (lambda: AtConvergence(0), "evaluations=0 must be at least 1"),
         (lambda: AtConvergence(improvement=-1), "improvement=-1 must be at least 0"),
@@ -131,5 +131,5 @@ def test_dynamic_coil_refuses_unusable_guides_and_values_out_of_range():
         ("critic_phases", "never"),
         ("guide_learning_rate", math.nan),
     ):
-        with pytest.raises(ValueError, match=f"{name}=.* must be"):
+        with pytest.raises(ValueError, match=rf"{name}.*=.* must be"):
             DynamicCoil(env, guides={"one": one}, **{name: value})

@@ -100,7 +100,7 @@ SWEEP = ["-m", *SMALL, "learner.gamma=7,0.9", "hydra.sweep.dir=sweep"]
 def test_failed_job_leaves_the_others_alone_and_the_same_command_goes_on(tmp_path):
     error = called("train", *SWEEP, cwd=tmp_path, code=2).stderr
     assert "1 job of this sweep failed: job 0" in error
-    assert "gamma=7 must be at least 0 and at most 1" in error
+    assert "gamma=7 must be at most 1" in error
     assert error.rstrip().endswith(shlex.join(["coil-train", *SWEEP]))
     (folder,) = [path for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
     assert is_evaluated(folder)
