@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import os
 import shlex
 import shutil
 import sys
@@ -197,6 +198,9 @@ def remove_unused(folder: Path) -> None:
     of_sweep = ("multirun.yaml", FAILED_JOBS)
     if all(path.is_dir() or path.name in of_sweep for path in folder.rglob("*")):
         shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(OSError):  # others are in it
+            if not folder.is_absolute():
+                os.removedirs(folder.parent)
 
 
 def is_sweep() -> bool:
