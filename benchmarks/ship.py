@@ -38,7 +38,6 @@ def ship(run: Path, name: str) -> Path:
     """Make a shipped policy, and return its folder.
 
     Args:
-        run: folder of a finished run.
         name: of the policy, such as "cone_track/coil".
 
     Raises:
@@ -84,13 +83,7 @@ def _add_checksums(name: str, folder: Path) -> None:
 
 
 def card(run: Path, name: str, settings: Mapping[str, Any]) -> str:
-    """Return the card of a policy.
-
-    Args:
-        run: folder of the run.
-        name: of the policy.
-        settings: configuration of the run.
-    """
+    """Return the card of a policy."""
     rows = list(csv.DictReader((run / EVALUATION).read_text().splitlines()))
     means = [row for row in rows if row["case"] == "mean"]
     cases = len({row["case"] for row in rows}) - 1
@@ -140,11 +133,7 @@ def _number(text: str) -> Any:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Entry point.
-
-    Args:
-        arguments: the run and the name.
-    """
+    """Entry point."""
     if len(arguments) != 2:
         raise SystemExit("give the folder of a run and a name: python -m benchmarks.ship RUN NAME")
     print(ship(Path(arguments[0]), arguments[1]))

@@ -14,14 +14,17 @@ from hydra._internal.config_repository import ConfigRepository
 from hydra.core.config_store import ConfigStore
 from hypothesis import settings
 from omegaconf import base
+from package_entries import find_entry_points
 from torch._export import utils
 
-from coil_rl.config.written import SHIPPED
+from coil_rl.config.guest_files import shipped_places
 from coil_rl.envs import Track, load_track
 from coil_rl.report import style
 
-OURS = (*SHIPPED, "pkg://coil_paper.")  # places of files of a configuration that no test changes
 LEVELS = Path(__file__).resolve().parents[2] / "shared" / "tracks"
+
+find_entry_points()
+OURS = shipped_places()  # of files of a configuration that no test changes
 
 # The tensors of the tests are too small for several threads.
 torch.set_num_threads(1)

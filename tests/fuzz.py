@@ -73,7 +73,7 @@ PHASES = "learner.phases.agent_phase.frames=32 learner.phases.guide_phase.frames
 ONCE, MINIBATCHES = "learner.epochs=1 learner.minibatches=2", "learner.minibatches=2"
 REPLAY = "learner.starts=16 learner.batch_size=8 learner.capacity=100"
 FOREST, GROUPS = (
-    "learner.regressor.estimator.n_estimators=3 learner.group_key=null",
+    "learner.regressor.n_estimators=3 learner.group_key=null",
     "learner.group_key=null",
 )
 LEARNERS = {
@@ -128,7 +128,7 @@ OF_RECORDINGS = [
     "reproduce table=6 budget=smoke results.table_6.recordings=[drive.mcap]",
 ]
 CLASSIFIER = (
-    "env.perception.classifier._target_=coil_rl.robot.classifier.load_classifier"
+    "env.perception.classifier._target_=coil_robot.load_classifier"
     " +env.perception.classifier.path=cones.json"
 )
 OF_CLASSIFIER = [

@@ -11,7 +11,7 @@ TINY = ["budget.num_envs=2", "budget.steps=16", "logger=none", *SHORT]
 TINY += [f"~evaluation.curve.cases.{name}" for name in ("evaluation", "selection")]
 REPLAY = ["learner.starts=16", "learner.ratio=1", "learner.batch_size=16"]
 ON_POLICY = ["learner.minibatches=2", "learner.epochs=1", "learner.action_gain=1"]
-FOREST = ["learner.regressor.estimator.n_estimators=3"]
+FOREST = ["learner.regressor.n_estimators=3"]
 # What makes a method small, and its policy do something before it has learned anything.
 OPTIONS = dict.fromkeys(("cheq", "ibrl", "policy_decorator", "rlpd", "wsrl", "q_filter"), REPLAY)
 OPTIONS |= {"dagger": FOREST, "oil": FOREST, "coil_anchored": ON_POLICY[:2]}

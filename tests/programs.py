@@ -13,11 +13,21 @@ from unittest.mock import patch
 from hydra._internal.hydra import Hydra
 
 import coil_rl.conf
+import coil_robot.conf
 from coil_rl.run.stopping import remember_trust
 
 ROOT = Path(__file__).parents[1]
 CONF = Path(coil_rl.conf.__path__[0])  # of the library that is tested, which may be a wheel
+CONFS = (CONF, Path(coil_robot.conf.__path__[0]))
 
+# Programs of guests, by command.
+GUESTS = {
+    "compare": "coil_rl.comparison.program",
+    "listen": "coil_studies.listening.program",
+    "drive": "coil_robot.programs.drive",
+    "replay": "coil_robot.programs.replay",
+    "reproduce": "coil_paper.program",
+}
 TRACK = ["track=folder", f"track.dir={ROOT / 'tests' / 'ring.csv'}"]
 LAP = [*TRACK, "env.laps=1", "env.rate=6"]
 SHORT_LAP = [*LAP, "env.time_limit=2"]
@@ -62,12 +72,12 @@ TINY_SWEEP = [
 
 def shipped(group):
     """Return the names of the files of a group of the configuration."""
-    return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
+    return sorted(file.stem for conf in CONFS for file in (conf / group).glob("*.yaml"))
 
 
 def module(name):
     """Return the module of a program."""
-    return "coil_paper.program" if name == "reproduce" else f"coil_rl.programs.{name}"
+    return GUESTS.get(name, f"coil_rl.programs.{name}")
 
 
 def command(name, *arguments):

@@ -11,24 +11,29 @@ from omegaconf import OmegaConf
 from programs import CONF
 
 import coil_paper.conf
+import coil_robot.conf
 
-PROJECT = ("coil_rl.", "coil_paper.")
+PROJECT = ("coil_rl.", "coil_paper.", "coil_robot.", "coil_studies.")
 # Folders in which a file changes the defaults of a class for a method or an experiment.
 VARIATION_FOLDERS = ("experiment", "method", "preset", "paper/experiment")
 # Other deliberate variations, by file. A key stands for all keys that begin with it.
 VARIATIONS = {
     "env/cone_track.yaml": ["env.reward"],  # None in the constructor: the rewards of the paper
     "env/driving_tasks.yaml": ["env.reward"],
-    "env/simulated_robot.yaml": ["env.reward", "env.lidar", "env.car_length"],  # rounded length
+    "robot/env/simulated_robot.yaml": [
+        "env.reward",
+        "env.lidar",
+        "env.car_length",
+    ],  # rounded length
     "env/gym.yaml": [
         "env.options",
         "env.controllers",
         "env.workers",
     ],  # None in the constructor: no options, no controllers; from Python processes are asked for
     "env/torchrl.yaml": ["env.max_steps"],
-    "env/mcap_replay.yaml": ["evaluation.env."],  # two laps of robots that start alike
+    "robot/env/mcap_replay.yaml": ["evaluation.env."],  # two laps of robots that start alike
     "task/cones_noisy_view.yaml": ["method.transforms.view.sigma"],
-    "robot/replayed.yaml": ["car_length"],
+    "robot/robot/replayed.yaml": ["car_length"],
     "disturb/late.yaml": ["min_lag", "max_lag", "in_keys", "memory_key"],
     "guide/authors.yaml": ["oddities"],
     "guide/undertuned.yaml": ["gain"],
@@ -39,7 +44,11 @@ VARIATIONS = {
     "paper/reproduce/table_5.yaml": ["worlds"],
     "paper/reproduce/table_6.yaml": ["experiments", "worlds", "car_length"],
 }
-FOLDERS = {"": CONF, "paper/": Path(coil_paper.conf.__path__[0])}
+FOLDERS = {
+    "": CONF,
+    "paper/": Path(coil_paper.conf.__path__[0]),
+    "robot/": Path(coil_robot.conf.__path__[0]),
+}
 FILES = {
     f"{prefix}{path.relative_to(conf).as_posix()}": path
     for prefix, conf in FOLDERS.items()

@@ -14,6 +14,8 @@ LINKED = {
     "transforms": "coil_rl.transforms",
     "conf": "coil_rl.conf",
     "paper": "coil_paper",
+    "studies": "coil_studies",
+    "robot": "coil_robot",
 }
 TENSOR_LIBRARIES = {"torch", "tensordict", "torchrl"}
 
@@ -26,11 +28,11 @@ PUBLIC = [
     "coil_rl.guides",
     "coil_rl.imitation",
     "coil_rl.learners",
-    "coil_rl.listening",
-    "coil_rl.replay",
     "coil_rl.report",
-    "coil_rl.robot",
     "coil_rl.transforms",
+    "coil_robot",
+    "coil_studies",
+    "coil_studies.listening",
 ]
 
 # Folder -> allowed imports besides the standard library and the folder itself.
@@ -103,7 +105,7 @@ def public_names():
     names = {*PUBLIC, *(f"coil_rl.{name}" for name in coil_rl.__all__)}
     for package in PUBLIC:
         init = ast.parse((ROOT / package.replace(".", "/") / "__init__.py").read_text("utf-8"))
-        imports = [node for node in init.body if isinstance(node, ast.ImportFrom)]
+        imports = [node for node in ast.walk(init) if isinstance(node, ast.ImportFrom)]
         aliases = [alias for node in imports for alias in node.names]
         names |= {f"{package}.{alias.asname}" for alias in aliases if alias.asname == alias.name}
     return names
@@ -120,11 +122,12 @@ def test_paper_imports_only_what_is_public() -> None:
     assert not wrong, "paper/ is written as a stranger's package; use, or make, public names"
 
 
-def test_library_does_not_name_the_paper_package() -> None:
+@pytest.mark.parametrize("guest", ["coil_paper", "coil_robot"])
+def test_library_does_not_name_its_guests(guest: str) -> None:
     folders = ["coil_rl", "envs", "transforms", "conf"]
     files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
     texts = [path for path in files if path.suffix in (".py", ".yaml")]
-    assert [str(path) for path in texts if "coil_paper" in path.read_text("utf-8")] == []
+    assert [str(path) for path in texts if guest in path.read_text("utf-8")] == []
 
 
 def test_only_modules_of_that_name_import_gymnasium() -> None:

@@ -20,6 +20,8 @@ LINKS = {
     "coil_rl/transforms": "../transforms",
     "coil_rl/conf": "../conf",
     "coil_paper": "paper",
+    "coil_studies": "studies",
+    "coil_robot": "robot",
 }
 
 SHIPPED = (".md", ".csv", ".pt", ".yaml")  # files of the shipped policies
@@ -95,7 +97,14 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
         "envs": ["*.py", "*.json", "tracks/**/*.csv"],
     }
     patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"], "paper": ["*.py", "*.yaml"]}
-    installed_as = {"coil_rl": "coil_rl", "paper": "coil_paper"}
+    patterns["studies"] = ["*.py", "*.yaml"]
+    patterns["robot"] = ["*.py", "*.yaml", "*.json"]
+    installed_as = {
+        "coil_rl": "coil_rl",
+        "paper": "coil_paper",
+        "robot": "coil_robot",
+        "studies": "coil_studies",
+    }
     expected = set()
     for folder, globs in patterns.items():
         package = installed_as.get(folder, f"coil_rl/{folder}")
@@ -112,9 +121,14 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
     } <= names
 
 
-def test_wheel_has_two_import_names(wheel: Path) -> None:
+def test_wheel_has_three_import_names(wheel: Path) -> None:
     top = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
-    assert {name for name in top if not name.endswith(".dist-info")} == {"coil_rl", "coil_paper"}
+    assert {name for name in top if not name.endswith(".dist-info")} == {
+        "coil_rl",
+        "coil_paper",
+        "coil_studies",
+        "coil_robot",
+    }
 
 
 @pytest.mark.slow
@@ -123,10 +137,20 @@ def test_sdist_contains_everything_that_its_tests_need(tree: Path) -> None:
     [sdist] = tree.parent.glob("*.tar.gz")
     with tarfile.open(sdist) as file:
         names = {name.partition("/")[2] for name in file.getnames()}
-    folders = ["benchmarks", "coil_rl", "conf", "docs", "envs", "examples", "paper", "tests"]
+    folders = [
+        "benchmarks",
+        "coil_rl",
+        "conf",
+        "docs",
+        "envs",
+        "examples",
+        "paper",
+        "robot",
+        "tests",
+    ]
     paths = [
         path
-        for folder in [*folders, "transforms"]
+        for folder in [*folders, "tests", "transforms"]
         for path in (tree / folder).rglob("*")
         if path.is_file()
     ]

@@ -19,12 +19,11 @@ from torch import nn
 
 from coil_rl.config import load
 from coil_rl.config.build import build_guides, build_learner, env_maker
-from coil_rl.config.fingerprint import fingerprint as fingerprint_of_object
 from coil_rl.config.given import kept_objects
 from coil_rl.config.nodes import find_target
 from coil_rl.config.schema import TrainConfig, fingerprint
+from coil_rl.config.source import code_of_user, identity_of
 from coil_rl.config.start import run_configured
-from coil_rl.config.user_code import code_of_user
 from coil_rl.errors import UserError
 from coil_rl.files import temporary, whole_file
 from coil_rl.guides import ControllerGuide
@@ -86,7 +85,7 @@ def _hash_of_user(config: DictConfig, name: str) -> list[str]:
     things = kept_objects(config, "env")
     if find_target(guide.get("_target_"), f"guide.{name}") is ControllerGuide:
         things += kept_objects(config, "guide")
-    found = [*map(fingerprint_of_object, things), *code_of_user(config, ("guide", "env"))]
+    found = [*map(identity_of, things), *code_of_user(config, ("guide", "env"))]
     if not found:
         return []
     return [hashlib.sha256(" ".join(found).encode()).hexdigest()[:10]]

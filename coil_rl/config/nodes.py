@@ -20,14 +20,7 @@ from coil_rl.ranges import yaml_text
 LARGEST_ARGUMENTS = {
     ("CatFrames", "N"): 1000,
     ("TimeMaxPool", "T"): 1000,
-    ("PolynomialFeatures", "degree"): 10,
-    ("SplineTransformer", "n_knots"): 1000,
-    ("SplineTransformer", "degree"): 10,
-    ("MLPRegressor", "hidden_layer_sizes"): 4096,
-    ("HistGradientBoostingRegressor", "max_iter"): 10_000,
-    ("TheilSenRegressor", "max_subpopulation"): 1_000_000,
 }
-MOST_ESTIMATORS = 10_000  # in an ensemble
 
 
 def build(node: Any, name: str, expected: type | None = None, **arguments: Any) -> Any:
@@ -105,15 +98,10 @@ def _check_size(target: Callable[..., Any], node: Mapping[str, Any], name: str) 
     """Raise a `UserError` for an argument of another library that memory cannot hold."""
     for key, value in node.items():
         largest = LARGEST_ARGUMENTS.get((getattr(target, "__name__", ""), key))
-        if key == "n_estimators":
-            largest = MOST_ESTIMATORS
-        numbers = value if isinstance(value, (list, tuple)) else [value]
-        for number in numbers:
-            if largest is not None and isinstance(number, int) and number > largest:
-                raise UserError(
-                    f"{name}.{key}={yaml_text(value)} must be at most {largest}: memory grows "
-                    "with it"
-                )
+        if largest is not None and isinstance(value, int) and value > largest:
+            raise UserError(
+                f"{name}.{key}={yaml_text(value)} must be at most {largest}: memory grows with it"
+            )
 
 
 def _converted(node: Any) -> Any:

@@ -24,6 +24,7 @@ from coil_rl.config.build import assemble
 from coil_rl.config.check import check_parts, make_folder
 from coil_rl.config.default_method import method_for
 from coil_rl.config.given import import_path, keep
+from coil_rl.config.guest_files import packages
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import trust_own
 from coil_rl.config.unread import check_read
@@ -254,9 +255,10 @@ def _own_hydra() -> Iterator[None]:
 
 
 def _shipped(group: str) -> set[str]:
-    """Return the names of the files in a group of the shipped configuration."""
-    folder = resources.files("coil_rl.conf") / group
-    return {file.name.removesuffix(".yaml") for file in folder.iterdir()}
+    """Return the names of the files of coil-rl and of its guests in a group."""
+    folders = [resources.files(package) / group for package in packages()]
+    files = [file for folder in folders if folder.is_dir() for file in folder.iterdir()]
+    return {file.name.removesuffix(".yaml") for file in files}
 
 
 Words = tuple[list[str], dict[str, Any]]  # of the command line, and nodes for objects by their key

@@ -12,10 +12,10 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.envs import McapReplayEnv, RecordingError
+from coil_rl.envs.recordings.demonstrations import about_demonstrations
 from coil_rl.envs.recordings.mcap_files import read_messages
 from coil_rl.errors import UserError
 from coil_rl.output import say
-from coil_rl.replay.demonstrations import about_demonstrations
 from coil_rl.run.parts import TRAIN, EnvMaker
 
 ONLY_IMITATION = (

@@ -11,7 +11,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.config.logger import shipped_logger
 from coil_rl.config.measured import complete_measures, is_complete
-from coil_rl.config.old_names import OLD_NAMES
+from coil_rl.config.old_names import renamed
 from coil_rl.config.schema import IGNORED_KEYS, TrainConfig
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import check_config
@@ -69,7 +69,7 @@ def read_config(
         logger = shipped_logger(values.get("logger"))
         if logger is not None or not goes_on:
             values["logger"] = None
-        saved = OmegaConf.create(_renamed(values))
+        saved = OmegaConf.create(renamed(values, path))
         check_config(saved, path)
         if logger is not None:
             saved["logger"] = logger
@@ -81,15 +81,6 @@ def read_config(
     except (OmegaConfBaseException, yaml.YAMLError, ValueError, OSError) as error:
         raise UserError(f"{path} is not the configuration of a run ({sentence(error)})") from error
     return config
-
-
-def _renamed(node: Any) -> Any:
-    """Return nested values with today's names of parts that moved."""
-    if isinstance(node, Mapping):
-        return {key: _renamed(value) for key, value in node.items()}
-    if isinstance(node, list):
-        return [_renamed(value) for value in node]
-    return OLD_NAMES.get(node, node) if isinstance(node, str) else node
 
 
 def holds(folder: Path, config: DictConfig) -> bool:

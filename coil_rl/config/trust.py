@@ -8,7 +8,7 @@ each of them must be on a list of full names before anything is imported:
 
 - what the shipped configuration names in the groups of a run, also as an alternative in a comment:
   a part that has its YAML file is on the list;
-- the estimators of scikit-learn and the transforms of TorchRL in `conf/trusted.yaml`;
+- some transforms of TorchRL, none of which writes a file where the folder says;
 - what the configuration of the command itself names, because the command uses it anyway;
 - anything that is defined in a package that the user trusts.
 
@@ -20,7 +20,6 @@ on the list may read a file that its arguments name, but must not write one.
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import fields
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
@@ -29,10 +28,9 @@ from typing import Any, NamedTuple
 import hydra.utils
 from omegaconf import DictConfig, OmegaConf
 
-from coil_rl.config.schema import TrainConfig
+from coil_rl.config.guest_files import packages
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.run.stopping import remember_trust
-from coil_rl.trusted import ESTIMATORS, TRUSTED
 
 ENTRY_POINTS = (
     "coil_rl.trusted"  # a package with an entry point of its name in this group is trusted
@@ -51,9 +49,19 @@ NEVER_TRUSTED = frozenset(sys.stdlib_module_names) | {
     "torch",
 }
 
-NAMED = ESTIMATORS.union(
-    ["coil_rl.config.given.kept"],  # it looks an object up that the user handed over in Python
-    (f"torchrl.envs.{name}" for name in TRUSTED["transforms"]),
+NAMED = frozenset(
+    [
+        "coil_rl.config.given.kept",  # it looks an object up that the user handed over in Python
+        "torchrl.envs.CatFrames",
+        "torchrl.envs.ClipTransform",
+        "torchrl.envs.DoubleToFloat",
+        "torchrl.envs.ObservationNorm",
+        "torchrl.envs.RewardClipping",
+        "torchrl.envs.RewardScaling",
+        "torchrl.envs.StepCounter",
+        "torchrl.envs.TimeMaxPool",
+        "torchrl.envs.VecNorm",
+    ]
 )
 
 _packages: frozenset[str] = frozenset()  # of the option `trust`
@@ -143,10 +151,6 @@ def check_config(config: DictConfig, path: Path) -> None:
             _check_target(target, name, path)
         elif str(key).startswith("_") and key != "_partial_":
             raise UserError(f"{path}: {name:.100} is not a key of a run's configuration; remove it")
-        if (key == "memory" or str(key).endswith("__memory")) and value is not None:
-            raise UserError(
-                f"{path}: {name:.100} names a cache, whose files can run code; set it to null"
-            )
         # Only a logger is saved with references, and none to itself, so that they cannot grow.
         known = r"(?!)"
         if name.startswith("logger.") and key != "_target_":
@@ -238,18 +242,17 @@ def _check_origin(entry: _Entry, package: str) -> None:
 
 @cache
 def _shipped_targets() -> frozenset[str]:
-    """Return all targets that the shipped configuration names in the groups of a run.
+    """Return all targets that the files of coil-rl and of its guests name in their groups.
 
     Loggers are not among them, because what they write and where is up to their arguments.
     """
-    conf = resources.files("coil_rl.conf")
     found: set[str] = set()
-    others = ("cases", "network", "robot", "transform")
-    for name in (*(field.name for field in fields(TrainConfig)), *others):
-        group = conf / name
-        if name == "logger" or not group.is_dir():
-            continue
-        for file in group.iterdir():
-            if ".yaml" in file.name:
-                found |= set(re.findall(r"_target_: ([\w.]+)", file.read_text(encoding="utf-8")))
+    for package in packages():
+        for group in resources.files(package).iterdir():
+            if group.name in ("hydra", "logger") or not group.is_dir():
+                continue
+            for file in group.iterdir():
+                if ".yaml" in file.name:
+                    text = file.read_text(encoding="utf-8")
+                    found |= set(re.findall(r"_target_: ([\w.]+)", text))
     return frozenset(found)

@@ -15,10 +15,9 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from coil_rl.config.guest_files import shipped_places
 from coil_rl.errors import UserError
 
-# Where the files are whose order of composition is meant.
-SHIPPED = ("pkg://coil_rl.", "pkg://hydra", "structured://")
 SEVERAL = ("guide", "disturb", "degrade")  # groups of which several files may be chosen
 REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
 
@@ -75,7 +74,8 @@ def keep_written(
             )
     with open_dict(config):
         # To look for files of users takes as long as to compose all files.
-        if not all(source.full_path().startswith(SHIPPED) for source in files.get_sources()):
+        places = [source.full_path() for source in files.get_sources()]
+        if not all(place.startswith(shipped_places()) for place in places):
             defaults = loader.compute_defaults_list(config_name, overrides, RunMode.RUN).defaults
             # A choice of a file, such as method=coil, gives no value.
             keys = [key_of(text) for text in task]
@@ -160,7 +160,7 @@ def _written(defaults: Iterable[Any], files: Any) -> Iterator[Written]:
     parents = {default.config_path: default.parent for default in defaults}
     for default in defaults:
         found = files.load_config(default.config_path)
-        if found is None or found.path.startswith(SHIPPED):
+        if found is None or found.path.startswith(shipped_places()):
             continue
         lists = frozenset(f"{path}.yaml" for path in _ancestors(default, parents))
         values: Any = OmegaConf.to_container(found.config, resolve=False)

@@ -473,8 +473,8 @@ class EntryGuide(TensorDictModule):
 class RecordedGuide(TensorDictModuleBase):
     """Actions from a CSV file by the number of the step, from the first step of every episode on.
 
-    The last one is held after the end of the file. The steering of a robot's recording is
-    `RecordingGuide`.
+    The last one is held after the end of the file. The steering of a robot's recording is another
+    guide, see `docs/imitation_from_recordings.md`.
 
     Args:
         file: a CSV of numbers, [T, A] in the env's unit, one line for each step, separated by

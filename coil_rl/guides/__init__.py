@@ -5,7 +5,6 @@ from coil_rl.foreign.controllers import EntryGuide as EntryGuide
 from coil_rl.foreign.controllers import PerRow as PerRow
 from coil_rl.foreign.controllers import RecordedGuide as RecordedGuide
 from coil_rl.guides.racing_line import RacingLineGuide as RacingLineGuide
-from coil_rl.guides.recording import RecordingGuide as RecordingGuide
 from coil_rl.guides.simple import ConstantGuide as ConstantGuide
 from coil_rl.guides.simple import FollowAdvice as FollowAdvice
 from coil_rl.guides.simple import RandomGuide as RandomGuide

@@ -57,16 +57,15 @@ class Imitation(Learner):
         dataset: [N] with the observed entries, `action` (of the guide) and the track.
 
     Example:
-        >>> from sklearn.linear_model import LinearRegression
         >>> from torchrl.envs import TransformedEnv
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
         >>> from coil_rl.guides import SplineGuide
-        >>> from coil_rl.imitation import SklearnRegressor
+        >>> from coil_rl.imitation import LinearRegressor
         >>> from coil_rl.run.rollout import Rollout
         >>> from coil_rl.transforms import GuideActions
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_envs=7, assignment="cyclic")
         >>> env = TransformedEnv(env, GuideActions({"middle": SplineGuide()}))
-        >>> learner = Imitation(env, regressor=SklearnRegressor(LinearRegression()))
+        >>> learner = Imitation(env, regressor=LinearRegressor())
         >>> rollout = Rollout(env, learner.policy, steps=20, keys=learner.keys)
         >>> metrics = learner.update(rollout.collect())
     """

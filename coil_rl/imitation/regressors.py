@@ -1,4 +1,4 @@
-"""Regressors for imitation: a neural network, and any regressor of scikit-learn.
+"""Regressors for imitation: what each of them is, a neural network, and a linear function.
 
 Imitation needs few things of a regressor: it fits vectors to vectors from scratch, it predicts, and
 its fitted state can be saved. So the learner is the same for a network, a forest or a line.
@@ -6,28 +6,19 @@ its fitted state can be saved. So the learner is the same for a network, a fores
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import Self
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import ClassVar, Self
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, clone, is_regressor
-from sklearn.ensemble import (
-    ExtraTreesRegressor,
-    GradientBoostingRegressor,
-    RandomForestRegressor,
-)
-from sklearn.utils import get_tags
+from scipy import linalg
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.modules import MLP
 
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.errors import UserError
-from coil_rl.imitation import archive
 from coil_rl.learners.encoders import Mlp
 from coil_rl.schedules import Linear, Schedule, schedule
 
@@ -36,7 +27,12 @@ class Regressor(nn.Module, ABC):
     """Regression from vectors to vectors; the fitted state is the `state_dict`.
 
     The constructor makes a specification; `fresh` makes a regressor that can be fitted.
+
+    Attributes:
+        is_network: whether it predicts by operations of torch alone, so that it can be exported.
     """
+
+    is_network: ClassVar[bool] = True
 
     @abstractmethod
     def fresh(self, inputs: int, outputs: int) -> Self:
@@ -134,171 +130,49 @@ class NetworkRegressor(Regressor):
         return self.y_mean + self.y_scale * self.layers((x - self.x_mean) / self.x_scale)
 
 
-class SklearnRegressor(Regressor):
-    """A regressor of scikit-learn, which may be a pipeline or a search.
-
-    Its state is a tensor with the bytes of a skops archive.
-
-    Args:
-        estimator: the regressor, of which only the parameters are used; a `random_state` that is
-            None is set to 0, and `n_jobs` to at most the number of processors. Anything else is a
-            `ValueError`, and so are boosted trees that begin with another regressor.
+class LinearRegressor(Regressor):
+    """A linear function by least squares, in double precision.
 
     Example:
-        >>> from sklearn.linear_model import LinearRegression
         >>> x = torch.rand(8, 2)
-        >>> regressor = SklearnRegressor(LinearRegression()).fresh(inputs=2, outputs=1)
+        >>> regressor = LinearRegressor().fresh(inputs=2, outputs=1)
         >>> regressor.fit(x, x[:, :1] - x[:, 1:])
         >>> regressor(torch.tensor([3.0, 1.0])).round(decimals=3)
         tensor([2.])
     """
 
-    def __init__(self, estimator: BaseEstimator) -> None:
-        super().__init__()
-        if not isinstance(estimator, BaseEstimator) or not is_regressor(estimator):
-            raise ValueError(
-                f"estimator={estimator!r} is not a regressor of scikit-learn, such as "
-                "LinearRegression()"
-            )
-        self.estimator = _with_parameter(
-            clone(estimator), "random_state", lambda value: 0 if value is None else value
-        )
-        self.estimator = _with_parameter(self.estimator, "n_jobs", _possible_jobs)
-        _check_boosted(self.estimator)
-        self.inputs, self.outputs = 0, 1
-        self.model: BaseEstimator | None = None
-        self._archive: Tensor | None = torch.empty(0, dtype=torch.uint8)
+    weights: Tensor
+    bias: Tensor
 
-    def fresh(self, inputs: int, outputs: int) -> SklearnRegressor:
-        """Return an unfitted regressor, which predicts 0.
-
-        Args:
-            inputs: length of the inputs.
-            outputs: length of the outputs; more than 1 is a `ValueError` for an estimator that
-                predicts one number only.
-        """
-        if outputs > 1 and not get_tags(self.estimator).target_tags.multi_output:
-            raise ValueError(
-                f"{self.estimator!r} predicts one number, but an action has {outputs} here; put it "
-                "into sklearn.multioutput.MultiOutputRegressor"
-            )
-        fresh = SklearnRegressor(self.estimator)
-        fresh.inputs, fresh.outputs = inputs, outputs
+    def fresh(self, inputs: int, outputs: int) -> LinearRegressor:
+        """Return an unfitted regressor, which predicts 0."""
+        fresh = LinearRegressor()
+        fresh.weights = nn.Buffer(torch.zeros(inputs, outputs, dtype=torch.float64))
+        fresh.bias = nn.Buffer(torch.zeros(outputs, dtype=torch.float64))
         return fresh
 
     def fit(self, x: Tensor, y: Tensor) -> None:
-        """Fit y [N, outputs] to x [N, inputs] from scratch, in double precision.
-
-        Data that the estimator refuses are a `UserError`.
-        """
-        if self.outputs == 1 and get_tags(self.estimator).target_tags.single_output:
-            y = y.squeeze(-1)
-        try:
-            fitted = clone(self.estimator).fit(x.cpu().double().numpy(), y.cpu().double().numpy())
-        except Exception as error:  # whatever a library raises
-            name = type(self.estimator).__name__
-            raise UserError(
-                f"{name} cannot be fitted to {len(x)} samples of {x.shape[-1]} inputs "
-                f"({type(error).__name__}: {error!s:.300}); change its parameters, or use another "
-                "regressor"
-            ) from error
-        # For small batches threads cost more than they save, and they sum in random order.
-        self.model = _with_parameter(fitted, "n_jobs", lambda _: 1)
-        self._archive = None
+        """Fit y [N, outputs] to x [N, inputs] from scratch."""
+        x_mean, y_mean = x.double().mean(0), y.double().mean(0)
+        centred = (x.double() - x_mean).cpu().numpy(), (y.double() - y_mean).cpu().numpy()
+        self.weights.copy_(torch.from_numpy(linalg.lstsq(*centred)[0]))
+        self.bias.copy_(y_mean - x_mean @ self.weights)
 
     def forward(self, x: Tensor) -> Tensor:
         """Predict y [*batch, outputs] for x [*batch, inputs]."""
-        if self.model is None:
-            return x.new_zeros(*x.shape[:-1], self.outputs)
-        rows = x.detach().reshape(-1, x.shape[-1]).cpu().numpy()
-        y = _predict(self.model, rows)
-        if np.size(y) != len(rows) * self.outputs:
-            raise UserError(
-                f"{type(self.model).__name__} predicts {np.shape(y)} for {len(rows)} rows and "
-                f"{self.outputs} outputs; use another regressor"
-            )
-        prediction = torch.from_numpy(np.asarray(y, np.float32)).to(x)
-        return prediction.reshape(*x.shape[:-1], self.outputs)
-
-    def get_extra_state(self) -> Tensor:
-        """Return the fitted regressor as bytes, [n] uint8; empty before the first fit."""
-        if self._archive is None:
-            self._archive = torch.frombuffer(bytearray(archive.dump(self.model)), dtype=torch.uint8)
-        return self._archive
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Restore a fitted regressor from its bytes, [n] uint8.
-
-        If that could run code or if the bytes do not fit, a `UserError` is raised.
-        """
-        content = state.cpu()
-        model = archive.load(content.numpy().tobytes()) if len(content) else None
-        inputs = getattr(model, "n_features_in_", self.inputs)
-        if inputs != self.inputs:
-            raise UserError(
-                f"the state holds a regressor of {inputs} inputs, but there are {self.inputs} here"
-            )
-        if model is not None:
-            try:
-                prediction = _predict(model, np.zeros((3, self.inputs), np.float32))
-                usable = np.size(prediction) == 3 * self.outputs and np.isfinite(prediction).all()
-            except Exception as error:
-                raise UserError(
-                    f"the state holds a regressor that cannot predict ({type(error).__name__})"
-                ) from error
-            if not usable:
-                raise UserError(
-                    f"the state is a regressor that does not predict {self.outputs} numbers; train "
-                    "again"
-                )
-        self.model, self._archive = model, content
+        return (x.double() @ self.weights + self.bias).to(x)
 
 
-def _predict(model: BaseEstimator, x: NDArray[np.float32]) -> NDArray[np.floating]:
-    """Predict y for x [N, inputs].
-
-    For forests this leaves out scikit-learn's checks, which dominate for small batches.
-    """
-    forest = type(model) in (RandomForestRegressor, ExtraTreesRegressor)
-    if forest and x.shape[1] == model.n_features_in_ and np.isfinite(x).all():
-        trees = model.estimators_
-        return sum(tree.tree_.predict(x.astype(np.float32)) for tree in trees) / len(trees)
-    return model.predict(x)
-
-
-def _possible_jobs(jobs: object) -> object:
-    """Return a number of processes that is at most that of the processors."""
-    most = os.cpu_count() or 1
-    return max(-most, min(jobs, most)) if isinstance(jobs, int) else jobs
-
-
-def _check_boosted(estimator: BaseEstimator) -> None:
-    """Raise a `ValueError` for boosted trees that could not be saved.
+@contextmanager
+def needs_scikit_learn(what: str) -> Iterator[None]:
+    """Say which extra brings scikit-learn, if it cannot be imported in the block.
 
     Args:
-        estimator: the estimator, which may hold others.
+        what: needs it.
     """
-    for part in (estimator, *estimator.get_params().values()):
-        if not isinstance(part, GradientBoostingRegressor) or part.init in (None, "zero"):
-            continue
-        raise ValueError(
-            f"{part!r:.200} begins with another regressor, which cannot be checked when it is "
-            "loaded; leave init out, or set it to zero"
-        )
-
-
-def _with_parameter(
-    estimator: BaseEstimator, name: str, change: Callable[[object], object]
-) -> BaseEstimator:
-    """Change a parameter of an estimator and of the estimators inside it.
-
-    Args:
-        estimator: the outer one.
-        name: of the parameter.
-        change: takes the old value and returns the new one.
-    """
-    changed = {}
-    for key, value in estimator.get_params().items():
-        if key.split("__")[-1] == name:
-            changed[key] = change(value)
-    return estimator.set_params(**changed)
+    try:
+        yield
+    except ImportError as error:
+        raise UserError(
+            f"{what} needs scikit-learn ({error}): python -m pip install 'coil-rl[imitate]'"
+        ) from error

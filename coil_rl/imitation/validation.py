@@ -5,12 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.metrics import mean_squared_error, r2_score
-from sklearn.model_selection import GroupKFold, train_test_split
 from torch import Tensor
 
 from coil_rl.errors import UserError
-from coil_rl.imitation.regressors import Regressor
+from coil_rl.imitation.regressors import Regressor, needs_scikit_learn
 from coil_rl.output import progress
 
 MAX_FOLDS = 10
@@ -44,6 +42,8 @@ def cross_validate(
             f"{len(x)} samples are too few to validate; use at least {MIN_SAMPLES}, or "
             "learner.validate=false"
         )
+    with needs_scikit_learn("the validation (learner.validate=true)"):
+        from sklearn.model_selection import train_test_split
     rows = np.arange(len(x))
     splits: dict[str, list[Split]] = {
         "random_split": [train_test_split(rows, test_size=TEST_SHARE, random_state=seed)]
@@ -80,6 +80,8 @@ def group_splits(groups: Tensor) -> list[Split]:
             "all samples are from one track, so no track can be left out; set "
             "learner.group_key=null"
         )
+    with needs_scikit_learn("the validation (learner.validate=true)"):
+        from sklearn.model_selection import GroupKFold
     return list(GroupKFold(min(count, MAX_FOLDS)).split(labels, groups=labels))
 
 
@@ -95,8 +97,10 @@ def scores(predictions: Sequence[Tensor], targets: Sequence[Tensor], name: str) 
         targets: [N, A] of each fold.
         name: NAME, of the split.
     """
-    numbers = (torch.cat(list(targets)).cpu().numpy(), torch.cat(list(predictions)).cpu().numpy())
-    return {
-        f"mse_{name}": float(mean_squared_error(*numbers)),
-        f"r2_{name}": float(r2_score(*numbers, multioutput="variance_weighted")),
-    }
+    y, predicted = (torch.cat(list(each)).cpu().numpy() for each in (targets, predictions))
+    errors = (y - predicted) ** 2
+    unexplained, spread = errors.sum(0), ((y - y.mean(0)) ** 2).sum(0)
+    r2 = np.mean(unexplained == 0)
+    if spread.any():
+        r2 = np.average(1 - unexplained / np.where(spread, spread, 1), weights=spread)
+    return {f"mse_{name}": float(errors.mean(0).mean()), f"r2_{name}": float(r2)}

@@ -34,7 +34,7 @@ import coil_rl
 from coil_rl import McapReplayEnv, SimulatedRobotEnv, SplineGuide, evaluate_policy
 from coil_rl.envs import Perception, read_recording, record_drives, simulated_cone_classifier
 from coil_rl.imitation import NetworkRegressor
-from coil_rl.replay import recorded_steering
+from coil_robot import recorded_steering
 
 matplotlib.use("Agg")  # whatever MPLBACKEND names
 torch.set_num_threads(1)

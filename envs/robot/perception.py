@@ -36,7 +36,7 @@ MAX_DISTANCE = 1.1  # greatest plausible distance, as a multiple of the range of
 class ConeClassifier:
     """Support vector machines that tell thin cones, thick cones and other clusters apart.
 
-    `coil_rl.robot` trains the machines with scikit-learn; the decision in NumPy is many times
+    Another package trains the machines with scikit-learn; the decision in NumPy is many times
     faster for a few clusters. The kernel is radial, exp(-gamma |a - b|^2), on standardised
     features. Of the two decision values, the first is positive for thick cones and negative for
     thin ones; the second is negative for clusters unlike those of the training.

@@ -14,8 +14,8 @@ from sklearn.decomposition import PCA
 from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
+import coil_robot as cones
 from coil_paper.reproduce.result import NO_RUNS, PAGES, Result, Runs
-from coil_rl import robot as cones
 from coil_rl.envs import read_recording
 from coil_rl.envs.robot import FEATURES, labelled_drive, record_labelling_drives
 from coil_rl.report import markdown_table, style, write_csv

@@ -24,8 +24,8 @@ from torchrl.envs import EnvBase
 from coil_rl.envs import Recording, RecordingError, Track, read_recording, record_drives
 from coil_rl.envs.recordings import SIMULATED
 from coil_rl.envs.robot import SPEED, THICK, THIN, RobotCourse, laps, middle_line, track_of
-from coil_rl.replay import recorded_steering
 from coil_rl.report import style
+from coil_robot import recorded_steering
 
 Array = NDArray[np.float64]
 Row = Mapping[str, Any]

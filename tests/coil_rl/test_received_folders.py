@@ -12,13 +12,11 @@ from coil_rl.errors import UserError
 from coil_rl.foreign.controllers import RecordedGuide
 from coil_rl.learners.dynamic_coil import PhaseSchedule
 from coil_rl.report.runs import read_runs
-from coil_rl.robot.classifier import load_classifier
 from coil_rl.run import checkpoint
 from coil_rl.run.folder import report_changed_versions
 from coil_rl.run.judge import report_outcome
 from coil_rl.run.metrics import Metrics
-
-SKLEARN = "coil_rl.imitation.SklearnRegressor"
+from coil_robot.classifier import load_classifier
 
 
 @pytest.fixture(params=["pipe", "device", "sparse"])
@@ -97,20 +95,11 @@ def test_guides_and_classifiers_refuse_a_file_without_an_end(tmp_path, endless):
         {"_target_": "coil_rl.learners.Gru", "state": 10**9},
         {"_target_": "coil_rl.learners.Cnn", "channels": [10**9], "kernels": [1], "strides": [1]},
         {"_target_": "coil_rl.imitation.NetworkRegressor", "hidden": [10**9]},
-        {"_target_": SKLEARN, "estimator": {"_target_": "sklearn.ensemble.RandomForestRegressor"}},
-        {
-            "_target_": SKLEARN,
-            "estimator": {
-                "_target_": "sklearn.neural_network.MLPRegressor",
-                "hidden_layer_sizes": [10**9],
-            },
-        },
+        {"_target_": "coil_rl.imitation.ForestRegressor", "n_estimators": 10**9},
     ],
     ids=lambda node: node["_target_"].rpartition(".")[2],
 )
 def test_size_beyond_any_memory_is_refused(node):
-    if "estimator" in node and "hidden_layer_sizes" not in node["estimator"]:
-        node["estimator"]["n_estimators"] = 10**9
     with pytest.raises(UserError, match="at most"):
         build(node, "part")
 

@@ -228,8 +228,6 @@ def test_target_is_refused_wherever_it_is(key, saved, tmp_path):
             {"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "a"},
             "could run code",
         ),
-        ("learner.memory", "cache", "learner.memory names a cache, whose files can run code"),
-        ("learner.grid", {"steps__memory": ["cache"]}, "steps__memory names a cache"),
         ("guide", {"../../x": {}}, "must not contain / or"),
         ("label", "../../x", "label must not contain / or"),
     ],

@@ -223,7 +223,7 @@ def test_numbering_of_an_env_of_choices_is_kept(tmp_path):
 @pytest.mark.parametrize("method", sorted(REFUSED))
 def test_forest_is_refused(method, tmp_path):
     run = coil_rl.open_run(learned(tmp_path / "run", method))
-    with pytest.raises(coil_rl.UserError, match="it is a regressor of scikit-learn"):
+    with pytest.raises(coil_rl.UserError, match="it is a forest"):
         coil_rl.export_policy(run, tmp_path / "exported", observations=5)
     assert not (tmp_path / "exported").exists()
 

@@ -3,8 +3,6 @@ import math
 import pytest
 import torch
 import worlds
-from sklearn.ensemble import RandomForestRegressor
-from sklearn.linear_model import LinearRegression
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Composite, Unbounded
@@ -13,14 +11,14 @@ from torchrl.envs import EnvBase, TransformedEnv
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
 from coil_rl.guides import RandomGuide, SplineGuide
-from coil_rl.imitation import Imitation, NetworkRegressor, SklearnRegressor
+from coil_rl.imitation import ForestRegressor, Imitation, LinearRegressor, NetworkRegressor
 from coil_rl.run import checkpoint
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
 REGRESSORS = {
-    "linear": lambda: SklearnRegressor(LinearRegression()),
-    "forest": lambda: SklearnRegressor(RandomForestRegressor(5, max_depth=6)),
+    "linear": LinearRegressor,
+    "forest": lambda: ForestRegressor(5, max_depth=6),
     "network": lambda: NetworkRegressor((8,), epochs=3),
 }
 
@@ -36,7 +34,7 @@ def env():
 
 
 def linear(**changes):
-    return {"regressor": SklearnRegressor(LinearRegression()), "validate": False} | changes
+    return {"regressor": LinearRegressor(), "validate": False} | changes
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +202,7 @@ def test_two_dimensional_actions_and_batches(name):
 @pytest.mark.parametrize("categorical", [True, False])
 def test_discrete_actions_are_learned_from_one_hot_advice(categorical):
     env = worlds.carts(categorical=categorical)
-    learner = Imitation(env, regressor=SklearnRegressor(RandomForestRegressor(5)), validate=False)
+    learner = Imitation(env, regressor=ForestRegressor(5), validate=False)
     env.set_seed(0)
     data = Rollout(env, learner.policy, 200, learner.keys).collect()
     learner.update(data)

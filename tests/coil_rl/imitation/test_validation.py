@@ -8,7 +8,7 @@ from sklearn.metrics import r2_score
 from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 
 from coil_rl.errors import UserError
-from coil_rl.imitation import SklearnRegressor
+from coil_rl.imitation import LinearRegressor
 from coil_rl.imitation.validation import cross_validate, group_splits
 
 
@@ -36,9 +36,7 @@ def sines(rows=90):
 
 def test_error_on_left_out_tracks_equals_that_of_scikit_learn_for_every_seed():
     x, y, groups = sines()
-    metrics, other = (
-        cross_validate(SklearnRegressor(LinearRegression()), x, y, groups, seed=k) for k in (0, 1)
-    )
+    metrics, other = (cross_validate(LinearRegressor(), x, y, groups, seed=k) for k in (0, 1))
     assert metrics["mse_by_track"] == other["mse_by_track"]
     assert metrics["mse_random_split"] != other["mse_random_split"]
     predicted = cross_val_predict(LinearRegression(), x, y, groups=groups, cv=LeaveOneGroupOut())
@@ -48,11 +46,11 @@ def test_error_on_left_out_tracks_equals_that_of_scikit_learn_for_every_seed():
 
 def test_without_tracks_there_is_a_random_split_only():
     x, y, groups = sines()
-    assert set(cross_validate(SklearnRegressor(LinearRegression()), x, y)) == {
+    assert set(cross_validate(LinearRegressor(), x, y)) == {
         "mse_random_split",
         "r2_random_split",
     }
     with pytest.raises(UserError, match="from one track"):
-        cross_validate(SklearnRegressor(LinearRegression()), x, y, torch.zeros_like(groups))
+        cross_validate(LinearRegressor(), x, y, torch.zeros_like(groups))
     with pytest.raises(UserError, match="9 samples are too few"):
-        cross_validate(SklearnRegressor(LinearRegression()), x[:9], y[:9])
+        cross_validate(LinearRegressor(), x[:9], y[:9])

@@ -12,6 +12,7 @@ import kill_and_resume
 import pytest
 from hydra import compose, initialize_config_module
 from programs import called, shipped
+from slow import some_fast
 
 import coil_rl.config.schema  # noqa: F401 registers the schema
 from coil_rl.config.build import env_maker
@@ -46,9 +47,7 @@ PROXY = shlex.split(
     "proxy.budget.frames=64 proxy.budget.num_envs=2 proxy.budget.steps=16 "
     "proxy.learner.regressor.epochs=1"
 )
-FOREST = shlex.split(
-    "learner=forest learner.regressor.estimator.n_estimators=5 learner.validate=false"
-)
+FOREST = shlex.split("learner=forest learner.regressor.n_estimators=5 learner.validate=false")
 LEARNERS = {
     "ppo": ["method=ppo", *PPO],
     "guide": ["method=guide"],
@@ -105,7 +104,7 @@ def test_env_takes_steps_with_the_advice_of_its_guide(env):
         assert rollout[key].float().isfinite().all(), key
 
 
-@pytest.mark.parametrize("env", [*TRACKED, *OTHERS])
+@pytest.mark.parametrize("env", some_fast([*TRACKED, *OTHERS], OTHERS))
 def test_env_trains_and_is_evaluated_in_its_own_cases(env, tmp_path):
     trained(env, "ppo", tmp_path / "run")
     with (tmp_path / "run" / "evaluation.csv").open(newline="") as file:

@@ -10,7 +10,7 @@ from coil_rl.envs.recordings.mcap_files import RecordingWriter, read_messages
 from coil_rl.envs.recordings.messages import ODOMETRY, SCAN
 from coil_rl.envs.robot.drives import labelled_drive, record_labelling_drives
 from coil_rl.errors import UserError
-from coil_rl.robot.classifier import accuracy, clusters_in_range, label_clusters, load_classifier
+from coil_robot.classifier import accuracy, clusters_in_range, label_clusters, load_classifier
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,115 @@
+"""What a run depends on of a user's code: the file that defines a part, and the state of an object.
+
+A configuration holds only a name for them, so that two of them look the same there.
+"""
+
+import hashlib
+import inspect
+import io
+import pickle
+import sys
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import hydra.utils
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor, nn
+
+from coil_rl.config.trust import import_paths
+
+INSTALLED = {"site-packages", "dist-packages"}  # folders of libraries
+
+
+def identity_of(thing: Any) -> str:
+    """Return the name of a class, function or object, with a hash that is equal in every process.
+
+    It is of the files that define it and its bases, and of the state of an object, if that can be
+    pickled: its numbers, texts and arrays, and what a function without a name has closed over.
+
+    Args:
+        thing: it may be anything.
+    """
+    defined = thing if isinstance(thing, (type, FunctionType)) else type(thing)
+    inner = getattr(thing, "func", getattr(thing, "__func__", None))  # of a partial, of a method
+    digest = hashlib.sha256()
+    for part in (*getattr(defined, "__mro__", [defined]), inner):
+        if part is not None and is_of_user(part):
+            with suppress(OSError, TypeError):  # no file defines it
+                digest.update("".join(inspect.findsource(part)[0]).encode())
+    state = io.BytesIO()
+    with suppress(Exception):  # whatever the pickling of somebody else's object raises
+        _State(state).dump(thing)
+        digest.update(state.getvalue())
+    return f"{defined.__module__}.{defined.__qualname__} (state {digest.hexdigest()[:10]})"
+
+
+class _State(pickle.Pickler):
+    """Pickles what the actions of an object depend on; it is not to be read again."""
+
+    def reducer_override(self, thing: Any) -> Any:
+        """Replace what cannot be pickled, or is not the same in each process, by plain values."""
+        if isinstance(thing, Tensor):
+            return str, (str(thing.dtype), thing.detach().cpu().tolist())
+        if isinstance(thing, nn.Module):  # it is used in one mode or the other
+            state = [item for item in vars(thing).items() if item[0] != "training"]
+            return dict, (type(thing), state)
+        if isinstance(thing, type) and is_of_user(thing):
+            return str, (f"{thing.__module__}.{thing.__qualname__}",)
+        if isinstance(thing, FunctionType) and is_of_user(thing):
+            closed = [cell.cell_contents for cell in thing.__closure__ or ()]
+            code = thing.__code__
+            return list, (thing.__qualname__, code.co_firstlineno, code.co_code, closed)
+        return NotImplemented
+
+
+def is_of_user(thing: Any) -> bool:
+    """Return whether a function or class is neither of Python, of a library nor of this package.
+
+    Args:
+        thing: the function or class.
+    """
+    name = str(getattr(thing, "__module__", ""))
+    if name.partition(".")[0] in (*sys.stdlib_module_names, "coil_rl"):
+        return False
+    file = getattr(sys.modules.get(name), "__file__", None)
+    return file is None or not INSTALLED & set(Path(file).parts)
+
+
+def code_of_user(config: DictConfig, keys: Iterable[str]) -> list[str]:
+    """Return the identity of each class and function of the user that a configuration names.
+
+    Args:
+        config: the configuration.
+        keys: parts of it to look at, among them `env`, whose id may be registered with Gymnasium.
+    """
+    parts = OmegaConf.masked_copy(config, list(keys))
+    named = [*map(_named, sorted(import_paths(parts))), _registered(config.env.get("id"))]
+    return [identity_of(each) for each in named if each is not None and is_of_user(each)]
+
+
+def _named(path: str) -> Any:
+    """Return what an import path names; None for nothing, which is refused where it is built.
+
+    Args:
+        path: written with points only.
+    """
+    with suppress(Exception):
+        return hydra.utils.get_object(path)
+    return None
+
+
+def _registered(id: Any) -> Any:
+    """Return what makes an env that is registered with Gymnasium; None for another one.
+
+    Args:
+        id: of the env; it may be anything.
+    """
+    if isinstance(id, str):
+        with suppress(Exception):
+            from coil_rl.foreign.makers import registered_maker
+
+            return registered_maker(id)
+    return None

@@ -1,0 +1,1 @@
+"""The console programs of the robot: `coil-replay` and `coil-drive`."""

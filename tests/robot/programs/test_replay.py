@@ -1,0 +1,315 @@
+"""coil-replay."""
+
+import csv
+import functools
+import hashlib
+import json
+import math
+import re
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from drives import PERIOD, START, drive, rosbag_of, scan, store, uncompressed
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from programs import called
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from run_folders import make_untrained_run
+
+from coil_paper.reproduce.robot import Table6
+from coil_rl.envs import SimulatedRobotEnv, read_recording, record_drives
+from coil_rl.envs.recordings.mcap_files import RecordingWriter
+from coil_rl.envs.recordings.messages import SCAN, TWIST_STAMPED, header, twist
+from coil_rl.guides import SplineGuide
+from coil_robot.programs.replay import _first_repeated, _run_names, _topic_name
+
+SCANS = 15
+TRACK = ["track=generated", "track.train.count=1", "learner.action_gain=1.0"]
+FILES = {"annotated.mcap", "foxglove_layout.json", "replay.md", "steering.csv", "steering.png"}
+POLICIES = ["spline", "coil_seed0", "coil_seed1"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A drive of the spline guide, and runs, two of them with the same label."""
+    folder = tmp_path_factory.mktemp("replay")
+    record_drives(
+        SimulatedRobotEnv(time_limit=SCANS / 5.5, seed=4), SplineGuide(), [folder / "drive.mcap"]
+    )
+    for seed in (0, 1):
+        make_untrained_run(folder / f"coil_{seed}", "method=coil", f"seed={seed}", *TRACK)
+    make_untrained_run(folder / "guide", "method=guide", *TRACK[:2])
+    return folder
+
+
+def replayed(folder, *arguments, out="results"):
+    return called("replay", "recording=drive.mcap", f"hydra.run.dir={out}", *arguments, cwd=folder)
+
+
+@pytest.fixture(scope="module")
+def done(folder):
+    return replayed(folder, "runs=[coil_0,coil_1]"), folder / "results"
+
+
+@pytest.fixture(scope="module")
+def rows(done):
+    with (done[1] / "steering.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def messages(done):
+    """The messages of each topic, read by another library."""
+    found = {}
+    with AnyReader(
+        [done[1] / "annotated.mcap"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)
+    ) as reader:
+        for channel, _, data in reader.messages():
+            found.setdefault(channel.topic, []).append(reader.deserialize(data, channel.msgtype))
+    return found
+
+
+def test_files_and_printed_table(done):
+    program, folder = done
+    assert {path.name for path in folder.iterdir()} == FILES
+    text = (folder / "replay.md").read_text()
+    assert program.stdout.startswith(text)
+    assert "Warning" not in text
+    assert "replay: drive.mcap" not in program.stderr
+    assert "coil_seed1 is coil_1 (policy handed_over)." in text
+    assert f"\ndrive.mcap: {SCANS} scans in 2.5 s, 5.5 a second; " in program.stdout
+
+
+def test_annotated_recording_agrees_with_the_csv(messages, rows):
+    topics = [f"/coil/{name}" for name in ("boundary", "cones", "valid")]
+    topics += [f"/coil/{policy}/{what}" for policy in POLICIES for what in ("cmd_vel", "steering")]
+    assert sorted(messages) == sorted([*topics, "/cmd_vel", "/odom", "/scan"])
+    assert len(rows) == SCANS
+    for policy in POLICIES:
+        steering = [float(row[f"{policy}/steering"]) * math.radians(80) for row in rows]
+        assert [message.data for message in messages[f"/coil/{policy}/steering"]] == pytest.approx(
+            steering
+        )
+        omega = [float(row[f"{policy}/omega"]) for row in rows]
+        assert [
+            message.angular.z for message in messages[f"/coil/{policy}/cmd_vel"]
+        ] == pytest.approx(omega)
+    assert [message.data for message in messages["/coil/valid"]] == [
+        row["valid"] == "1" for row in rows
+    ]
+    expected = [float(row["recorded/omega"]) for row in rows]
+    assert [float(row["spline/omega"]) for row in rows] == pytest.approx(expected, abs=1e-3)
+
+
+def test_annotated_recording_notes_its_inputs(done, folder):
+    with (done[1] / "annotated.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        notes = {record.name: record.metadata for record in reader.iter_metadata()}
+        attached = {record.name: record.data for record in reader.iter_attachments()}
+    assert set(attached) == {"config.yaml", "coil_seed0/config.yaml", "coil_seed1/config.yaml"}
+    assert attached["coil_seed1/config.yaml"] == (folder / "coil_1" / "config.yaml").read_bytes()
+    expected = {"input": (folder / "drive.mcap").read_bytes(), "config": attached["config.yaml"]}
+    for n in (0, 1):
+        expected[f"coil_seed{n}_config"] = attached[f"coil_seed{n}/config.yaml"]
+        expected[f"coil_seed{n}_checkpoint"] = (
+            folder / f"coil_{n}" / "policy_last.pt"
+        ).read_bytes()
+    assert notes["coil"] == {
+        f"{key}_sha256": hashlib.sha256(value).hexdigest() for key, value in expected.items()
+    }
+
+
+def test_topics_of_the_foxglove_layout_are_in_the_recording(done, messages):
+    panels = json.loads((done[1] / "foxglove_layout.json").read_text())["configById"]
+    assert set(panels["3D!scan"]["topics"]) <= set(messages)
+    paths = {path["value"] for panel in panels.values() for path in panel.get("paths", [])}
+    assert {f"/coil/{policy}/steering.data" for policy in POLICIES} < paths
+    for path in paths:
+        topic, *fields = path.split(".")
+        assert isinstance(functools.reduce(getattr, fields, messages[topic][0]), (float, bool))
+
+
+def test_same_replay_makes_the_same_bytes(done, folder):
+    torch.rand(3)  # earlier draws have no effect
+    replayed(folder, "runs=[coil_0,coil_1]", out="again")
+    for name in FILES:
+        assert (folder / "again" / name).read_bytes() == (folder / "results" / name).read_bytes(), (
+            name
+        )
+
+
+def test_each_of_several_recordings_has_a_folder(tmp_path):
+    for name, scans in (("a", 3), ("b", 5)):
+        drive(tmp_path / name / "drive.mcap", scans)
+    drive(tmp_path / "c.mcap", 4)
+    paths = "[a/drive.mcap,c.mcap,b/drive.mcap]"
+    out = called(
+        "replay", f"recording={paths}", "guide=zero", "hydra.run.dir=results", cwd=tmp_path
+    ).stdout
+    assert {path.name for path in (tmp_path / "results").iterdir()} == {
+        "drive_1",
+        "c",
+        "drive_2",
+        "replay.md",
+    }
+    for name, scans in (("drive_1", 3), ("c", 4), ("drive_2", 5)):
+        assert {path.name for path in (tmp_path / "results" / name).iterdir()} == FILES - {
+            "replay.md"
+        }
+        assert len(read_recording(tmp_path / "results" / name / "annotated.mcap").ranges) == scans
+    assert [line.split(":")[0] for line in out.splitlines()[-3:]] == [
+        "a/drive.mcap",
+        "c.mcap",
+        "b/drive.mcap",
+    ]
+
+
+def test_recording_without_boundaries_is_replayed_with_a_warning(tmp_path):
+    scan = {"angle_min": -math.pi, "angle_increment": math.pi / 180, "range_max": 12.0}
+    with RecordingWriter(tmp_path / "room.mcap") as writer:
+        for time in range(3):
+            writer.add("/scan", SCAN, time * 10**8, {**scan, "ranges": np.full(360, 0.8)})
+    done = called(
+        "replay", "recording=room.mcap", "guide=zero", "hydra.run.dir=results", cwd=tmp_path
+    )
+    sentence = done.stderr.splitlines()[-1]
+    assert sentence.startswith(
+        "replay: room.mcap: no scan shows both boundaries and "
+        "100% of the clusters in sight are unlike any cone of the "
+        "training, so the actions mean little; check env.perception, or train the classifier"
+    )
+    assert (
+        f"Warning: {sentence.removeprefix('replay: ')}."
+        in (tmp_path / "results" / "replay.md").read_text()
+    )
+
+
+def test_recording_that_is_cut_off_is_replayed_as_far_as_it_goes(tmp_path):
+    whole = uncompressed(drive(tmp_path / "whole.mcap", 200)).read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 6 // 10])
+    done = called(
+        "replay", "recording=cut.mcap", "guide=zero", "hydra.run.dir=results", cwd=tmp_path
+    )
+    scans = len(read_recording(tmp_path / "results" / "annotated.mcap").ranges)
+    assert 60 < scans < 120
+    assert f"the file is cut off: {scans} scans can be read" in done.stdout
+    assert "Warning" not in done.stderr
+    refused = called(
+        "replay", "recording=cut.mcap", "strict=true", "hydra.run.dir=no", cwd=tmp_path, code=2
+    )
+    assert (
+        f"replay: env: cut.mcap is cut off: {scans} scans can be read; copy it again"
+        in refused.stderr
+    )
+    assert not (tmp_path / "no").exists()
+
+
+def test_recorded_steering_is_that_of_table_6(tmp_path):
+    """Record a robot at another speed than the replay's.
+
+    It has two scanners, and stamped commands between its scans.
+    """
+    commands = [twist(0.3, 0.4 * math.sin(number)) for number in range(40)]
+    stamped = [{"header": header(START, "base_link"), "twist": each} for each in commands]
+    messages = [
+        ("/cmd_vel", TWIST_STAMPED, START + 60_000_000 * n, each) for n, each in enumerate(stamped)
+    ]
+    for number in range(12):
+        time = START + number * PERIOD
+        messages += [
+            ("/scan", SCAN, time + n, scan(number, header=header(time, f"laser_{n}")))
+            for n in (0, 1)
+        ]
+    messages += [("/odom", "geometry_msgs/msg/PoseStamped", START, {})]
+    rosbag_of(tmp_path / "drive", *messages)
+    arguments = "recording=drive guide=zero frame=laser_1 hydra.run.dir=results"
+    out = called("replay", *arguments.split(), cwd=tmp_path).stdout
+    assert "the file has messages of geometry_msgs/msg/PoseStamped in cdr on topic /odom" in out
+    assert "several scanners" not in out
+    [row] = [line.split("|") for line in out.splitlines() if line.startswith("| recorded")]
+    with pytest.warns(UserWarning, match="annotated.mcap has"):
+        Table6(recordings=[str(tmp_path / "results" / "annotated.mcap")]).make(tmp_path / "table")
+    [measured] = csv.DictReader((tmp_path / "table.csv").open(newline=""))
+    assert float(measured["smoothness"]) == pytest.approx(float(row[2]), abs=5e-4) != 0
+    panels = json.loads((tmp_path / "results" / "foxglove_layout.json").read_text())["configById"]
+    assert "/cmd_vel.twist.angular.z" in [path["value"] for path in panels["Plot!omega"]["paths"]]
+
+
+@given(st.text("aZ09_-. =,/日é", max_size=8))
+def test_any_label_becomes_a_topic_name(label):
+    assert re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", _topic_name(label))
+    assert _topic_name(_topic_name(label)) == _topic_name(label)
+
+
+def test_equal_labels_are_distinguished_by_seed_and_then_by_number():
+    assert _run_names(["ppo", "coil"], [0, 0]) == ["ppo", "coil"]
+    assert _run_names(["coil", "ppo", "coil"], [1, 1, 0]) == ["coil_seed1", "ppo", "coil_seed0"]
+    assert _run_names(["coil", "coil"], [0, 0]) == ["coil_seed0_1", "coil_seed0_2"]
+    assert _first_repeated(["a", "b", "b", "a"]) == "b"
+    assert _first_repeated(["a", "b"]) is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("", "recording must be given: write recording=VALUE"),
+        ("recording=null", "recording must be an MCAP file or a rosbag2 folder"),
+        ("recording=[]", "env: recordings is empty; give at least one"),
+        ("recording=missing.mcap", "missing.mcap cannot be read (No such file or directory)"),
+        ("recording=[drive.mcap,drive.mcap]", "drive.mcap twice; leave one out"),
+        ("recording=text.mcap", "text.mcap is not an MCAP file"),
+        ("recording=silent.mcap", "silent.mcap has no scans of a LiDAR"),
+        (
+            "recording=drive.mcap frame=rear",
+            "topic /scan has no scan with the frame rear; give frame=laser",
+        ),
+        (
+            "recording=drive.mcap env.scan=/lidar",
+            "has no topic /lidar; give the topic of the LiDAR, here /scan",
+        ),
+        (
+            "recording=drive.mcap guide=[]",
+            "there is no policy; give a guide, as in guide=spline, or runs=[FOLDER]",
+        ),
+        (
+            "recording=drive.mcap guide=constant guide.constant.value=[1,2]",
+            "its action has the shape [1, 2]",
+        ),
+        (
+            "recording=drive.mcap runs=[nowhere]",
+            "runs=nowhere is not the folder of a run: it has no config.yaml",
+        ),
+        ("recording=drive.mcap runs=[guide]", "guide has no agent: its guide drives alone"),
+        ("recording=drive.mcap policy=last", "policy=last has no effect: nothing in a replay with"),
+        ("recording=drive.mcap env.num_envs=2", "env.num_envs=2 has no effect: each recording has"),
+        ("recording=drive.mcap env.smooth=-1", "env.smooth=-1 has no effect: a replay earns no"),
+        ("recording=drive.mcap runs=[coil_0,./coil_0]", "coil_0 twice; leave one out"),
+        (
+            "recording=drive.mcap runs=[coil_0] policy=best",
+            "policy='best' must be 'handed_over' or 'last'",
+        ),
+        (
+            "recording=drive.mcap runs=[coil_0] guide=zero +guide.coil=${guide.zero}",
+            "policies would be called coil",
+        ),
+        (
+            "recording=drive.mcap guide=zero +guide.recorded=${guide.zero}",
+            "two policies would be called recorded",
+        ),
+    ],
+)
+def test_errors_are_one_sentence_and_leave_no_files(arguments, words, folder, tmp_path):
+    for name in ("coil_0", "guide"):
+        shutil.copytree(folder / name, tmp_path / name)
+    shutil.copy(folder / "drive.mcap", tmp_path)
+    (tmp_path / "text.mcap").write_text("no recording")
+    store(tmp_path / "silent.mcap", b"", kind="std_msgs/msg/Float64", topic="/speed")
+    before = sorted(tmp_path.iterdir())
+    (sentence,) = called("replay", *arguments.split(), cwd=tmp_path, code=2).stderr.splitlines()
+    assert sentence.startswith("replay: ")
+    assert words in sentence
+    assert sorted(tmp_path.iterdir()) == before
