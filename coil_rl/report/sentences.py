@@ -30,14 +30,14 @@ class Sentences:
     def __init__(self, package: str, file: str) -> None:
         self.package, self.file = package, file
 
-    def said(self, name: str, **values: Any) -> list[str]:
+    def said(self, macro: str, /, **values: Any) -> list[str]:
         """Return the paragraphs of a macro, none if it says nothing.
 
         Args:
-            name: of the macro.
+            macro: its name.
             values: its arguments.
         """
-        text = str(getattr(self._macros, name)(**values))
+        text = str(getattr(self._macros, macro)(**values))
         paragraphs = (" ".join(part.split()) for part in re.split(r"\n\s*\n", text))
         return [part for part in paragraphs if part]
 
