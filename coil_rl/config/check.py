@@ -3,6 +3,7 @@
 A mistake is found in seconds. Nothing is written except the folder of the run, as the last step.
 """
 
+import errno
 import math
 import os
 import warnings
@@ -33,6 +34,7 @@ from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
 from coil_rl.config.pretrained import run_folder
 from coil_rl.config.replay import check_recordings_to_leave_out, check_replay
 from coil_rl.config.schema import TrainConfig
+from coil_rl.config.sentences import sentence
 from coil_rl.config.values import check_values
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.batch import SeededRows, optional_entries
@@ -538,9 +540,6 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
-            raise PermissionError(None, "Permission denied")
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
     except OSError as error:
-        raise UserError(
-            f"the run's folder {folder} cannot be used ({error.strerror}); choose another with "
-            "hydra.run.dir=FOLDER"
-        ) from error
+        raise UserError(sentence(error)) from error
