@@ -79,7 +79,8 @@ def interval(values: ArrayLike) -> Estimate:
         return Estimate(math.nan, seeds=len(of_each))
     if len(of_each) == 1:
         return Estimate(float(of_each[0]))
-    return Estimate(*map(float, mean_interval(of_each)), len(of_each))
+    mean, low, high = map(float, mean_interval(of_each))
+    return Estimate(mean, low, high, len(of_each))
 
 
 def difference(ours: ArrayLike, theirs: ArrayLike) -> Estimate:
