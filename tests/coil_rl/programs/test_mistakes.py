@@ -236,7 +236,7 @@ def refusal(name, *arguments):
         ),
         (
             "degrade=[noisy] degrade.noisy.sigma=-1",
-            "degrade.noisy: sigma=-1 must be a finite number of at least 0",
+            "degrade.noisy.sigma=-1 must be at least 0",
         ),
         (
             "method=coil degrade=[shuffled] track.train.count=2",
