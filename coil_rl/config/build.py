@@ -16,7 +16,7 @@ from coil_rl.config.beside import unread_controllers
 from coil_rl.config.logger import make_logger
 from coil_rl.config.measured import complete_measures
 from coil_rl.config.nodes import build, build_all, find_target
-from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune, with_tuned
+from coil_rl.config.own_run import own_run
 from coil_rl.config.pretrained import run_folder
 from coil_rl.config.saved import identity, settings
 from coil_rl.errors import UserError
@@ -32,8 +32,6 @@ from coil_rl.run.parts import TEST, TESTS, TRAIN, EnvMaker
 from coil_rl.run.run import Budget, Run
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
-from coil_rl.tune.run import TunedRun
-from coil_rl.tune.search import Search
 
 
 def assemble(config: DictConfig, folder: Path | None = None) -> Run:
@@ -59,10 +57,9 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         each_phase = config.evaluation.guides == "phases"
         return [GuideReturns(make_env, learner.guides, each_phase=each_phase)] if trains else []
 
-    has_learner = config.method.observes is not None and not config.method.search
-    make_run: Callable[..., Run] = Run
-    if config.method.search:
-        make_run = partial(TunedRun, **_searched(config))
+    has_learner = config.method.observes is not None and learner_kind(config) != "none"
+    own = own_run(config)
+    make_run: Callable[..., Run] = Run if own is None else own.maker(config)
     return make_run(
         folder,
         make_env,
@@ -87,15 +84,6 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         settings=settings(config),
         identity=identity(config),
     )
-
-
-def _searched(config: DictConfig) -> dict[str, Any]:
-    """Return the arguments of a run that tunes its guide, besides those of any run."""
-    return {
-        "numbers": numbers_to_tune(config),
-        "make_guide": GuideWithNumbers(config),
-        "search": build(config.method.search, "method.search", Search),
-    }
 
 
 def budget(config: DictConfig) -> Budget:
@@ -134,7 +122,7 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         guides=guide_titles(driving_guides(config)),
         guide_results=partial(guide_results, config),
         together=has_agent
-        and not config.method.search
+        and not config.method.run
         and advises_only(config)
         and not demonstrations(config),
         advice=list(config.evaluation.advice) if advises(config) else [],
@@ -273,7 +261,9 @@ def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
     """
 
     def transforms(advice: str) -> list[Transform]:
-        return build_transforms(config if folder is None else with_tuned(config, folder), advice)
+        own = None if folder is None else own_run(config)
+        found = config if own is None or folder is None else own.found(config, folder)
+        return build_transforms(found, advice)
 
     def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
         return build_bare_env(config, cases_node(config, rows, cases, count))
@@ -425,7 +415,7 @@ def learner_kind(config: DictConfig) -> str:
 
     It is `none` for a method that has no learner.
     """
-    if config.method.search:
+    if config.method.learner == "none":
         return "none"
     target = find_target(config.learner.get("_target_"), "learner")
     if isinstance(target, type) and issubclass(target, Learner):

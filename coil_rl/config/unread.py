@@ -21,7 +21,7 @@ REFERRED = (
     "training.imitation_env",
     "budget.minibatches",
 )
-# Keys that no run reads that tunes its guide.
+# Keys that no run of an agent reads that has no learner.
 OF_A_LEARNER = (
     "learner",
     "network",
@@ -163,7 +163,7 @@ class Reasons:
 
     def _of_tests(self, key: str) -> str:
         anchored = OmegaConf.select(self.config, "learner.anchor") is not None
-        tests = anchored or self.config.method.search or self.config.delivery == "tested"
+        tests = anchored or self.config.delivery == "tested"
         if tests or not is_part(key, ["training.tests"]):
             return ""
         return (
@@ -177,12 +177,12 @@ class Reasons:
 
     def _of_method(self, key: str) -> str:
         has_agent = self.config.method.observes is not None
-        if has_agent and not self.config.method.search:
+        if has_agent and not self.config.method.run:
             return ""
         unread = OF_A_LEARNER if has_agent else OF_A_TRAINING
         if not is_part(key, unread) or _touches(key, self._references_beside(unread)):
             return ""
-        what = "tunes its guide and has no learner" if has_agent else "trains nothing"
+        what = "has no learner" if has_agent else "trains nothing"
         return f"{self.method} {what}; leave it out"
 
     def _of_advice(self, key: str) -> str:

@@ -48,25 +48,6 @@ def start_test(row: Mapping[str, float]) -> str | None:
     return f"Start test, mean returns in {cases:.0f} new cases: {listed}. {outcome}"
 
 
-def beyond_budget(folder: Path, frames: int) -> str | None:
-    """Return the sentence for a search that took more frames than its budget; None for another.
-
-    Args:
-        folder: of the run.
-        frames: the budget.
-
-    Raises:
-        UserError: if the file is damaged.
-    """
-    report = DELIVERY.read(folder)
-    if report is None or report.steps <= frames:
-        return None
-    return (
-        f"The search took {report.steps:,} frames, more than budget.frames={frames:,}: that is "
-        "too little for a generation and a test of its result."
-    )
-
-
 def handed_over(folder: Path) -> str | None:
     """Return the sentence that says what a run handed over and why; None without a test.
 
