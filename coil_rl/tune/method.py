@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from coil_rl.config.own_run import OwnRun
 from coil_rl.errors import UserError
+from coil_rl.extras import require
 from coil_rl.ranges import checked
 from coil_rl.run.run import Run
 from coil_rl.tune.numbers import GuideWithNumbers, numbers_to_tune, with_values
@@ -24,10 +24,7 @@ class Tuning(Search, OwnRun):
 
     def check(self, config: DictConfig) -> None:
         """Raise a `UserError` for numbers that cannot be tuned, and for another delivery."""
-        if find_spec("cmaes") is None:
-            raise UserError(
-                f"method={config.method.name} needs cmaes: python -m pip install 'coil-rl[tune]'"
-            )
+        require(f"method={config.method.name}", "tune", "cmaes")
         if config.delivery != "tested":
             raise UserError(
                 f"delivery={config.delivery}: method={config.method.name} always tests what it "

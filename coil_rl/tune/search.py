@@ -208,7 +208,6 @@ class Tuner:
 
     def _begin(self) -> None:
         """Begin the search at the guide's own numbers."""
-        require("method=tune", "tune", "cmaes")
         from cmaes import CMA  # imports scipy.stats, which takes a second in every training
 
         self.told = []

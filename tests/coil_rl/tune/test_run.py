@@ -5,9 +5,9 @@ import json
 import pytest
 from hydra import compose, initialize_config_module
 
-from coil_rl import UserError
+from coil_rl import UserError, extras
 from coil_rl.record import DELIVERY
-from coil_rl.tune import Tuning, method
+from coil_rl.tune import Tuning
 from coil_rl.tune.run import beyond_budget
 
 
@@ -20,7 +20,7 @@ def test_search_beyond_its_budget_is_said_from_a_file_that_may_be_missing(tmp_pa
 
 
 def test_missing_extra_is_named(monkeypatch):
-    monkeypatch.setattr(method, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose("train", ["method=tune", "env=pendulum", "run_dir=unused"])
     with pytest.raises(UserError, match=r"method=tune needs cmaes: .* 'coil-rl\[tune\]'"):
