@@ -110,8 +110,7 @@ class TunedRun(Run):
         values = read_tuned(self.folder, self.numbers)
         if values is not None:
             found.append(numbers_sentence(values, {each.name: each.own for each in self.numbers}))
-        beyond = beyond_budget(self.folder, self.budget.frames)
-        return found if beyond is None else [*found, beyond]
+        return [*found, *beyond_budget(self.folder, self.budget.frames)]
 
     def _env_of(self, candidates: Candidates) -> Any:
         """Return what makes the env in which candidates act."""
@@ -246,8 +245,8 @@ class TunedRun(Run):
         return {number.name: row[f"tune/number/{number.name}"] for number in self.numbers}
 
 
-def beyond_budget(folder: Path, frames: int) -> str | None:
-    """Return the sentence for a search that took more frames than its budget; None for another.
+def beyond_budget(folder: Path, frames: int) -> list[str]:
+    """Return the sentence for a search that took more frames than its budget; none for another.
 
     Args:
         folder: of the run.
@@ -258,11 +257,11 @@ def beyond_budget(folder: Path, frames: int) -> str | None:
     """
     report = record.DELIVERY.read(folder)
     if report is None or report.steps <= frames:
-        return None
-    return (
+        return []
+    return [
         f"The search took {report.steps:,} frames, more than budget.frames={frames:,}: that is "
         "too little for a generation and a test of its result."
-    )
+    ]
 
 
 def numbers_sentence(values: Values, own: Values) -> str:

@@ -12,11 +12,11 @@ from coil_rl.tune.run import beyond_budget
 
 
 def test_search_beyond_its_budget_is_said_from_a_file_that_may_be_missing(tmp_path):
-    assert beyond_budget(tmp_path, 300) is None
+    assert beyond_budget(tmp_path, 300) == []
     report = {"policy": "own", "cases": 4, "returns": {}, "frames": None, "steps": 1800}
     (tmp_path / DELIVERY.name).write_text(json.dumps(report))
     assert "took 1,800 frames, more than budget.frames=300" in str(beyond_budget(tmp_path, 300))
-    assert beyond_budget(tmp_path, 1800) is None
+    assert beyond_budget(tmp_path, 1800) == []
 
 
 def test_missing_extra_is_named(monkeypatch):
