@@ -7,8 +7,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.build import advises, env_maker, learner_kind, trains_guides
-from coil_rl.config.written import REFERENCE, Job, covers, key_of, leaves
+from coil_rl.config.compose import REFERENCE, Job, covers, key_of, leaves
+from coil_rl.config.parts import advises, env_maker, learner_kind, trains_guides
 from coil_rl.errors import UserError
 from coil_rl.report.configurations import is_part
 

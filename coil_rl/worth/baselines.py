@@ -14,9 +14,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.config.build import assemble, build_evaluation, env_maker
+from coil_rl.config.assemble import assemble
+from coil_rl.config.folder import read_config
 from coil_rl.config.nodes import build_all
-from coil_rl.config.saved import read_config
+from coil_rl.config.parts import build_evaluation, env_maker
 from coil_rl.errors import file_of_a_run
 from coil_rl.report import write_csv
 from coil_rl.run import checkpoint

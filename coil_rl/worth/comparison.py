@@ -15,8 +15,8 @@ from typing import Any
 import pandas as pd
 from omegaconf import DictConfig
 
-from coil_rl.config.build import env_maker
 from coil_rl.config.check import check_parts
+from coil_rl.config.parts import env_maker
 from coil_rl.config.python import Named, composed, named
 from coil_rl.config.trust import trust_own
 from coil_rl.config.unread import check_read

@@ -13,8 +13,8 @@ from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
+from coil_rl.config.compose import key_of
 from coil_rl.config.python import Named
-from coil_rl.config.written import key_of
 from coil_rl.learners.anchor import StartTest
 from coil_rl.report import markdown_table, style
 from coil_rl.report.curves import RETURNS, draw_guides, mean_curve, points

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.config.build import build_learner, env_maker
+from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.run.evaluation import episodes
 from coil_rl.run.parts import TEST, EnvMaker
 from coil_rl.run.rollout import Rollout

@@ -6,8 +6,8 @@ import pytest
 import yaml
 from programs import CONF
 
-from coil_rl.config import logger
-from coil_rl.config.logger import check_logger, make_logger, shipped_logger
+from coil_rl.config import trust
+from coil_rl.config.trust import check_logger, make_logger, shipped_logger
 from coil_rl.errors import UserError
 
 SHIPPED = {path.stem: yaml.safe_load(path.read_text()) for path in (CONF / "logger").iterdir()}
@@ -70,7 +70,7 @@ def test_what_is_not_shipped_is_none_of_them(node):
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow", "trackio"])
 def test_missing_package_is_named_with_the_extra_that_installs_it(name, monkeypatch):
-    monkeypatch.setattr(logger, "find_spec", lambda package: None)
+    monkeypatch.setattr(trust, "find_spec", lambda package: None)
     with pytest.raises(UserError, match=rf"package {name} is not .* 'coil-rl\[{name}\]'"):
         check_logger(SHIPPED[name])
     check_logger(SHIPPED["csv"])

@@ -5,8 +5,8 @@ from programs import called
 
 import coil_rl
 from coil_rl import UserError, compose_train
+from coil_rl.config.compose import Job
 from coil_rl.config.unread import check_read, check_sweep
-from coil_rl.config.written import Job
 
 GUIDE = "method=guide trains nothing; leave it out"
 

@@ -14,7 +14,7 @@ from hydra import compose, initialize_config_module
 from programs import called, shipped
 
 import coil_rl.config.schema  # noqa: F401 registers the schema
-from coil_rl.config.build import env_maker
+from coil_rl.config.parts import env_maker
 
 FILES = shipped("env")
 REPLAYS = ["mcap_replay"]  # of recordings, see config/test_replay.py

@@ -9,7 +9,7 @@ import torch
 from hydra import compose, initialize_config_module
 from tiny_runs import METHODS, TRACKS, trained
 
-from coil_rl.config.load import open_run
+from coil_rl.config.python import open_run
 from coil_rl.errors import UserError
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume

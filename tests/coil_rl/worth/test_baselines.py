@@ -7,7 +7,7 @@ from gymnasium import spaces
 from hydra import compose, initialize_config_module
 
 import coil_rl.config.schema  # noqa: F401 registers the configuration schema
-from coil_rl.config.build import build_evaluation, env_maker
+from coil_rl.config.parts import build_evaluation, env_maker
 from coil_rl.errors import UserError
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.report import write_csv

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coil_rl.config.python import Named, compose_train
+from coil_rl.config.compose import compose_train
+from coil_rl.config.python import Named
 from coil_rl.report.runs import Run
 from coil_rl.worth.entry import Entry
 from coil_rl.worth.page import command_of, delayed_sentence, few_cases
