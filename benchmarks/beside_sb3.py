@@ -104,7 +104,6 @@ def ours(
         algorithm: "ppo", "sac" or "dqn".
         env_id: Gymnasium's name of the env.
         values: hyper-parameters, see `VALUES`.
-        frames: of the training.
         seed: of the env and of the learner.
 
     Returns:

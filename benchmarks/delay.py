@@ -61,10 +61,8 @@ def late_run(folder: Path, lags: tuple[int, int], missing: float, count: int) ->
     """Return a run with another evaluation: on the robot's track, with a late view.
 
     Args:
-        folder: of the run.
         lags: least and most steps by which the view is late.
         missing: share of the cones that is missing.
-        count: number of copies of the track.
     """
     config: DictConfig = read_config(folder, "run", {"device": "cpu"})
     tracks = {
@@ -115,7 +113,6 @@ def row_of(label: str, turns: str, missing: float, results: Sequence[Any]) -> di
     """Return a row of the table.
 
     Args:
-        label: of the runs.
         turns: by which the view was late.
         missing: share of the cones.
         results: episodes by seed.
@@ -152,9 +149,7 @@ def rows_of(
 
     Args:
         labels: folders of runs by label.
-        count: number of copies of the track.
         late: by how many turns, names in `LAGS`.
-        shares: of the cones that are missing.
     """
     first = next(iter(labels.values()))[0]
     cases = [(missing, turns) for missing in shares for turns in late]

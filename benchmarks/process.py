@@ -39,10 +39,7 @@ def main(cars: int, steps: int, device: str, threads: int) -> Row:
     """Import, build an env with advice and step it, and perhaps train COIL once.
 
     Args:
-        cars: number of cars.
         steps: length of the batch of the training; 0 for no training.
-        device: of the env.
-        threads: of torch.
     """
     start = time.perf_counter()
     import torch

@@ -91,12 +91,7 @@ def _is_guide(driver: str) -> bool:
 
 
 def plain_episodes(run: Run, driver: str) -> pd.DataFrame:
-    """Return the evaluation of a policy with deterministic actions and the advice as it is.
-
-    Args:
-        run: of the policy.
-        driver: the policy, as in the evaluation.
-    """
+    """Return the evaluation of a policy with deterministic actions and the advice as it is."""
     table = run.evaluation
     plain = (table["advice"] == "") & (table["actions"] == "deterministic")
     return table[plain & (table["driver"] == driver)]
@@ -104,10 +99,6 @@ def plain_episodes(run: Run, driver: str) -> pd.DataFrame:
 
 def mean_reward(run: Run, driver: str) -> float:
     """Return the mean reward of a policy; NaN if there is no such policy.
-
-    Args:
-        run: of the policy.
-        driver: the policy, as in the evaluation.
 
     Raises:
         ValueError: if the reward of an episode is NaN.
@@ -123,9 +114,6 @@ def mean_reward(run: Run, driver: str) -> float:
 
 def arms_of(runs: Sequence[Run]) -> dict[Key, Arm]:
     """Return the finished runs by method and arm, the two parts of their labels.
-
-    Args:
-        runs: of one task.
 
     Raises:
         UserError: if the runs cannot be compared: for two of one arm and seed, for different
@@ -166,10 +154,6 @@ def _cases(run: Run) -> set[str]:
 def paired(arm: Arm, alone: Arm) -> tuple[Arm, Arm]:
     """Return the runs of a method and of PPO, limited to the seeds that both have.
 
-    Args:
-        arm: of the method.
-        alone: the runs of PPO.
-
     Raises:
         UserError: if they have no seed in common.
     """
@@ -184,12 +168,7 @@ def paired(arm: Arm, alone: Arm) -> tuple[Arm, Arm]:
 
 
 def rows_of_task(name: str, runs: Sequence[Run]) -> list[dict[str, object]]:
-    """Return a row of the table for each method with each guide; none without plain PPO.
-
-    Args:
-        name: of the task.
-        runs: its runs.
-    """
+    """Return a row of the table for each method with each guide; none without plain PPO."""
     arms = arms_of(runs)
     alone = arms.get((PPO, ALONE))
     if alone is None:
@@ -203,13 +182,7 @@ def rows_of_task(name: str, runs: Sequence[Run]) -> list[dict[str, object]]:
 
 
 def add_parts(rows: Sequence[dict[str, object]], runs: Sequence[Run], others: int) -> None:
-    """Add to the rows of a task the difference with the first seeds, and with the others.
-
-    Args:
-        rows: of the task.
-        runs: its runs.
-        others: the smallest seed of the others.
-    """
+    """Add to the rows of a task the difference with the first seeds, and with the others."""
     arms = arms_of(runs)
     scale = scale_of(arms, arms[PPO, ALONE])
     for row in rows:
@@ -232,12 +205,7 @@ def _part(arm: Arm, alone: Arm, scale: float, seeds: range) -> str:
 
 
 def scale_of(arms: dict[Key, Arm], alone: Arm) -> float:
-    """Return the scale of a task; NaN without a random guide, or if it is as good as the better.
-
-    Args:
-        arms: of the task.
-        alone: the runs of PPO.
-    """
+    """Return the scale of a task; NaN without a random guide, or if it is as good as the better."""
     best = float(np.mean([alone.reward(seed) for seed in alone.runs]))
     intact = guide_of(arms, INTACT)
     if not math.isnan(intact):
@@ -246,12 +214,7 @@ def scale_of(arms: dict[Key, Arm], alone: Arm) -> float:
 
 
 def guide_of(arms: dict[Key, Arm], name: str) -> float:
-    """Return the mean reward of the guide of an arm, which is no method's; NaN without the arm.
-
-    Args:
-        arms: of the task.
-        name: of the arm.
-    """
+    """Return the mean reward of the guide of an arm, which is no method's; NaN without the arm."""
     known = [each.guide for (_, arm), each in arms.items() if arm == name]
     return float(np.mean(known)) if known else math.nan
 
@@ -302,8 +265,7 @@ def verdict(mean: float, low: float, high: float) -> str:
 
     Args:
         mean: in % of the scale.
-        low: end of its interval; NaN if it has none, as with one seed or without a scale.
-        high: end of its interval.
+        low, high: ends of its interval; NaN if it has none, as with one seed or without a scale.
     """
     if any(map(math.isnan, (mean, low, high))):
         return "unknown"
@@ -348,7 +310,6 @@ def runs_of(folder: Path, pages: Path | None = None) -> dict[str, list[Run]]:
     """Return the runs of each task.
 
     Args:
-        folder: with a folder for each task.
         pages: a folder in it that is no task.
 
     Raises:
@@ -360,10 +321,6 @@ def runs_of(folder: Path, pages: Path | None = None) -> dict[str, list[Run]]:
 
 def with_ppo(folder: Path, runs: Mapping[str, list[Run]]) -> dict[str, list[Run]]:
     """Return the runs of the tasks that have plain PPO, and say which tasks are left out.
-
-    Args:
-        folder: of the runs, for messages.
-        runs: of each task.
 
     Raises:
         ValueError: if no task has a finished run of plain PPO.

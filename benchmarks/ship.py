@@ -17,9 +17,9 @@ from typing import Any
 from coil_rl.config.folder import CARD, CHECKSUMS, LARGEST
 from coil_rl.files import write_text
 from coil_rl.plain_yaml import read_yaml, yaml_of
-from coil_rl.report.runs import DELIVERY
+from coil_rl.record import COMMAND, DELIVERY, SECONDS, VERSIONS
 from coil_rl.report.table import markdown_table
-from coil_rl.run.folder import COMMAND, CONFIG, HANDED_OVER, weights_file
+from coil_rl.run.folder import CONFIG, HANDED_OVER, weights_file
 from coil_rl.run.reasons import handed_over
 
 PLACE = Path(__file__).parents[1] / "coil_rl" / "policies"
@@ -38,7 +38,6 @@ def ship(run: Path, name: str) -> Path:
     """Make a shipped policy, and return its folder.
 
     Args:
-        run: folder of a finished run.
         name: of the policy, such as "cone_track/coil".
 
     Raises:
@@ -52,7 +51,7 @@ def ship(run: Path, name: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / CONFIG, yaml_of(settings))
     files = [weights_file(run, HANDED_OVER if tested else "last").name, EVALUATION]
-    files += [DELIVERY] if tested else []
+    files += [DELIVERY.name] if tested else []
     for file in files:
         (folder / file).write_bytes((run / file).read_bytes())
     write_text(folder / CARD, card(run, name, settings))
@@ -84,13 +83,7 @@ def _add_checksums(name: str, folder: Path) -> None:
 
 
 def card(run: Path, name: str, settings: Mapping[str, Any]) -> str:
-    """Return the card of a policy.
-
-    Args:
-        run: folder of the run.
-        name: of the policy.
-        settings: configuration of the run.
-    """
+    """Return the card of a policy."""
     rows = list(csv.DictReader((run / EVALUATION).read_text().splitlines()))
     means = [row for row in rows if row["case"] == "mean"]
     cases = len({row["case"] for row in rows}) - 1
@@ -99,10 +92,10 @@ def card(run: Path, name: str, settings: Mapping[str, Any]) -> str:
     guides = ", ".join(settings["guide"]) or "none"
     env = settings["env"]
     title = env.get("id") or env["_target_"].rpartition(".")[2]
-    versions = json.loads((run / "versions.json").read_text())
+    versions = VERSIONS.need(run)
     names = ("python", "torch", "torchrl", "tensordict", "gymnasium")
     made = ", ".join(f"{each} {versions[each]}" for each in names)
-    seconds = json.loads((run / "training_time.json").read_text())["seconds"]
+    seconds = SECONDS.need(run)["seconds"]
     parts = [
         f"# {name}",
         f"The policy of one training of `{settings['method']['name']}` in {title}. "
@@ -127,7 +120,7 @@ def card(run: Path, name: str, settings: Mapping[str, Any]) -> str:
 
 def _command(run: Path) -> str:
     """Return the command that made a run, without what says where it was written."""
-    words = shlex.split((run / COMMAND).read_text())
+    words = shlex.split(COMMAND.need(run))
     kept = [word for word in words if not word.startswith(("hydra.run.dir=", "logger="))]
     return shlex.join(kept)
 
@@ -140,11 +133,7 @@ def _number(text: str) -> Any:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Entry point.
-
-    Args:
-        arguments: the run and the name.
-    """
+    """Entry point."""
     if len(arguments) != 2:
         raise SystemExit("give the folder of a run and a name: python -m benchmarks.ship RUN NAME")
     print(ship(Path(arguments[0]), arguments[1]))

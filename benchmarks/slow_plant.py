@@ -65,11 +65,7 @@ def measure_workers(args: Namespace) -> list[Row]:
 
 
 def works(workers: int) -> dict[str, Work]:
-    """Return the functions that are timed by name: a step, a rollout, a batch.
-
-    Args:
-        workers: number of its processes.
-    """
+    """Return the functions that are timed by name: a step, a rollout, a batch."""
     env: EnvBase = GymnasiumEnv(SlowPlant, ROWS, workers=workers, seed=0)
     action = env.rand_action(env.reset())
     whole = TransformedEnv(

@@ -78,8 +78,6 @@ class Stopwatch:
         """Time all further calls of a method of one object.
 
         Args:
-            owner: the object.
-            method: name of the method.
             name: under which its time is added up.
         """
         inner = getattr(owner, method)

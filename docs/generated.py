@@ -5,8 +5,10 @@ Each directive of this file reads it where it is defined, at every build.
 
 import importlib
 import inspect
+import itertools
 import re
 import tomllib
+import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ CONF = ROOT / "conf"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # Headings of the API, by the beginning of the module that defines a name; the first that fits.
 PARTS = {
-    "Runs": ("coil_rl.run", "coil_rl.config", "coil_rl.worth", "coil_rl.measures"),
+    "Runs": ("coil_rl.run", "coil_rl.config", "coil_rl.comparison", "coil_rl.measures"),
     "Envs": ("coil_rl.envs",),
     "Transforms": ("coil_rl.transforms",),
     "Guides": ("coil_rl.guides",),
@@ -129,11 +131,7 @@ class PackageNames(Generated):
 
 
 def help_of(program: str) -> str:
-    """Return the header of the help of a program; its docstring if it has no configuration.
-
-    Args:
-        program: the name of the command.
-    """
+    """Return the header of the help of a program; its docstring if it has no configuration."""
     module = PROJECT["scripts"][program].partition(":")[0]
     file = Path(program.removeprefix("coil-")).with_suffix(".yaml")
     for folder in (CONF, ROOT / "paper" / "conf"):
@@ -143,11 +141,7 @@ def help_of(program: str) -> str:
 
 
 def description(file: Path) -> str:
-    """Return the first sentence of the comment at the beginning of a YAML file.
-
-    Args:
-        file: of the configuration.
-    """
+    """Return the first sentence of the comment at the beginning of a YAML file."""
     comments = []
     for line in file.read_text().splitlines():
         if not line.startswith("#"):
@@ -159,24 +153,14 @@ def description(file: Path) -> str:
 
 
 def block(file: Path) -> Iterator[str]:
-    """Yield a YAML file as a block of code, with its name.
-
-    Args:
-        file: of the configuration.
-    """
+    """Yield a YAML file as a block of code, with its name."""
     yield from ("```{code-block} yaml", f":caption: conf/{file.relative_to(CONF)}", "")
     yield from file.read_text().splitlines()
     yield from ("```", "")
 
 
 def documented(module: str, name: str, thing: object) -> Iterator[str]:
-    """Yield the autodoc directive of a public name.
-
-    Args:
-        module: from which it is imported.
-        name: its name there.
-        thing: what it is.
-    """
+    """Yield the autodoc directive of a public name."""
     kind = "data"
     if inspect.isclass(thing):
         kind = "exception" if issubclass(thing, Exception) else "class"
@@ -190,18 +174,13 @@ def is_of(thing: object, modules: tuple[str, ...]) -> bool:
 
     Args:
         thing: class, function or value.
-        modules: their names.
     """
     module = getattr(thing, "__module__", "coil_rl")
     return any(module == each or module.startswith(f"{each}.") for each in modules)
 
 
 def escaped(text: str) -> str:
-    """Return a text as it stands in a cell of a table.
-
-    Args:
-        text: plain.
-    """
+    """Return a text as it stands in a cell of a table."""
     return text.replace("|", "\\|").replace("*", "\\*").replace("[", "\\[")
 
 
@@ -246,6 +225,51 @@ def plain_docstring(
             lines[index] = re.sub(r"(?<=\w)`(?=s\b)", r"`\\ ", "`".join(parts))  # a plural: `Run`s
 
 
+def arguments_of_bases(
+    app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]
+) -> None:
+    """Add the arguments that a class takes and that a class above it documents."""
+    if what != "class" or not inspect.isfunction(thing.__init__):
+        return
+    known, names = entries(lines), taken(thing)
+    added: list[str] = []
+    for base in thing.__mro__[1:]:
+        above = entries(inspect.cleandoc(vars(base).get("__doc__") or "").splitlines())
+        for argument in above:
+            if argument in names and argument not in known:
+                known[argument] = above[argument]
+                added += above[argument]
+    if added and "Args:" not in lines:
+        lines += ["", "Args:", *added]
+    elif added:
+        end = lines.index("Args:") + 1
+        while end < len(lines) and lines[end]:
+            end += 1
+        lines[end:end] = added
+
+
+def entries(lines: list[str]) -> dict[str, list[str]]:
+    """Return the lines of each entry under `Args:`."""
+    found: dict[str, list[str]] = {}
+    start = lines.index("Args:") + 1 if "Args:" in lines else len(lines)
+    for line in itertools.takewhile(bool, lines[start:]):
+        if not line.startswith(" " * 8):
+            found[line.strip().partition(":")[0]] = []
+        found[next(reversed(found))].append(line)
+    return found
+
+
+def taken(thing: Any) -> set[str]:
+    """Return the names of the arguments of a class, those of its typed dictionaries too."""
+    names = set[str]()
+    for parameter in inspect.signature(thing.__init__).parameters.values():
+        settings = typing.get_args(parameter.annotation)
+        if typing.get_origin(parameter.annotation) is typing.Unpack:
+            names |= settings[0].__annotations__.keys()
+        names.add(parameter.name)
+    return names
+
+
 def is_field(
     app: Sphinx, what: str, name: str, thing: object, is_skipped: bool, options: Any
 ) -> bool | None:
@@ -264,11 +288,7 @@ def keep_present(app: Sphinx, page: str, source: list[str]) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register the directives.
-
-    Args:
-        app: of the build.
-    """
+    """Register the directives."""
     directives: dict[str, type[Generated]] = {
         "commands": Commands,
         "extras": Extras,
@@ -279,6 +299,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     }
     for name, directive in directives.items():
         app.add_directive(name, directive)
+    app.connect("autodoc-process-docstring", arguments_of_bases, priority=50)
     app.connect("autodoc-process-docstring", plain_docstring, priority=100)  # before napoleon
     app.connect("autodoc-process-signature", own_signature)
     app.connect("autodoc-skip-member", is_field)

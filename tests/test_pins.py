@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from programs import LAP, called
+from slow import some_fast
 
 PINS = Path(__file__).parent / "pins"
 FILES = ("metrics.csv", "evaluation.csv")
@@ -64,11 +65,7 @@ def same(one: str, other: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow) if name.startswith("dynamic") else name
-        for name in RUNS
-    ],
+    "name", some_fast(RUNS, [name for name in RUNS if not name.startswith("dynamic")])
 )
 def test_short_run_gives_the_pinned_numbers(name: str, tmp_path: Path) -> None:
     folder = run(name, tmp_path)

@@ -16,6 +16,8 @@ TINY = [
     "evaluation.repeats=1",
     "evaluation.gif=false",
     "evaluation.curve.env.time_limit=0.5",
+    "evaluation.curve.num_envs=2",
+    "~evaluation.pictures.lines",
     "logger=none",
     "checkpoint_every=1",
     "budget.num_envs=4",

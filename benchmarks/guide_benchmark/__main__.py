@@ -31,7 +31,6 @@ def added(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
     Args:
         file: a table of rows; it need not exist.
-        rows: that join it.
 
     Raises:
         ValueError: if a row is not valid.

@@ -25,11 +25,11 @@ from tqdm import tqdm
 from benchmarks.guide_benchmark import picture
 from benchmarks.guide_benchmark.rows import read_rows
 from benchmarks.promise import ALONE, PPO
+from coil_rl.comparison.arms import ANCHORED, GUIDE, OPPOSITE, TUNE
+from coil_rl.comparison.compare import FOUND, TABLE
+from coil_rl.comparison.verdict import NOTHING
 from coil_rl.files import write_text
 from coil_rl.report import markdown_table, write_csv
-from coil_rl.worth.arms import ANCHORED, GUIDE, OPPOSITE, TUNE
-from coil_rl.worth.comparison import FOUND, TABLE
-from coil_rl.worth.verdict import NOTHING
 
 Row = Mapping[str, str]
 DETUNED = "detuned"
@@ -50,13 +50,7 @@ COLUMNS = {
 
 
 def ends(rows: Sequence[Row], task: str, arm: str) -> dict[str, float]:
-    """Return what whole trainings with a guide gave, by method; plain PPO and the guide too.
-
-    Args:
-        rows: of the guide benchmark.
-        task: name of the task.
-        arm: of the guide.
-    """
+    """Return what whole trainings with a guide gave, by method; plain PPO and the guide too."""
     found: dict[str, float] = {}
     guides: list[float] = []
     for row in rows:
@@ -70,14 +64,7 @@ def ends(rows: Sequence[Row], task: str, arm: str) -> dict[str, float]:
 
 
 def words(task: str, arm: str, folder: Path, frames: int) -> list[str]:
-    """Return the arguments of coil-compare.
-
-    Args:
-        task: name of the task.
-        arm: of the guide.
-        folder: of the comparison.
-        frames: of a whole training.
-    """
+    """Return the arguments of coil-compare."""
     file = f"{arm}/{task.partition('_noisy')[0]}" if arm == DETUNED else arm
     searched = ["hydra.searchpath=[pkg://benchmarks.guide_benchmark.conf]"]
     own = searched if (OWN / f"{task}.yaml").exists() else []
@@ -85,14 +72,7 @@ def words(task: str, arm: str, folder: Path, frames: int) -> list[str]:
 
 
 def judged(rows: Sequence[Row], task: str, arm: str, folder: Path) -> dict[str, Any]:
-    """Return the row of a comparison: what it said, and what that is worth.
-
-    Args:
-        rows: of the guide benchmark.
-        task: name of the task.
-        arm: of the guide.
-        folder: of the comparison.
-    """
+    """Return the row of a comparison: what it said, and what that is worth."""
     values = ends(rows, task, arm)
     said = json.loads((folder / FOUND).read_text())
     use = said["train"] or GUIDE if said["use"] == NOTHING else said["use"]
@@ -126,11 +106,7 @@ def _measured(folder: Path, name: str) -> float:
 
 
 def page(found: Sequence[Mapping[str, Any]]) -> str:
-    """Return the page of all comparisons.
-
-    Args:
-        found: their rows.
-    """
+    """Return the page of all comparisons."""
     titles = {"regret": "coil-compare"} | {f"regret_{rule}": f"always {rule}" for rule in RULES}
     summary = []
     for name, title in titles.items():
@@ -157,10 +133,6 @@ def page(found: Sequence[Mapping[str, Any]]) -> str:
 def run(place: Path, arguments: Sequence[str]) -> None:
     """Run a comparison, unless it is finished; what it prints is in log.txt, beside its folder.
 
-    Args:
-        place: its folder.
-        arguments: of coil-compare.
-
     Raises:
         ChildProcessError: if it fails.
     """
@@ -168,7 +140,7 @@ def run(place: Path, arguments: Sequence[str]) -> None:
         return
     place.parent.mkdir(parents=True, exist_ok=True)
     log = place.parent / "log.txt"
-    command = [sys.executable, "-m", "coil_rl.programs.compare", *arguments]
+    command = [sys.executable, "-m", "coil_rl.comparison.program", *arguments]
     with log.open("a") as output:
         done = subprocess.run(command, stdout=output, stderr=output, check=False)
     if done.returncode:

@@ -79,10 +79,7 @@ def write_task(
     """Write the page of a task with its curves and its ladder.
 
     Args:
-        folder: of the pages.
-        task: its name.
         rows: of the table, the best first.
-        runs: those of which curves are drawn.
         jobs: number of further runs beside them that were refused or failed.
         curves_of: name of a further picture of curves; empty: the first picture.
     """
@@ -123,9 +120,6 @@ def _several_ppo(rows: Sequence[Row]) -> list[str]:
     """Return a sentence with the returns of PPO that rows are compared with, if there are several.
 
     Rows of another sweep, or of fewer seeds, are compared with the PPO of these.
-
-    Args:
-        rows: of one task.
     """
     known = [row for row in rows if row["arm"] != ALONE and not math.isnan(row["ppo"])]
     returns = Counter(f"{row['ppo']:.1f}" for row in known)
@@ -168,12 +162,7 @@ def _guided(arms: Mapping[tuple[str, str], Any]) -> list[Run]:
 
 
 def write_all(folder: Path, rows: Sequence[Row]) -> str:
-    """Write the page that holds all tasks, with its picture, and return its text.
-
-    Args:
-        folder: of the pages.
-        rows: of all tasks.
-    """
+    """Write the page that holds all tasks, with its picture, and return its text."""
     lines = ["# Guide benchmark"]
     if all(row["effort"] == "smoke" for row in rows):
         lines.append(SMOKE)
@@ -205,11 +194,7 @@ def _table(rows: Sequence[Row], columns: Mapping[str, Sequence[str]]) -> str:
 
 
 def summarised(rows: Sequence[Row]) -> list[Row]:
-    """Return a row for each arm and method over all tasks, in the order of the arms.
-
-    Args:
-        rows: of all tasks.
-    """
+    """Return a row for each arm and method over all tasks, in the order of the arms."""
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         if row["arm"] in ARMS:
@@ -221,11 +206,7 @@ def summarised(rows: Sequence[Row]) -> list[Row]:
 
 
 def by_method(rows: Sequence[Row]) -> list[Row]:
-    """Return a row for each method over all tasks and guides, with the fewest losses first.
-
-    Args:
-        rows: of all tasks.
-    """
+    """Return a row for each method over all tasks and guides, with the fewest losses first."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         if row["arm"] in ARMS:
@@ -241,7 +222,6 @@ def by_method(rows: Sequence[Row]) -> list[Row]:
 
 
 def _summary(arm: str, method: str, rows: Sequence[Row]) -> Row:
-    """Return the row of one arm and method."""
     counts = Counter(row["verdict"] for row in rows)
     lowest = [row["lowest"] for row in rows if not math.isnan(row["lowest"])]
     return {

@@ -23,12 +23,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def draw(rows: Rows, path: Path) -> None:
-    """Draw a line for each arm and method: small a dot for each task, large their mean.
-
-    Args:
-        rows: of the table, as numbers.
-        path: output file.
-    """
+    """Draw a line for each arm and method: small a dot for each task, large their mean."""
     compared = [row for row in rows if row["arm"] != ALONE]
     arms = [arm for arm in ARMS if any(row["arm"] == arm for row in compared)]
     methods = list(dict.fromkeys(str(row["method"]) for row in compared))

@@ -33,8 +33,7 @@ from benchmarks.promise import (
     scale_of,
     verdict,
 )
-from coil_rl.errors import file_of_a_run
-from coil_rl.files import LARGEST_NUMBERS, read_text
+from coil_rl import record
 from coil_rl.report.curves import frames_until, points
 from coil_rl.report.runs import RETURN, Run
 
@@ -75,11 +74,7 @@ class Reference:
     source: str
 
     def value(self, guide: float) -> float:
-        """Return the reference as a number.
-
-        Args:
-            guide: return of the intact guide.
-        """
+        """Return the reference as a number."""
         return guide if self.level == GUIDE else float(self.level)
 
 
@@ -93,11 +88,7 @@ def references() -> dict[str, Reference]:
 
 
 def fingerprint(settings: Mapping[str, Any]) -> str:
-    """Return ten hexadecimal digits of a configuration, the same for all seeds.
-
-    Args:
-        settings: the configuration of a run.
-    """
+    """Return ten hexadecimal digits of a configuration, the same for all seeds."""
     text = json.dumps(_without_seeds(settings), sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
@@ -109,13 +100,7 @@ def _without_seeds(value: Any) -> Any:
 
 
 def effort(seeds: int, frames: float, reference: Reference) -> str:
-    """Return "smoke", "standard" or "headline".
-
-    Args:
-        seeds: of a row.
-        frames: of its runs.
-        reference: of the task.
-    """
+    """Return "smoke", "standard" or "headline"."""
     standard = min(STANDARD_FRAMES, reference.frames)
     if seeds < SEEDS["standard"] or frames < ENOUGH * standard:
         return "smoke"
@@ -127,7 +112,6 @@ def benchmark_rows(task: str, runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Return the rows of a task, those with the highest end first; none without plain PPO.
 
     Args:
-        task: its name in references.csv.
         runs: its runs; their labels are METHOD_ARM.
 
     Raises:
@@ -172,10 +156,8 @@ def _versions(runs: Sequence[Run]) -> dict[str, str]:
     """Return the versions of the libraries of runs; different ones are joined by a slash."""
     found = []
     for run in runs:
-        file = run.folder / "versions.json"
-        with file_of_a_run(file, "remove the run from the folder, or train it again"):
-            own = json.loads(read_text(file, LARGEST_NUMBERS))
-            found.append([str(own.get(name) or "") for name in VERSIONS])
+        own = record.VERSIONS.need(run.folder)
+        found.append([own.get(name, "") for name in VERSIONS])
     columns = zip(*found, strict=True)
     return {
         name: " / ".join(dict.fromkeys(filter(None, column)))
@@ -187,7 +169,6 @@ def score(value: float, row: Mapping[str, Any]) -> float:
     """Return (value - random) / (reference - random).
 
     Args:
-        value: a return.
         row: with `random` and `reference`.
     """
     distance = float(row["reference"]) - float(row["random"])
@@ -273,9 +254,6 @@ def check_row(row: Mapping[str, str]) -> None:
 
 def read_rows(file: Path) -> list[dict[str, str]]:
     """Return the checked rows of a table.
-
-    Args:
-        file: the table.
 
     Raises:
         OSError: if it cannot be read.

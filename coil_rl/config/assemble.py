@@ -39,9 +39,9 @@ from coil_rl.run.guide_returns import GuideReturns
 from coil_rl.run.judge import Trial, guide_titles
 from coil_rl.run.parts import EnvMaker
 from coil_rl.run.run import Budget, Run
-from coil_rl.run.tuned_run import TunedRun
-from coil_rl.run.tuning import Search
 from coil_rl.transforms.normalised_action import in_unit_of
+from coil_rl.tune.run import TunedRun
+from coil_rl.tune.search import Search
 
 
 def assemble(config: DictConfig, folder: Path | None = None) -> Run:

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.config.messages import sentence
+from coil_rl.config.old_names import renamed
 from coil_rl.config.schema import IGNORED_KEYS, TrainConfig
 from coil_rl.config.trust import check_config, shipped_logger
 from coil_rl.config.values import complete_measures, is_complete
@@ -52,7 +53,7 @@ def read_config(
         key: of the calling program that names the folder, for the message.
         changes: new values of top-level keys.
         goes_on: whether the run may be trained further, so that its logger is needed. A shipped one
-            is taken by its name, see `coil_rl.config.logger`; another one must be trusted as any
+            is taken by its name, see `coil_rl.config.trust`; another one must be trusted as any
             part, and is left out where the run is only evaluated.
 
     Raises:
@@ -130,35 +131,6 @@ def _flat(node: Any, name: str = "") -> dict[str, Any]:
     for key, value in node.items():
         result |= _flat(value, f"{name}.{key}" if name else str(key))
     return result
-
-
-OLD_NAMES = {
-    "coil_rl.envs.EnvBatch": "coil_rl.foreign.torchrl_env.EnvBatch",
-    "coil_rl.envs.gymnasium_env.GymnasiumEnv": "coil_rl.foreign.gymnasium_env.GymnasiumEnv",
-    "coil_rl.guides.learned.LearnedGuide": "coil_rl.LearnedGuide",
-}
-GONE = {
-    "coil_rl.imitation.SklearnRegressor": "regressors of scikit-learn are saved in another way",
-}
-
-
-def renamed(node: Any, path: Path) -> Any:
-    """Return nested values of a configuration with today's names of parts that moved.
-
-    Args:
-        node: as read from a folder.
-        path: of its file, for the message.
-
-    Raises:
-        UserError: for a part that no longer exists.
-    """
-    if isinstance(node, Mapping):
-        return {key: renamed(value, path) for key, value in node.items()}
-    if isinstance(node, list):
-        return [renamed(value, path) for value in node]
-    if isinstance(node, str) and node in GONE:
-        raise UserError(f"{path} is of an earlier version: {GONE[node]} today; train again")
-    return OLD_NAMES.get(node, node) if isinstance(node, str) else node
 
 
 PREFIX = "pretrained:"

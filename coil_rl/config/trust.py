@@ -12,7 +12,7 @@ each of them must be on a list of full names before anything is imported:
 - what the configuration of the command itself names, because the command uses it anyway;
 - anything that is defined in a package that the user trusts.
 
-The logger of a run is not among them: `coil_rl.config.logger` takes it by its name. A constructor
+The logger of a run is not among them: `shipped_logger` takes it by its name. A constructor
 on the list may read a file that its arguments name, but must not write one.
 `docs/trust.md` has the trust model.
 """

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import metadata
 from typing import Any
 
@@ -14,13 +12,12 @@ from gymnasium import spaces
 from torch import Tensor
 from torchrl.data import Bounded
 
+from coil_rl import record
 from coil_rl.envs.meanings import meaning, meanings_of
-from coil_rl.errors import file_of_a_run
 from coil_rl.export.contract import FORMAT, VERSION, checksum
 from coil_rl.export.files import OPSET
 from coil_rl.export.parity import Parity
 from coil_rl.export.step import ADVICE, Entry, PolicyStep
-from coil_rl.files import LARGEST_TABLE, read_text
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.normaliser import Normaliser
@@ -28,7 +25,7 @@ from coil_rl.measures import MEAN_CASE
 from coil_rl.run.controller import Controller
 from coil_rl.run.delivery import GuideActs
 from coil_rl.run.folder import HANDED_OVER
-from coil_rl.run.reasons import FIRST, delivered, handed_over
+from coil_rl.run.reasons import FIRST, handed_over
 from coil_rl.run.run import Run
 
 PACKAGES = ("coil-rl", "torch", "onnx", "onnxscript", "onnxruntime")
@@ -103,7 +100,7 @@ def title_of(plant: Any) -> str:
         plant: without transforms.
     """
     if isinstance(plant, GymnasiumEnv):
-        return plant.rows[0].gate.name
+        return plant.codec.name
     return type(plant).__name__
 
 
@@ -124,11 +121,12 @@ def guide_itself(controller: Controller, step: PolicyStep) -> str | None:
 
 def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
     tested = which == HANDED_OVER and run.delivery == "tested"  # so a test may have chosen it
+    delivery = record.DELIVERY.read(run.folder) if tested else None
     method = run.settings.get("method") or {}
     acts = LEARNED
     if guide is not None:
         acts = f"guide {guide} itself, not a learned policy"
-    elif tested and delivered(run.folder) == FIRST:
+    elif delivery is not None and delivery.policy == FIRST:
         acts = "the first policy, which is its guide and has learned nothing"
     return {
         "label": run.label,
@@ -188,7 +186,7 @@ def _input(
 
 def _source(plant: GymnasiumEnv, key: list[str]) -> dict[str, Any]:
     """Return where an input is in the observation of a Gymnasium env."""
-    for entry in plant.entries:
+    for entry in plant.codec.entries:
         if list(entry.key) == key:
             start = torch.as_tensor(entry.start).reshape(-1)
             start = start.expand(len(entry.choices)) if entry.choices else start[:0]
@@ -219,7 +217,10 @@ def _action(plant: Any, step: PolicyStep, known: Mapping[str, Mapping[str, str]]
         meant["unit"] = "number of a choice"
     space = {"shape": shape, "dtype": dtype}
     if isinstance(plant, GymnasiumEnv):
-        space = {"shape": list(plant.space.shape or ()), "dtype": str(plant.space.dtype)}
+        space = {
+            "shape": list(plant.codec.actions.space.shape or ()),
+            "dtype": str(plant.codec.actions.space.dtype),
+        }
     numbers = (
         _numbering(step) if step.space.choices else {"bounds": _bounds(spec, plant.batch_dims)}
     )
@@ -280,26 +281,14 @@ def results_of(run: Run) -> list[dict[str, Any]]:
     Args:
         run: the run.
     """
-    path = run.folder / "evaluation.csv"
-    if not path.is_file():
-        return []
-    with file_of_a_run(path, "remove the file, and evaluate again"):
-        text = read_text(path, LARGEST_TABLE)
-        rows = list(csv.DictReader(io.StringIO(text, newline="")))
-        means = [row for row in rows if row["case"] == MEAN_CASE]
-        cases = len({row["case"] for row in rows} - {MEAN_CASE})
-        return [_result(row, cases) for row in means]
-
-
-def _result(row: Mapping[str, str], cases: int) -> dict[str, Any]:
-    names: Sequence[str] = ("driver", "advice", "actions")
-    result: dict[str, Any] = {name: row[name] for name in names} | {"cases": cases}
-    for name, text in row.items():
-        if name in (*names, "case"):
+    rows = record.EVALUATION.read(run.folder) or []
+    cases = len({row["case"] for row in rows} - {MEAN_CASE})
+    results = []
+    for row in rows:
+        if row["case"] != MEAN_CASE:
             continue
-        try:
-            number = float(text)
-        except ValueError:
-            continue
-        result[name] = number if math.isfinite(number) else None
-    return result
+        driver = {name: row[name] for name in record.DRIVER if name != "case"}
+        numbers = {name: row[name] for name in row if name not in record.DRIVER}
+        known = {name: each if math.isfinite(each) else None for name, each in numbers.items()}
+        results.append(driver | {"cases": cases} | known)
+    return results

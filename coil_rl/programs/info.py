@@ -1,12 +1,12 @@
 """`coil-info`: print the versions that a bug report needs, or the command that made a run."""
 
-import json
 import sys
 from pathlib import Path
 
-from coil_rl.errors import UserError, file_of_a_run
+from coil_rl import record
+from coil_rl.errors import UserError
 from coil_rl.programs import app
-from coil_rl.run.folder import COMMAND, is_begun, versions
+from coil_rl.run.folder import is_begun, versions
 
 HELP = """coil-info: the versions that a bug report needs, or the command that made a run.
 
@@ -25,17 +25,8 @@ def describe(folder: Path) -> dict[str, str]:
     """
     if not is_begun(folder):
         raise UserError(f"run={folder} is not the folder of a run: it has no config.yaml")
-    command = folder / COMMAND
-    made = "not known: the run was not made on a command line"
-    if command.exists():
-        with file_of_a_run(command, "remove it"):
-            made = command.read_text(encoding="utf-8").strip()
-    file = folder / "versions.json"
-    begun = {}
-    if file.exists():
-        with file_of_a_run(file, "remove it"):
-            begun = {str(name): str(value) for name, value in json.loads(file.read_text()).items()}
-    return {"command": made, **begun}
+    made = record.COMMAND.read(folder) or "not known: the run was not made on a command line"
+    return {"command": made} | (record.VERSIONS.read(folder) or {})
 
 
 def main() -> None:

@@ -16,8 +16,9 @@ import numpy as np
 
 from coil_rl.errors import UserError
 from coil_rl.measures import Measure
+from coil_rl.record import DRIVER
 from coil_rl.report.guides import is_guide, shared_guides
-from coil_rl.report.runs import DRIVER, FALLBACK, GUIDE, Run
+from coil_rl.report.runs import FALLBACK, GUIDE, Run
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
 from coil_rl.report.table import return_format
 

@@ -11,9 +11,10 @@ from itertools import chain
 from statistics import mean
 from typing import Any
 
+from coil_rl.record import UNTESTED
 from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning
-from coil_rl.report.runs import GUIDE, PER_STEP, TERM, UNTESTED, Run, begun_with
+from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run, begun_with
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
 from coil_rl.report.table import AUTO_FORMAT, TABLES, Table, fitted, return_format
 

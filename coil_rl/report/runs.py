@@ -5,21 +5,16 @@ pandas takes half a second to import, so only what reads an evaluation does. A t
 
 from __future__ import annotations
 
-import csv
-import io
-import json
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import yaml
 
+from coil_rl import record
 from coil_rl.errors import UserError, file_of_a_run
-from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, LARGEST_TABLE, read_file, read_text
+from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, read_text
 from coil_rl.measures import MEAN_CASE, Measure, measures_of
 from coil_rl.plain_yaml import read_yaml
 
@@ -28,14 +23,11 @@ if TYPE_CHECKING:
 
 GUIDE = "guide"  # in the column `driver` of evaluation.csv
 FALLBACK = f" or {GUIDE}"  # after the label, there: the policy with a guide to fall back to
-DRIVER = ("driver", "advice", "actions", "case")
 EVALUATION = "evaluation"  # set of cases for reports
 SELECTION = "selection"  # set of cases for the choice of the best policy
 RETURN, CHOICE = f"{EVALUATION}/return", f"{SELECTION}/return"  # columns of metrics.csv
 PER_STEP = "per_step_"  # prefix of the measures of tasks
 TERM = "reward_"  # prefix of the measures of the terms of the reward
-DELIVERY = "delivery.json"  # of a run: which policy it hands over, and why
-UNTESTED = "last_untested"  # in that file: the last policy, as no frames were left for a test
 RESTORE = "restore the file, or remove the run from the folder"
 
 
@@ -157,33 +149,21 @@ def _is_run(config: Path, folder: Path) -> bool:
 def _read_run(folder: Path) -> Run:
     """Return the run in a folder; without an evaluation only what its configuration says."""
     run, measures = _read_config(folder / "config.yaml")
-    path = folder / "evaluation.csv"
-    if not path.exists():
+    rows = record.EVALUATION.read(folder)
+    if rows is None:
         return run
-    again = shlex.join(["coil-train", f"resume={folder}"])
-    with file_of_a_run(path, f"remove the file and write it again by {again}"):
-        shown = [name for name, measure in measures.items() if measure.title]
-        evaluation = _read_evaluation(path, shown)
-    path = folder / "metrics.csv"
-    with file_of_a_run(path, RESTORE):
-        curve = read_curve(path) if path.exists() else []
+    with file_of_a_run(folder / record.EVALUATION.name, RESTORE):
+        evaluation = _cases_of(rows, [name for name in measures if measures[name].title])
+    delivery = record.DELIVERY.read(folder)
     return replace(
         run,
         evaluation=evaluation,
         measures=measures,
-        curve=curve,
-        guide_returns=_read_numbers(folder / "guide_return.json"),
-        seconds=_read_numbers(folder / "training_time.json").get("seconds"),
-        handed_over=_handed_over(folder / DELIVERY),
+        curve=record.METRICS.read(folder) or [],
+        guide_returns=record.GUIDE_RETURNS.read(folder) or {},
+        seconds=(record.SECONDS.read(folder) or {}).get("seconds"),
+        handed_over=delivery.policy if delivery is not None else "",
     )
-
-
-def _handed_over(path: Path) -> str:
-    """Return which policy a run handed over; empty without the file."""
-    with file_of_a_run(path, RESTORE):
-        if not path.exists():
-            return ""
-        return str(json.loads(read_file(path, LARGEST_NUMBERS))["policy"])
 
 
 def _read_config(path: Path) -> tuple[Run, dict[str, Measure]]:
@@ -206,77 +186,20 @@ def _read_config(path: Path) -> tuple[Run, dict[str, Measure]]:
     return run, measures
 
 
-def _read_numbers(path: Path) -> dict[str, float]:
-    """Return the numbers in a JSON file by name; none without the file."""
-    with file_of_a_run(path, RESTORE):
-        saved = json.loads(read_file(path, LARGEST_NUMBERS)) if path.exists() else {}
-        return {key: float(value) for key, value in saved.items()}
-
-
-def _read_evaluation(path: Path, shown: Iterable[str]) -> pd.DataFrame:
-    """Return the rows of an evaluation.csv, without those of means.
+def _cases_of(rows: Sequence[record.Row], shown: Iterable[str]) -> pd.DataFrame:
+    """Return the rows of an evaluation, without those of means.
 
     Args:
-        path: of the file.
+        rows: of evaluation.csv.
         shown: measures that reports show, of which there must be a column.
     """
     import pandas as pd
 
-    rows = read_table(path)
-    if not rows:
-        raise ValueError("no rows")
-    frame = pd.DataFrame(rows)
     for name in shown:
-        if name not in frame and set(DRIVER) <= set(frame):
+        if name not in rows[0]:
             raise ValueError(f"no column {name}")
-    numbers = ["reward", *(column for column in frame if column not in (*DRIVER, "reward"))]
-    frame = frame[[*DRIVER, *numbers]].astype(dict.fromkeys(numbers, float))
+    frame = pd.DataFrame(rows)
     frame = frame[frame["case"] != MEAN_CASE]
     if frame.empty:
         raise ValueError("no rows")
-    if frame.duplicated(list(DRIVER)).any():
-        raise ValueError("two rows of one driver in the same case")
     return frame
-
-
-def read_curve(file: Path | BinaryIO) -> list[dict[str, float]]:
-    """Return the rows of a `metrics.csv`.
-
-    Args:
-        file: its path, or the opened file.
-
-    Raises:
-        ValueError: if a cell is no number, or `frames` is missing.
-    """
-    rows = [{name: float(cell) for name, cell in row.items()} for row in read_table(file)]
-    if not all(np.isfinite(row.get("frames", np.nan)) for row in rows):
-        raise ValueError("not every row has its number of frames")
-    return rows
-
-
-def read_table(file: Path | BinaryIO) -> list[dict[str, str]]:
-    """Return the rows of a CSV file by the names of its columns, all cells as text.
-
-    So numbers keep every digit, and an empty cell is an error where a number is expected.
-
-    Args:
-        file: its path, or the opened file.
-
-    Raises:
-        ValueError: for a file that is no text or empty, and for a row with more values than there
-            are columns; one with fewer, as while it is written, is filled with "nan".
-    """
-    content = read_file(file, LARGEST_TABLE) if isinstance(file, Path) else file.read()
-    try:
-        lines = list(csv.reader(io.StringIO(content.decode("utf-8"), newline=""), strict=True))
-    except csv.Error as error:
-        raise ValueError(str(error)) from error
-    if not lines or not lines[0]:
-        raise ValueError("No columns")
-    columns = lines[0]
-    if len(set(columns)) < len(columns):
-        raise ValueError("two columns of one name")
-    rows = [line for line in lines[1:] if line]
-    if any(len(row) > len(columns) for row in rows):
-        raise ValueError("a row with more values than columns")
-    return [dict(zip_longest(columns, row, fillvalue="nan")) for row in rows]

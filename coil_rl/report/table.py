@@ -1,6 +1,5 @@
 """Tables of results as Markdown, aligned for terminals, and as CSV."""
 
-import csv
 import math
 import os
 import re
@@ -15,6 +14,7 @@ import tabulate
 import yaml
 
 from coil_rl.files import whole_file
+from coil_rl.record import csv_text, plain
 
 tabulate.MIN_PADDING = 0  # extra width of headings
 # Columns and notes by table.
@@ -160,7 +160,7 @@ def _values(rows: Rows, columns: Columns) -> list[list[object]]:
             raise ValueError(
                 f"No row has {key!r} for the column {heading!r}; the rows have: {', '.join(keys)}."
             )
-    return [[_to_python(row.get(key)) for key in columns] for row in rows]
+    return [[plain(row.get(key)) for key in columns] for row in rows]
 
 
 def _specs(values: Sequence[Sequence[object]], columns: Columns) -> list[str]:
@@ -188,26 +188,14 @@ def _escaped(text: str) -> str:
 def write_csv(rows: Sequence[Mapping[str, object]], path: str | os.PathLike[str]) -> None:
     """Write rows as CSV with full precision; the file appears whole or not at all.
 
-    The columns are all keys in the order of their first appearance. Missing keys and None become an
-    empty cell, NaN becomes nan.
+    See `csv_text`.
 
     Args:
         rows: one mapping per line.
         path: output file.
     """
-    columns = list(dict.fromkeys(chain.from_iterable(rows)))
-    with whole_file(path) as unfinished, unfinished.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        if columns:
-            writer.writeheader()
-        writer.writerows({key: _to_python(value) for key, value in row.items()} for row in rows)
-
-
-def _to_python(value: object) -> object:
-    """Convert a NumPy or torch scalar to a Python number."""
-    if getattr(value, "ndim", None) == 0 and hasattr(value, "item"):
-        return value.item()
-    return value
+    with whole_file(path) as unfinished:
+        unfinished.write_text(csv_text(rows), encoding="utf-8", newline="")
 
 
 def _is_missing(value: object) -> bool:

@@ -9,7 +9,6 @@ held and the start test has left no frames for it, the test is left out.
 """
 
 import copy
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,11 +21,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.files import write_text
+from coil_rl import record
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.anchor import hold_of
 from coil_rl.learners.learner import Learner
-from coil_rl.report.runs import DELIVERY, UNTESTED
 from coil_rl.report.statistics import mean_interval
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
@@ -184,7 +182,7 @@ class Delivery:
     def _hand_over_untested(self, last: dict[str, Any]) -> dict[str, float]:
         """Hand over the last policy without a test, and return NaN for its mean returns."""
         checkpoint.save(last, weights_file(self.folder, HANDED_OVER))
-        self._report(UNTESTED, {}, {"last": torch.empty(0)}, None)
+        self._report(record.UNTESTED, {}, {"last": torch.empty(0)}, None)
         return dict.fromkeys(self.names, math.nan) | {"delivery/cases": 0.0}
 
     def _earlier(self, update: int) -> Path | None:
@@ -266,17 +264,18 @@ class Delivery:
             earlier: file of the best kept policy; None: there is none.
         """
         ahead = None
-        if chosen not in ("last", UNTESTED):
+        if chosen not in ("last", record.UNTESTED):
             ahead = mean_interval((returns[chosen] - returns["last"]).tolist())
-        report = {
-            "policy": chosen,
-            "cases": len(returns["last"]),
-            "steps": self.cases.steps,
-            "returns": means,
-            "ahead": ahead,  # of the last policy: mean difference, with its 95 % t interval
-            "frames": int(earlier.stem) if chosen == "earlier" and earlier is not None else None,
-        }
-        write_text(self.folder / DELIVERY, json.dumps(report, indent=2))
+        report = record.Delivery(
+            policy=chosen,
+            cases=len(returns["last"]),
+            steps=self.cases.steps,
+            calls=self.cases.calls,
+            returns=dict(means),
+            ahead=ahead,
+            frames=int(earlier.stem) if chosen == "earlier" and earlier is not None else None,
+        )
+        record.DELIVERY.write(self.folder, report)
 
 
 def policy_of(state: dict[str, Any], learner: Learner, env: EnvBase) -> TensorDictModuleBase:

@@ -1,7 +1,6 @@
 """The folder of a run: its lock, configuration and software versions."""
 
 import errno
-import json
 import os
 import platform
 import shlex
@@ -14,13 +13,14 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from coil_rl import record
 from coil_rl.errors import RunningError, UserError
-from coil_rl.files import LARGEST_NUMBERS, read_file, remove_unfinished, write_text
+from coil_rl.files import remove_unfinished, write_text
 from coil_rl.output import say
 from coil_rl.plain_yaml import yaml_of
 from coil_rl.run.stopping import resume_command
 
-CONFIG, COMMAND = "config.yaml", "command.txt"
+CONFIG = "config.yaml"
 HANDED_OVER = "handed_over"  # the policy that `delivery` chose
 OLD_HANDED_OVER = "policy_best.pt"  # its file in older folders
 ROOT = Path(__file__).resolve().parents[2]
@@ -74,9 +74,9 @@ def begin(folder: Path, saved: Mapping[str, Any], command: Sequence[str] = ()) -
             f"{folder} already holds a run; resume it with {resume_command(folder)}, or choose "
             "another folder with hydra.run.dir=FOLDER"
         )
-    write_text(folder / "versions.json", json.dumps(versions(), indent=2))
+    record.VERSIONS.write(folder, versions())
     if command:
-        write_text(folder / COMMAND, shlex.join(command))
+        record.COMMAND.write(folder, shlex.join(command))
     write_config(folder, saved)
 
 
@@ -119,7 +119,7 @@ def is_begun(folder: Path) -> bool:
 
 def is_evaluated(folder: Path) -> bool:
     """Return whether a run is finished: its evaluation is the last thing it writes."""
-    return (folder / "evaluation.csv").exists()
+    return (folder / record.EVALUATION.name).exists()
 
 
 def report_changed_versions(folder: Path) -> None:
@@ -128,8 +128,8 @@ def report_changed_versions(folder: Path) -> None:
     They are the versions of Python and of the packages.
     """
     try:
-        begun = dict(json.loads(read_file(folder / "versions.json", LARGEST_NUMBERS)))
-    except (OSError, RecursionError, TypeError, ValueError):
+        begun = record.VERSIONS.read(folder) or {}
+    except UserError:
         begun = {}
     present = versions()
     names = [name for name in ("python", *PACKAGES) if begun.get(name) != present[name]]

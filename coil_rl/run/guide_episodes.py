@@ -7,16 +7,16 @@ evaluation curve they are a file of the run.
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from coil_rl.files import LARGEST_TABLE, read_file, write_text
+from coil_rl.errors import UserError
+from coil_rl.record import GUIDE_EPISODES, Driven, Episode, GuideEpisodes
 from coil_rl.run.evaluation import EvaluationResult
 
-GUIDE_EPISODES = "guide_episodes.json"
 MOST_NUMBERS = 5_000_000  # of steps; more are not kept
 # The values of a configuration that the episodes of guides depend on.
 OF_GUIDES = ("env", "guide", "degrade", "evaluation", "track", "device")
@@ -38,17 +38,16 @@ def driven_once(
         drive: drives the guides; returns their episodes by name.
     """
     key = _key(settings, evaluation)
-    file = folder / GUIDE_EPISODES
     try:
-        saved = json.loads(read_file(file, LARGEST_TABLE))
-        if saved["key"] == key:
-            return {str(name): _result(each) for name, each in saved["guides"].items()}
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        saved = GUIDE_EPISODES.read(folder)
+        if saved is not None and saved.key == key:
+            return {name: _result(each) for name, each in saved.guides.items()}
+    except (UserError, ValueError, TypeError):
         pass  # they are driven
     results = drive()
     if results and _numbers(results) <= MOST_NUMBERS:
-        guides = {name: _plain(result) for name, result in results.items()}
-        write_text(file, json.dumps({"key": key, "guides": guides}))
+        guides = {name: _driven(result) for name, result in results.items()}
+        GUIDE_EPISODES.write(folder, GuideEpisodes(key=key, guides=guides))
     return results
 
 
@@ -68,21 +67,17 @@ def _numbers(results: Results) -> int:
     return count
 
 
-def _plain(result: EvaluationResult) -> dict[str, Any]:
-    """Return a result as values of JSON, which keep every digit."""
-    histories = {
-        name: [history.tolist() for history in each] for name, each in result.histories.items()
-    }
-    return {"rate": result.rate, "episodes": result.episodes, "histories": histories}
+def _driven(result: EvaluationResult) -> Driven:
+    """Return a result as it is written, with every digit."""
+    histories = {name: [each.tolist() for each in of] for name, of in result.histories.items()}
+    episodes = [Episode(**episode) for episode in result.episodes]
+    return Driven(rate=result.rate, episodes=episodes, histories=histories)
 
 
-def _result(plain: Mapping[str, Any]) -> EvaluationResult:
-    """Return the result of values of JSON; raises an error for others."""
+def _result(driven: Driven) -> EvaluationResult:
+    """Return what was written as a result."""
     histories = {
-        str(name): [np.array(history, dtype=np.float64) for history in each]
-        for name, each in plain["histories"].items()
+        name: [np.array(history, dtype=np.float64) for history in each]
+        for name, each in driven.histories.items()
     }
-    episodes: Sequence[Mapping[str, Any]] = plain["episodes"]
-    for episode in episodes:
-        float(episode["reward"]), int(episode["steps"]), str(episode["case"])
-    return EvaluationResult([dict(episode) for episode in episodes], histories, plain["rate"])
+    return EvaluationResult([each.model_dump() for each in driven.episodes], histories, driven.rate)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
@@ -17,9 +15,9 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from coil_rl import record
 from coil_rl.compiled import compile_steps
-from coil_rl.errors import file_of_a_run
-from coil_rl.files import LARGEST_NUMBERS, LARGEST_TABLE, read_text, write_text
+from coil_rl.errors import UserError
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.measures import (
     MEAN_CASE,
@@ -30,7 +28,7 @@ from coil_rl.measures import (
     with_shares,
 )
 from coil_rl.output import decoration, progress, say
-from coil_rl.report import Returns, markdown_table, write_csv
+from coil_rl.report import Returns, markdown_table
 from coil_rl.report.pictures import Picture
 from coil_rl.report.runs import FALLBACK
 from coil_rl.report.statistics import mean_interval
@@ -200,11 +198,11 @@ def judge(
             result = trial.evaluation.run(trial.env(len(trial.evaluation.cases)), fallback)
             judgement.add(result, f"{trial.label}{FALLBACK}")
             share = fallback.share(result)
-    write_csv(judgement.episodes, folder / "episodes.csv")
+    record.EPISODES.write(folder, judgement.episodes)
     page = _page(trial, judgement, has_policy=policy is not None, share=share)
-    write_text(folder / "evaluation.md", page)
+    record.PAGE.write(folder, page)
     table = with_denominators(judgement.table, judgement.counts)
-    write_csv(table, folder / "evaluation.csv")
+    record.EVALUATION.write(folder, table)
     for picture in trial.pictures:
         with decoration(f"the picture {type(picture).__name__} in {folder}"):
             picture.draw(judgement.shown, folder)
@@ -373,21 +371,17 @@ def report_outcome(folder: Path) -> float:
     Without a policy it is that of the guide; that of a fallback is on the page only. A damaged file
     is a `UserError`.
     """
-    path = folder / "evaluation.csv"
-    with file_of_a_run(path, "remove the file, and evaluate again"):
-        rows = list(csv.DictReader(io.StringIO(read_text(path, LARGEST_TABLE), newline="")))
-        means = [
-            row for row in rows if (row["case"], row["actions"]) == (MEAN_CASE, "deterministic")
-        ]
-        with_fallback = {f"{row['driver']}{FALLBACK}" for row in means}
-        own = [row for row in means if not row["advice"] and row["driver"] not in with_fallback]
-        last = own[-1]
-        reward, completed = float(last["reward"]), float(last.get("completed", "nan"))
-        page = read_text(folder / "evaluation.md", LARGEST_NUMBERS).rstrip()
-    say(page)
+    rows = record.EVALUATION.need(folder)
+    means = [row for row in rows if (row["case"], row["actions"]) == (MEAN_CASE, "deterministic")]
+    with_fallback = {f"{row['driver']}{FALLBACK}" for row in means}
+    own = [row for row in means if not row["advice"] and row["driver"] not in with_fallback]
+    if not own:
+        raise UserError(f"{folder / record.EVALUATION.name} has no means; evaluate again")
+    reward, completed = own[-1]["reward"], own[-1].get("completed", math.nan)
+    say(record.PAGE.need(folder))
     share = "" if math.isnan(completed) else f", {completed:.0%} completed"
     shown = format(reward, return_format([reward]))
-    say(f"{last['driver']}: mean test reward {shown}{share}; see {folder}")
+    say(f"{own[-1]['driver']}: mean test reward {shown}{share}; see {folder}")
     return reward
 
 

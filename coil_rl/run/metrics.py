@@ -1,7 +1,6 @@
 """The log of a run: one row of numbers for each update, in a CSV file and in any TorchRL logger."""
 
 import csv
-import io
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -12,7 +11,8 @@ from typing import Any
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import LARGEST_TABLE, read_file, whole_file
 from coil_rl.output import decoration
-from coil_rl.report.runs import RETURN, read_curve, read_table
+from coil_rl.record import curve, table
+from coil_rl.report.runs import RETURN
 
 REMEDY = "put the whole file back, or train again in another folder"  # for a damaged log
 
@@ -137,7 +137,7 @@ class Metrics:
         for number, values in results.items():
             self.rows[number] |= values
             self.log(values, int(self.rows[number]["frames"]))
-        rows: list[dict[str, Any]] = list(read_table(self.path))
+        rows: list[dict[str, Any]] = list(table(read_file(self.path, LARGEST_TABLE)))
         for number, values in results.items():
             rows[number] |= values
         with (
@@ -185,7 +185,7 @@ class Metrics:
         if count:
             kept = b"".join(lines[: count + 1])
             with file_of_a_run(self.path, REMEDY):
-                self.rows = read_curve(io.BytesIO(kept))
+                self.rows = curve(kept)
             with whole_file(self.path) as unfinished:
                 unfinished.write_bytes(kept)
         else:

@@ -1,15 +1,11 @@
 """Sentences on the tests of a run: which guide its policy holds, and what is handed over."""
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from coil_rl.errors import file_of_a_run
-from coil_rl.files import LARGEST_NUMBERS, read_file
 from coil_rl.learners.anchor import StartTest
-from coil_rl.report.runs import DELIVERY, UNTESTED
+from coil_rl.record import DELIVERY, UNTESTED
 from coil_rl.report.table import return_format
 
 FIRST = "first"  # policy of a run that holds its guide
@@ -52,45 +48,6 @@ def start_test(row: Mapping[str, float]) -> str | None:
     return f"Start test, mean returns in {cases:.0f} new cases: {listed}. {outcome}"
 
 
-def delivered(folder: Path) -> str | None:
-    """Return the name of what a run handed over, such as "last" or that of a guide.
-
-    It is None without a test.
-
-    Args:
-        folder: of the run.
-
-    Raises:
-        UserError: if the file is damaged.
-    """
-    report = _delivery(folder)
-    return None if report is None else report["policy"]
-
-
-def _delivery(folder: Path) -> dict[str, Any] | None:
-    """Return what a run says about its test at the end; None without a test.
-
-    Args:
-        folder: of the run.
-
-    Raises:
-        UserError: if the file is damaged.
-    """
-    file = folder / DELIVERY
-    if not file.exists():
-        return None
-    with file_of_a_run(file, "remove it, and the sentence is left out"):
-        report = json.loads(read_file(file, LARGEST_NUMBERS))
-        return {
-            "policy": str(report["policy"]),
-            "returns": {str(name): float(value) for name, value in report["returns"].items()},
-            "cases": int(report["cases"]),
-            "steps": int(report.get("steps", 0)),
-            "frames": None if report["frames"] is None else int(report["frames"]),
-            "ahead": [float(value) for value in report.get("ahead") or ()],
-        }
-
-
 def beyond_budget(folder: Path, frames: int) -> str | None:
     """Return the sentence for a search that took more frames than its budget; None for another.
 
@@ -101,11 +58,11 @@ def beyond_budget(folder: Path, frames: int) -> str | None:
     Raises:
         UserError: if the file is damaged.
     """
-    report = _delivery(folder)
-    if report is None or report["steps"] <= frames:
+    report = DELIVERY.read(folder)
+    if report is None or report.steps <= frames:
         return None
     return (
-        f"The search took {report['steps']:,} frames, more than budget.frames={frames:,}: that is "
+        f"The search took {report.steps:,} frames, more than budget.frames={frames:,}: that is "
         "too little for a generation and a test of its result."
     )
 
@@ -119,25 +76,25 @@ def handed_over(folder: Path) -> str | None:
     Raises:
         UserError: if the file is damaged.
     """
-    report = _delivery(folder)
+    report = DELIVERY.read(folder)
     if report is None:
         return None
-    chosen, returns, ahead = report["policy"], report["returns"], report["ahead"]
+    chosen, returns, ahead = report.policy, report.returns, report.ahead
     if chosen == UNTESTED:
         return (
             "Handed over is the last policy, without a test at the end: the frames that are left "
             "for it are too few for two cases, and no guide is held."
         )
     names = dict(POLICIES)
-    if report["frames"] is not None:
-        names["earlier"] = f"the policy after {report['frames']:,} frames"
+    if report.frames is not None:
+        names["earlier"] = f"the policy after {report.frames:,} frames"
     spec = return_format(returns.values())
     listed = ", ".join(f"{names.get(name, name)} {value:{spec}}" for name, value in returns.items())
     title = names.get(chosen, f"the {chosen} itself, and nothing that was learned")
     if chosen == FIRST:
         title += ", which is its guide and has learned nothing"
     sentence = (
-        f"Handed over is {title}: mean returns in {report['cases']} new cases of the training, "
+        f"Handed over is {title}: mean returns in {report.cases} new cases of the training, "
         f"whose steps are among its frames: {listed}"
     )
     if ahead:

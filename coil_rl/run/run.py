@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,14 +15,14 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.errors import NO_SPACE, UserError, file_of_a_run, is_outside
-from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
+from coil_rl import record
+from coil_rl.errors import NO_SPACE, UserError, is_outside
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.measures import Measure
 from coil_rl.output import decoration, say
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.report.pictures import Picture
-from coil_rl.report.runs import DELIVERY, EVALUATION, begun_with, read_curve
+from coil_rl.report.runs import EVALUATION, begun_with
 from coil_rl.run import checkpoint
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import Watch
@@ -283,8 +282,8 @@ class Run:
         if not begun:
             return
         write_config(self.folder, self.settings)
-        for file in ("evaluation.csv", "evaluation.md", "training_time.json", DELIVERY):
-            (self.folder / file).unlink(missing_ok=True)
+        for file in (record.EVALUATION, record.PAGE, record.SECONDS, record.DELIVERY):
+            (self.folder / file.name).unlink(missing_ok=True)
         say(
             f"{self.folder} goes on from {budget.frames:,} to {frames:,} frames; schedules over "
             f"the run, such as a learning rate, go on at {budget.frames / frames:.0%} of their way",
@@ -352,7 +351,7 @@ class Run:
     def _say_next(self) -> None:
         """Print the command that usually follows a training."""
         if self.has_agent:
-            rows = read_curve(self.folder / "metrics.csv")
+            rows = record.METRICS.need(self.folder)
             say(next_step(self.folder, self.budget.frames, rows))
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
@@ -368,8 +367,7 @@ class Run:
         start = time.monotonic()
         rows = experiment.run(max(guide_returns.values(), default=None))
         if not resumed:  # the time before the interruption is unknown
-            seconds = {"seconds": time.monotonic() - start}
-            write_text(self.folder / "training_time.json", json.dumps(seconds, indent=2))
+            record.SECONDS.write(self.folder, {"seconds": time.monotonic() - start})
         learner = experiment.learner
         with decoration(f"the learning curve in {self.folder}"):
             self._draw(rows, learner, guide_returns)
@@ -395,15 +393,12 @@ class Run:
 
         It is empty without such cases.
         """
-        file = self.folder / "guide_return.json"
-        if file.exists():
-            names = self.trial.guides if EVALUATION in self.make_env.sizes else ()
-            with file_of_a_run(file, "remove it, and the run measures it again"):
-                numbers = json.loads(read_file(file, LARGEST_NUMBERS))
-                return {name: float(numbers[name]) for name in names}
-        returns = guide_returns(self.make_env, self.make_env.guides())
-        write_text(file, json.dumps(returns, indent=2))
-        return returns
+        names = self.trial.guides if EVALUATION in self.make_env.sizes else ()
+        saved = record.GUIDE_RETURNS.read(self.folder)
+        if saved is None or not saved.keys() >= set(names):
+            saved = guide_returns(self.make_env, self.make_env.guides())
+            record.GUIDE_RETURNS.write(self.folder, saved)
+        return {name: saved[name] for name in names}
 
     def require_agent(self) -> Callable[[EnvBase], Learner]:
         """Return what makes the learner of the run for an env.
@@ -457,7 +452,7 @@ class Run:
 
     def reasons(self) -> list[str]:
         """Return the sentences on how the training began, and on its tests."""
-        rows = read_curve(self.folder / "metrics.csv") if self.has_agent else []
+        rows = record.METRICS.need(self.folder) if self.has_agent else []
         found = [start_test(rows[0])] if rows else []
         if (source := begun_with(self.settings)) is not None:
             found.append(f"It began with {source}, whose frames are not among those of this run.")

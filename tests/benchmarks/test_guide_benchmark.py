@@ -167,6 +167,7 @@ def folder(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_scores_are_0_for_the_random_guide_and_1_for_the_reference(folder):
     rows = benchmark_rows("pendulum", read_runs([folder / "pendulum"]))
     arms = {(row["method"], row["arm"]): row for row in rows}
@@ -248,7 +249,7 @@ def test_versions_are_those_of_all_runs_of_a_row(made):
 
 def test_run_without_its_versions_is_one_sentence(made):
     (made / "coil_intact" / "1" / "versions.json").unlink()
-    with pytest.raises(UserError, match=r"versions.json is damaged .*; remove the run"):
+    with pytest.raises(UserError, match=r"versions.json is damaged .*; remove it"):
         benchmark_rows("pendulum", read_runs([made]))
 
 
@@ -282,6 +283,7 @@ def test_methods_are_ordered_by_their_share_of_losses_and_name_their_worst_pair(
     assert (tune["method"], tune["loss"]) == ("tune", 1)
 
 
+@pytest.mark.slow
 def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, monkeypatch, capsys):
     file = tmp_path / "rows.csv"
     for _ in range(2):  # the second time each row replaces itself
@@ -301,6 +303,7 @@ def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, monke
     assert (tmp_path / "pendulum.webp").exists()
 
 
+@pytest.mark.slow
 def test_page_of_all_tasks_is_of_the_whole_table_that_rows_join(folder, tmp_path, monkeypatch):
     file = tmp_path / "table.csv"
     shutil.copyfile(ROWS, file)
@@ -362,6 +365,7 @@ def test_every_arm_and_every_method_of_a_task_can_be_started(task, tmp_path):
             check_parts(compose("train", [*words, f"run_dir={tmp_path}"]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", PACKAGES)
 def test_task_of_another_package_trains(task, tmp_path):
     if find_spec(PACKAGES[task]) is None:

@@ -172,6 +172,7 @@ def folder(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_experiment_trains_the_arms_of_a_task_in_its_folder(folder):
     labels = [(run.label, run.seed) for run in read_runs([folder / "pendulum"])]
     assert sorted(labels) == sorted(
@@ -181,6 +182,7 @@ def test_experiment_trains_the_arms_of_a_task_in_its_folder(folder):
     )
 
 
+@pytest.mark.slow
 def test_table_compares_each_arm_with_the_better_of_guide_and_ppo(folder):
     runs = read_runs([folder / "pendulum"])
     intact, random = promise.rows_of_task("pendulum", runs)
@@ -203,6 +205,7 @@ def test_table_compares_each_arm_with_the_better_of_guide_and_ppo(folder):
     assert all(policy in intact["handed_over"] for policy in chosen)
 
 
+@pytest.mark.slow
 def test_program_writes_the_table(folder, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["promise", str(folder)])
     promise.main()
@@ -213,6 +216,7 @@ def test_program_writes_the_table(folder, monkeypatch, capsys):
     assert "others" not in page
 
 
+@pytest.mark.slow
 def test_seeds_that_confirm_have_a_column_of_their_own(folder):
     runs = read_runs([folder / "pendulum"])
     rows = promise.rows_of_task("pendulum", runs)

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 from hydra.utils import get_object
 
-from coil_rl.config.folder import GONE, OLD_NAMES, renamed
+from coil_rl.config.old_names import GONE, OLD_NAMES, renamed
 from coil_rl.errors import UserError
 
 PATH = Path("config.yaml")

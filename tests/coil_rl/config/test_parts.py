@@ -1,8 +1,11 @@
+from itertools import product
+
 import pytest
 import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from programs import shipped
+from slow import some_fast
 
 from coil_rl.config.nodes import build
 from coil_rl.config.parts import (
@@ -36,16 +39,13 @@ def composed(*overrides, name="train"):
 
 
 # Each method with the first preset, and each preset with one method.
-PRESETS = [
-    pytest.param(
-        *(method, preset), marks=[] if preset == "default" or method == "coil" else pytest.mark.slow
-    )
-    for method in shipped("method")
-    for preset in shipped("preset")
-]
+PRESETS = list(product(shipped("method"), shipped("preset")))
 
 
-@pytest.mark.parametrize(("method", "preset"), PRESETS)
+@pytest.mark.parametrize(
+    ("method", "preset"),
+    some_fast(PRESETS, [pair for pair in PRESETS if "default" in pair or "coil" in pair]),
+)
 def test_env_of_every_method_passes_check_env(method, preset):
     env = env_maker(composed(f"preset={preset}", f"method={method}"))()
     check_env(env, steps=3)
@@ -147,12 +147,11 @@ def test_every_learner_is_built(learner):
     assert built.policy(env.reset())["action"].shape == env.action_spec.shape
 
 
-SLOW_TRACKS = [pytest.param("unseen", marks=pytest.mark.slow)]  # many generated tracks
+# track=unseen has many generated tracks.
+TRACKS = sorted({*shipped("track")} - {"folder"})
 
 
-@pytest.mark.parametrize(
-    "track", [*sorted({*shipped("track")} - {"folder", "unseen"}), *SLOW_TRACKS]
-)
+@pytest.mark.parametrize("track", some_fast(TRACKS, {*TRACKS} - {"unseen"}))
 def test_every_track_group_has_tracks(track):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         node = compose("train", [f"track={track}", "run_dir=unused"]).track

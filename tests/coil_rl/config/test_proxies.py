@@ -17,7 +17,7 @@ from coil_rl.config.python import composed as composed_in_python
 from coil_rl.errors import UserError
 from coil_rl.programs.distill import distill
 from coil_rl.programs.train import train
-from coil_rl.report.runs import read_curve
+from coil_rl.record import METRICS
 from coil_rl.run.parts import TEST, TRAIN
 from coil_rl.transforms import GuideActions, ObservationDelay
 
@@ -236,8 +236,8 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
     ]
     assert len(list(proxies.glob("zero_*"))) == 1
     used = [next(proxies.glob(f"{name}_*")) / "metrics.csv" for name in ("spline", "zero")]
-    taken = sum(read_curve(curve)[-1]["frames"] for curve in used)
-    assert read_curve(tmp_path / "run" / "metrics.csv")[0]["frames/before"] == taken
+    taken = sum(METRICS.read(curve.parent)[-1]["frames"] for curve in used)
+    assert METRICS.read(tmp_path / "run")[0]["frames/before"] == taken
     guides = load_guides(tmp_path / "run", config)
     network, state = (
         guides["spline"],

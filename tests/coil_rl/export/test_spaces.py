@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from learned_runs import TINY
+from slow import some_fast
 
 import coil_rl
 
@@ -16,7 +17,6 @@ ACTIONS = {
     "large": spaces.Box(200, 1000, (2,), np.float64),
     "scalar": spaces.Box(0, 1, (), np.float32),
 }
-SLOW = set(ACTIONS) - {"several"}
 OBSERVATIONS = spaces.Dict(
     {"gear": spaces.Discrete(3, start=1), "motion": spaces.Dict({"speed": spaces.Box(-1, 1, (2,))})}
 )
@@ -64,10 +64,7 @@ def trained(folder, method="ppo", guide=None, **options):
     return run
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [pytest.param(kind, marks=pytest.mark.slow if kind in SLOW else []) for kind in ACTIONS],
-)
+@pytest.mark.parametrize("kind", some_fast(ACTIONS, ["several"]))
 def test_action_is_what_the_env_takes(kind, tmp_path):
     run = trained(tmp_path / "run", kind=kind)
     policy = coil_rl.export_policy(run, tmp_path / "exported", observations=20)

@@ -9,6 +9,7 @@ import worlds
 from any_env import AnyEnv
 from hydra import compose, initialize_config_module
 from run_folders import make_untrained_run
+from slow import some_fast
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, Unbounded
 from torchrl.envs import Compose, RewardSum, TransformedEnv
@@ -254,10 +255,7 @@ def composed(folder, *overrides, name="train"):
         return compose(name, [*overrides, f"run_dir={folder}"])
 
 
-@pytest.mark.parametrize(
-    "method",
-    ["ppo", *(pytest.param(name, marks=pytest.mark.slow) for name in ("coil", "jump_start"))],
-)
+@pytest.mark.parametrize("method", some_fast(["ppo", "coil", "jump_start"], ["ppo"]))
 def test_run_resumes_to_the_bit_and_is_evaluated_in_a_new_env(method, tmp_path):
     run, stopped = tmp_path / "run", tmp_path / "stopped"
     config = composed(run, *TINY, "network=gru", f"method={method}")

@@ -3,6 +3,7 @@
 import pytest
 from hydra import compose, initialize_config_module
 from programs import shipped
+from slow import some_fast
 
 from coil_rl.config.check import check
 from coil_rl.config.parts import build_learner, env_maker
@@ -76,12 +77,7 @@ REFUSED_FAST = [
 
 
 @pytest.mark.parametrize(
-    ("method", "learner"),
-    [
-        pytest.param(*pair, marks=[] if pair in REFUSED_FAST else pytest.mark.slow)
-        for pair in PAIRS
-        if refusal(*pair)
-    ],
+    ("method", "learner"), some_fast([pair for pair in PAIRS if refusal(*pair)], REFUSED_FAST)
 )
 def test_incompatible_method_and_learner_are_refused(method, learner, tmp_path):
     config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])
@@ -89,30 +85,11 @@ def test_incompatible_method_and_learner_are_refused(method, learner, tmp_path):
         check(config)
 
 
-FAST = [
-    ("coil_rfc", "dqn"),
-    ("residual_coil", "dqn"),
-    ("jump_start", "dqn"),
-    ("coil", "sac"),
-    ("residual", "sac"),
-    ("coil_multi", "ppo"),
-    ("kickstart", "sac"),
-    ("policy_decorator", "dqn"),
-    ("advisor", "ppo"),
-    ("coil_anchored", "dqn"),
-    ("coil_anchored", "sac"),
-    ("coil_dropout", "sac"),
-    ("wsrl", "sac"),
-]
+FAST = [("coil_multi", "ppo"), ("residual_coil", "dqn"), ("coil_anchored", "sac")]
 
 
 @pytest.mark.parametrize(
-    ("method", "learner"),
-    [
-        pytest.param(*pair, marks=[] if pair in FAST else pytest.mark.slow)
-        for pair in PAIRS
-        if not refusal(*pair)
-    ],
+    ("method", "learner"), some_fast([pair for pair in PAIRS if not refusal(*pair)], FAST)
 )
 def test_compatible_method_and_learner_train(method, learner, tmp_path):
     config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])

@@ -7,6 +7,7 @@ import shutil
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from slow import some_fast
 from tiny_runs import METHODS, TRACKS, trained
 
 from coil_rl.config.python import open_run
@@ -15,8 +16,6 @@ from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume
 from coil_rl.run import checkpoint
 
-# One of each kind: learning from batches, tests, a replay buffer, imitation, a search, no training.
-FAST = ["coil", "coil_anchored", "rlpd", "dagger", "tune", "guide"]
 SKLEARN = ["oil", "dagger"]  # archives of skops contain the time
 
 
@@ -25,10 +24,7 @@ def proxies(tmp_path_factory):
     return f"proxy.folder={tmp_path_factory.mktemp('proxies')}"
 
 
-@pytest.mark.parametrize(
-    "method",
-    [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in METHODS],
-)
+@pytest.mark.parametrize("method", some_fast(METHODS, ["coil_anchored"]))
 def test_method_ends_with_the_same_files_after_a_resume(method, proxies, tmp_path, capsys):
     run = trained(tmp_path / "run", method, proxies, "track.test.count=1")
     stopped = tmp_path / "stopped"
@@ -66,6 +62,7 @@ def rows(folder, **where):
         ]
 
 
+@pytest.mark.slow
 def test_existing_resume_does_not_repeat_a_finished_run(residual, capsys):
     before = {file: file.stat().st_mtime_ns for file in residual.iterdir() if file.name != ".lock"}
     trained(residual, "residual", "label=mine", "existing=resume")
@@ -77,6 +74,7 @@ def test_existing_resume_does_not_repeat_a_finished_run(residual, capsys):
         trained(residual, "residual", "label=mine", "existing=resume", "learner.gamma=0.9")
 
 
+@pytest.mark.slow
 def test_trained_agent_is_evaluated_with_other_advice(residual, tmp_path):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose(
@@ -100,6 +98,7 @@ def test_trained_agent_is_evaluated_with_other_advice(residual, tmp_path):
     assert len({row["reward"] for row in (normal[-1], zeroed[-1], adversarial[-1])}) == 3
 
 
+@pytest.mark.slow
 def test_rfc_logs_the_reward_of_the_task_alone(tmp_path, plain):
     # Before the first update its numbers are those of plain PPO.
     coupled = trained(tmp_path / "rfc", "rfc", "method.transforms.coupling.beta=1000")
@@ -112,6 +111,7 @@ def test_rfc_logs_the_reward_of_the_task_alone(tmp_path, plain):
     assert first["learner/loss_critic"] != other["learner/loss_critic"]
 
 
+@pytest.mark.slow
 def test_jump_start_without_steps_is_ppo_to_the_bit(tmp_path, plain):
     jumped = trained(tmp_path / "jump", "jump_start", "method.transforms.jump_start.horizon=0")
     first, other = (
@@ -120,12 +120,14 @@ def test_jump_start_without_steps_is_ppo_to_the_bit(tmp_path, plain):
     assert all(torch.equal(first[key], other[key]) for key in other)
 
 
+@pytest.mark.slow
 def test_residual_of_scale_zero_is_the_guide(tmp_path):
     run = trained(tmp_path / "run", "residual", "method.transforms.residual.scale=0")
     guide, agent = rows(run, driver="guide"), rows(run, driver="residual", actions="deterministic")
     assert [row["reward"] for row in agent] == [row["reward"] for row in guide]
 
 
+@pytest.mark.slow
 def test_first_round_of_dagger_collects_the_data_of_oil(tmp_path):
     given = ["learner.validate=false", "env.assignment=cyclic", "budget.frames=64"]
     oil = trained(tmp_path / "oil", "oil", *given)
@@ -135,6 +137,7 @@ def test_first_round_of_dagger_collects_the_data_of_oil(tmp_path):
     assert all(torch.equal(gathered[key], other[key]) for key in ("observation", "action"))
 
 
+@pytest.mark.slow
 def test_every_one_of_several_guides_is_evaluated(tmp_path):
     run = trained(tmp_path / "run", "coil_multi", "guide=[zero,spline]")
     assert [row["driver"] for row in rows(run)][::3] == [

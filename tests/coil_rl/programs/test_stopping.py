@@ -76,14 +76,8 @@ def test_training_stops_after_its_update_unless_it_is_asked_twice():
     assert not stop.ask()
 
 
-@pytest.mark.parametrize(
-    "streams",
-    [
-        ">/dev/full 2>&-",
-        pytest.param(">&- 2>&-", marks=pytest.mark.slow),
-        pytest.param(">/dev/full 2>/dev/full", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("streams", [">/dev/full 2>&-", ">&- 2>&-", ">/dev/full 2>/dev/full"])
 def test_closed_or_full_streams_do_not_end_a_training(tmp_path, streams):
     arguments = shlex.join(command("train", *SMALL, "hydra.run.dir=run"))
     done = subprocess.run(
@@ -97,6 +91,7 @@ def test_closed_or_full_streams_do_not_end_a_training(tmp_path, streams):
 SWEEP = ["-m", *SMALL, "learner.gamma=7,0.9", "hydra.sweep.dir=sweep"]
 
 
+@pytest.mark.slow
 def test_failed_job_leaves_the_others_alone_and_the_same_command_goes_on(tmp_path):
     error = called("train", *SWEEP, cwd=tmp_path, code=2).stderr
     assert "1 job of this sweep failed: job 0" in error
@@ -138,6 +133,7 @@ def test_jobs_that_fail_in_two_programs_of_a_sweep_count_once(tmp_path, monkeypa
     assert "train: 1 job of this sweep failed: job 0" in error
 
 
+@pytest.mark.slow
 def test_job_that_another_process_works_on_is_left_to_it(tmp_path):
     folders = ["hydra.sweep.dir=sweep", "hydra.sweep.subdir=${hydra.job.num}"]
     with locked(tmp_path / "sweep" / "0"):

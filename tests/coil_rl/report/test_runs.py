@@ -76,7 +76,7 @@ ROW = (
             r"is damaged \(No columns.*\); remove the file and write it again by coil-train",
         ),
         ("evaluation.csv", ROW.splitlines()[0] + "\n", r"is damaged \(no rows\)"),
-        ("evaluation.csv", "driver,actions\nguide,sampled\n", r"\['advice', .*not in index"),
+        ("evaluation.csv", "driver,actions\nguide,sampled\n", r"is damaged \(it lacks advice\)"),
         (
             "evaluation.csv",
             ROW.replace("lap_time,", "") + "1,1,1,1,1\n",
@@ -88,7 +88,7 @@ ROW = (
         (
             "metrics.csv",
             "frames,evaluation/return\n1,2\n3,\n",
-            r"metrics.csv is damaged .*; restore the file",
+            r"metrics.csv is damaged .*; put the file back",
         ),
         (
             "metrics.csv",

@@ -6,6 +6,7 @@ import torch
 from learned_runs import ON_POLICY, OPTIONS, STEPS, TINY, learned
 from outside_package.install import SOURCE
 from programs import shipped
+from slow import some_fast
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
@@ -17,14 +18,10 @@ METHODS = sorted({*shipped("method")} - {"tune"})
 # Learners that refuse a network with a memory.
 WITHOUT_MEMORY = {*OPTIONS, "advisor"} - {"coil_anchored", "guide"}
 WITHOUT_MEMORY |= {method for method in METHODS if method.startswith("dynamic_coil")}
-# The parts of the other methods are also those of one that is tested here.
+# The parts of these methods are also those of one that is tested here.
 SLOW = {"coil_multi", "coil_rfc", "imitate_then_ppo", "kickstart", "residual_coil", "wsrl"}
 SLOW |= {f"dynamic_coil_{name}" for name in ("agent_only", "guide_only", "joint", "stochastic")}
 FAST_WITH_MEMORY = {"coil", "coil_dropout", "jump_start", "mixing", "residual"}
-
-
-def cases(methods, slow):
-    return [pytest.param(name, marks=pytest.mark.slow if name in slow else []) for name in methods]
 
 
 @pytest.fixture(autouse=True)
@@ -60,7 +57,7 @@ def check_same(folder):
     return observations, actions, controller
 
 
-@pytest.mark.parametrize("method", cases(METHODS, SLOW))
+@pytest.mark.parametrize("method", some_fast(METHODS, {*METHODS} - SLOW))
 def test_controller_acts_as_the_policy_does_in_an_evaluation(method, tmp_path):
     _, actions, _ = check_same(learned(tmp_path / "run", method))
     assert np.ptp(actions) > 1e-3
@@ -68,9 +65,8 @@ def test_controller_acts_as_the_policy_does_in_an_evaluation(method, tmp_path):
 
 @pytest.mark.parametrize(
     "method",
-    cases(
-        [name for name in METHODS if name not in {*WITHOUT_MEMORY, "guide"}],
-        {*METHODS} - FAST_WITH_MEMORY,
+    some_fast(
+        [name for name in METHODS if name not in {*WITHOUT_MEMORY, "guide"}], FAST_WITH_MEMORY
     ),
 )
 def test_controller_has_the_memory_of_its_policy(method, tmp_path):

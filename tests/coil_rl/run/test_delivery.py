@@ -12,7 +12,7 @@ from programs import called
 from coil_rl import open_run
 from coil_rl.config.parts import env_maker
 from coil_rl.guides.simple import FollowAdvice
-from coil_rl.report.runs import DELIVERY
+from coil_rl.record import DELIVERY
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
 from coil_rl.run.delivery import GUIDE, Delivery, GuideActs
@@ -48,7 +48,7 @@ def rows_of(path):
 
 
 def report(folder):
-    return json.loads((folder / DELIVERY).read_text())
+    return json.loads((folder / DELIVERY.name).read_text())
 
 
 @pytest.fixture(scope="module")
@@ -241,14 +241,14 @@ def test_killed_run_ends_with_the_same_files(tmp_path):
     for name in (
         "evaluation.csv",
         "evaluation.md",
-        DELIVERY,
+        DELIVERY.name,
         "policy_handed_over.pt",
         "policy_last.pt",
     ):
         (stopped / name).unlink()
     (stopped / "checkpoint.pt").unlink()
     called("train", f"resume={stopped}", cwd=tmp_path)
-    for name in ("metrics.csv", DELIVERY, "policy_handed_over.pt", "evaluation.csv"):
+    for name in ("metrics.csv", DELIVERY.name, "policy_handed_over.pt", "evaluation.csv"):
         assert (stopped / name).read_bytes() == (whole / name).read_bytes(), name
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 from programs import shipped
+from slow import some_fast
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
@@ -142,16 +143,10 @@ def check_equal(folder, boxes, method, *overrides):
             )
 
 
-def marked(methods):
-    return [
-        method if method in FAST else pytest.param(method, marks=pytest.mark.slow)
-        for method in methods
-        if method != "guide"
-    ]
-
-
 # There is nothing to tune.
-@pytest.mark.parametrize("method", marked(name for name in METHODS if name != "tune"))
+@pytest.mark.parametrize(
+    "method", some_fast([name for name in METHODS if name not in ("guide", "tune")], FAST)
+)
 def test_every_method_has_equal_digits_in_every_box(method, tmp_path):
     boxes = BOXES
     if method in FAST:
@@ -162,11 +157,7 @@ def test_every_method_has_equal_digits_in_every_box(method, tmp_path):
 # What is added to the reward by rfc is in its unit, and there is nothing to tune.
 @pytest.mark.parametrize(
     "method",
-    [
-        method if method == "coil_anchored" else pytest.param(method, marks=pytest.mark.slow)
-        for method in METHODS
-        if method not in ("guide", "tune", "rfc", "coil_rfc")
-    ],
+    some_fast(sorted({*METHODS} - {"guide", "tune", "rfc", "coil_rfc"}), ["coil_anchored"]),
 )
 def test_every_method_learns_the_same_in_every_unit_of_the_reward(method, tmp_path):
     frames = 256  # two updates with a policy that has learned
@@ -180,11 +171,10 @@ def test_every_method_learns_the_same_in_every_unit_of_the_reward(method, tmp_pa
 
 @pytest.mark.parametrize(
     "method",
-    [
-        *("coil", "residual", "q_filter"),
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("coil_anchored", "rlpd", "cheq")),
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("ibrl", "residual_coil")),
-    ],
+    some_fast(
+        ["coil", "residual", "q_filter", "coil_anchored", "rlpd", "cheq", "ibrl", "residual_coil"],
+        ["coil", "residual", "q_filter"],
+    ),
 )
 def test_half_bounded_actions_have_equal_digits_wherever_the_bound_is(method, tmp_path):
     boxes = HALF

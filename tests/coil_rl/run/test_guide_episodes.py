@@ -65,19 +65,19 @@ def test_guides_drive_again_after_a_change_of_guide_or_env(tmp_path, changed, ti
 def test_damaged_file_is_written_anew(tmp_path, text):
     drive = Driven()
     driven_once(tmp_path, SETTINGS, "cases", drive)
-    whole = (tmp_path / GUIDE_EPISODES).read_text()
-    (tmp_path / GUIDE_EPISODES).write_text(text)
+    whole = (tmp_path / GUIDE_EPISODES.name).read_text()
+    (tmp_path / GUIDE_EPISODES.name).write_text(text)
     assert driven_once(tmp_path, SETTINGS, "cases", drive)["guide"].rate == 12
-    assert (tmp_path / GUIDE_EPISODES).read_text() == whole
+    assert (tmp_path / GUIDE_EPISODES.name).read_text() == whole
 
 
 @pytest.mark.parametrize("part", ["episodes", "histories", "rate"])
 def test_file_without_a_part_is_written_anew(tmp_path, part):
     drive = Driven()
     driven_once(tmp_path, SETTINGS, "cases", drive)
-    saved = json.loads((tmp_path / GUIDE_EPISODES).read_text())
+    saved = json.loads((tmp_path / GUIDE_EPISODES.name).read_text())
     del saved["guides"]["guide"][part]
-    (tmp_path / GUIDE_EPISODES).write_text(json.dumps(saved))
+    (tmp_path / GUIDE_EPISODES.name).write_text(json.dumps(saved))
     driven_once(tmp_path, SETTINGS, "cases", drive)
     assert drive.times == 2
 

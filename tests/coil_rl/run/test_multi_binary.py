@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
+from slow import some_fast
 
 import coil_rl
 
@@ -57,13 +58,10 @@ def trained(env, folder, method, *overrides):
 
 @pytest.mark.parametrize(
     ("method", "learner"),
-    [
-        ("ppo", "ppo"),
-        ("coil", "ppo"),
-        pytest.param("ppo", "a2c", marks=pytest.mark.slow),
-        pytest.param("ppo", "trpo", marks=pytest.mark.slow),
-        pytest.param("rfc", "ppo", marks=pytest.mark.slow),
-    ],
+    some_fast(
+        [("ppo", "ppo"), ("coil", "ppo"), ("ppo", "a2c"), ("ppo", "trpo"), ("rfc", "ppo")],
+        [("coil", "ppo")],
+    ),
 )
 def test_policy_learns_the_same_with_flags_as_with_numbers(method, learner, tmp_path):
     words = ["learner.minibatches=2"] if learner == "ppo" else [f"learner={learner}", *TINY]

@@ -7,7 +7,7 @@ import pytest
 
 from coil_rl.errors import UserError
 from coil_rl.learners.anchor import StartTest
-from coil_rl.report.runs import DELIVERY
+from coil_rl.record import DELIVERY
 from coil_rl.run.reasons import beyond_budget, handed_over, start_test
 
 
@@ -52,19 +52,19 @@ def test_run_without_tests_has_no_sentences(tmp_path):
 def test_handing_over_is_said_with_its_reason(changes, part, tmp_path):
     returns = {"last": 1.0, "spline": 5.0}
     report = {"policy": "last", "cases": 6, "returns": returns, "frames": None} | changes
-    (tmp_path / DELIVERY).write_text(json.dumps(report))
+    (tmp_path / DELIVERY.name).write_text(json.dumps(report))
     assert part in handed_over(tmp_path)
 
 
 def test_search_beyond_its_budget_is_said_from_a_file_that_may_be_missing(tmp_path):
     assert beyond_budget(tmp_path, 300) is None
     report = {"policy": "own", "cases": 4, "returns": {}, "frames": None, "steps": 1800}
-    (tmp_path / DELIVERY).write_text(json.dumps(report))
+    (tmp_path / DELIVERY.name).write_text(json.dumps(report))
     assert "took 1,800 frames, more than budget.frames=300" in str(beyond_budget(tmp_path, 300))
     assert beyond_budget(tmp_path, 1800) is None
 
 
 def test_damaged_file_is_one_sentence(tmp_path):
-    (tmp_path / DELIVERY).write_text("{")
+    (tmp_path / DELIVERY.name).write_text("{")
     with pytest.raises(UserError, match="remove it, and the sentence is left out"):
         handed_over(tmp_path)

@@ -1,0 +1,40 @@
+"""Parts that moved or went, by the names that older run folders have for them."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from coil_rl.errors import UserError
+
+OLD_NAMES = {
+    "coil_rl.envs.EnvBatch": "coil_rl.foreign.torchrl_env.EnvBatch",
+    "coil_rl.envs.gymnasium_env.GymnasiumEnv": "coil_rl.foreign.gymnasium_env.GymnasiumEnv",
+    "coil_rl.guides.learned.LearnedGuide": "coil_rl.LearnedGuide",
+    "coil_rl.learners.Advisor": "coil_studies.Advisor",
+    "coil_rl.learners.IBRL": "coil_studies.IBRL",
+    "coil_rl.listening.TrackSections": "coil_studies.listening.TrackSections",
+    "coil_rl.listening.WholeEpisode": "coil_studies.listening.WholeEpisode",
+    "coil_rl.run.tuning.Search": "coil_rl.tune.search.Search",
+}
+GONE = {
+    "coil_rl.imitation.SklearnRegressor": "regressors of scikit-learn are saved in another way",
+}
+
+
+def renamed(node: Any, path: Path) -> Any:
+    """Return nested values of a configuration with today's names of parts that moved.
+
+    Args:
+        node: as read from a folder.
+        path: of its file, for the message.
+
+    Raises:
+        UserError: for a part that no longer exists.
+    """
+    if isinstance(node, Mapping):
+        return {key: renamed(value, path) for key, value in node.items()}
+    if isinstance(node, list):
+        return [renamed(value, path) for value in node]
+    if isinstance(node, str) and node in GONE:
+        raise UserError(f"{path} is of an earlier version: {GONE[node]} today; train again")
+    return OLD_NAMES.get(node, node) if isinstance(node, str) else node

@@ -1,0 +1,12 @@
+"""What is left out by `make test`, and run by `make test-all` and by `.ci/run`."""
+
+import pytest
+
+
+def some_fast(cases, fast):
+    """Return the parameters of a test of which only some cases are fast; the others are slow."""
+    params = []
+    for case in cases:
+        values = case if isinstance(case, tuple) else (case,)
+        params.append(pytest.param(*values, marks=[] if case in fast else pytest.mark.slow))
+    return params
