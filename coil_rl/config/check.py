@@ -25,13 +25,13 @@ from coil_rl.config.folder import run_folder
 from coil_rl.config.messages import sentence
 from coil_rl.config.nodes import build, build_all, check_node
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
+from coil_rl.config.passive import check_passive, passive
 from coil_rl.config.proxies import (
     frames_of_proxies,
     guides_with_untrained_proxies,
     guides_without_parameters,
     proxy_config,
 )
-from coil_rl.config.replay import check_recordings_to_leave_out, check_replay
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import check_logger
 from coil_rl.config.values import check_values
@@ -90,7 +90,7 @@ def check_parts(config: DictConfig) -> None:
     make_env = parts.env_maker(config)
     cases = _count_cases(config)
     if trains:
-        check_replay(config, make_env)
+        check_passive(config, make_env)
     if not _is_of_run(config):
         recorded = parts.recorded(parts.build_pictures(config))
         _check_env(config, make_env, cases, recorded.values())
@@ -199,8 +199,7 @@ def _check_env(
     if "num_envs" not in config.env:
         raise UserError(
             f"env: {config.env.get('_target_', 'it')} has no key num_envs, so no policy can act in "
-            "it; choose another env (for the actions of policies on a recording: "
-            "coil-replay recording=FILE)"
+            "it; choose another env"
         )
     check_node(config.env, "env")
     env = make_env.bare(1, TEST, None)
@@ -373,11 +372,10 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
         for key in guide.in_keys:
             if key not in known:
                 has = ", ".join(map(_dotted, env.observation_spec.keys()))
-                remedy = ""
-                if getattr(guide, "demonstrates", False):
-                    remedy = "; give env=mcap_replay recording=[FILE,...], see also guide=recorded"
+                remedy = getattr(guide, "remedy", "")  # what gives the entry that it reads
                 raise UserError(
-                    f"{name}: it reads {_dotted(key)}, but the env has only {has}{remedy}"
+                    f"{name}: it reads {_dotted(key)}, but the env has only {has}"
+                    f"{remedy and '; '}{remedy}"
                 )
         advised = TransformedEnv(env, transform)
         advised.step(FollowAdvice(advised)(advised.reset()))
@@ -475,7 +473,13 @@ def _check_validation(config: DictConfig, learner: Learner) -> None:
     """Raise a `UserError` if tracks are to be left out to validate, and there is only one."""
     if not config.track or not learner.validates_groups:
         return
-    if check_recordings_to_leave_out(config):
+    kind = passive(config)
+    if kind is not None:
+        if kind.whole_pass(config.env)[0] == 1:
+            raise UserError(
+                "there is one episode, which cannot be left out to validate; give several, or set "
+                "learner.group_key=null"
+            )
         return
     if len(build(config.track.train, "track.train")) == 1:
         raise UserError(

@@ -22,7 +22,6 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib import metadata, resources
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +32,7 @@ from omegaconf import DictConfig, OmegaConf
 from coil_rl.config.compose import packages
 from coil_rl.config.nodes import build
 from coil_rl.errors import UserError, did_you_mean
+from coil_rl.extras import require
 from coil_rl.run.stopping import remember_trust
 
 ENTRY_POINTS = (
@@ -262,7 +262,12 @@ def _shipped_targets() -> frozenset[str]:
 
 
 # The packages of TorchRL's loggers, which are extras of this one.
-PACKAGES = {"WandbLogger": "wandb", "MLFlowLogger": "mlflow", "TrackioLogger": "trackio"}
+PACKAGES = {
+    "MLFlowLogger": "mlflow",
+    "TensorboardLogger": "tensorboard",
+    "TrackioLogger": "trackio",
+    "WandbLogger": "wandb",
+}
 PLAIN = r"[\w-]+"  # a name that is no path, no address and no reference
 
 
@@ -298,11 +303,8 @@ def check_logger(node: Mapping[str, Any]) -> None:
         UserError: if it is missing.
     """
     package = PACKAGES.get(str(node["_target_"]).rpartition(".")[2])
-    if package is not None and find_spec(package) is None:
-        raise UserError(
-            f"logger: the package {package} is not installed; python -m pip install "
-            f"'coil-rl[{package}]', or take logger=none"
-        )
+    if package is not None:
+        require("this logger (logger=none needs no package)", package, package)
 
 
 def make_logger(node: Any) -> Any:

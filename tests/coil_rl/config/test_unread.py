@@ -191,8 +191,6 @@ def test_words_from_python_are_read_too(tmp_path):
         UserError, match=r"proxy\.seed=3 has no effect: nothing in this run reads proxy\.seed"
     ):
         coil_rl.prepare("cone_track", method="ppo", folder=folder, overrides=words)
-    with pytest.raises(
-        UserError, match=r"budget\.frames=64 has no effect: .*method=guide"
-    ):
+    with pytest.raises(UserError, match=r"budget\.frames=64 has no effect: .*method=guide"):
         coil_rl.prepare("cone_track", guide="spline", method="guide", frames=64, folder=folder)
     assert not folder.exists()
