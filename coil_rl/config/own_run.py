@@ -3,11 +3,14 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
 from coil_rl.config.nodes import build
-from coil_rl.run.run import Run
+
+if TYPE_CHECKING:
+    from coil_rl.run.run import Run
 
 
 class OwnRun(ABC):
@@ -18,7 +21,7 @@ class OwnRun(ABC):
         """Raise a `UserError` for a configuration that this run cannot have."""
 
     @abstractmethod
-    def maker(self, config: DictConfig) -> Callable[..., Run]:
+    def maker(self, config: DictConfig) -> "Callable[..., Run]":
         """Return what makes the run; its arguments are those of `Run`."""
 
     def found(self, config: DictConfig, folder: Path) -> DictConfig:
