@@ -27,14 +27,15 @@ from coil_rl.guides import PerRow
 from coil_rl.run.parts import TRAIN
 from coil_rl.run.policy_batch import memory_keys
 from coil_rl.run.run import Run
-from coil_rl.transforms.action_space import ActionSpace, first_choices, space_of
+from coil_rl.transforms.action_space import ActionSpace, OwnChoices, first_choices, space_of
+from coil_rl.transforms.hosted import HostedGuide
 from coil_rl.transforms.normalised_action import normalising
 
 LONGEST_CHAIN = 4  # learned guides of learned guides
 _loading: list[Path] = []  # runs that are being loaded, each of which is a guide of the one before
 
 
-class LearnedGuide(TensorDictModuleBase):
+class LearnedGuide(HostedGuide):
     """Deterministic action of a trained policy, with the guides and action transforms of its run.
 
     All rows act at once. Where the policy, a guide of it or a transform depends on earlier steps,
@@ -77,15 +78,12 @@ class LearnedGuide(TensorDictModuleBase):
         self.eval()
 
     @property
-    def by_row(self) -> bool:
+    def by_row(self) -> bool:  # type: ignore[override]
         """Whether there is one object for each row, see `Guides`."""
         return isinstance(self.guide, PerRow)
 
-    def in_space(self, space: ActionSpace) -> None:
+    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Check the action of an env.
-
-        Args:
-            space: of the actions of the env.
 
         Raises:
             UserError: if the policy has another number of choices or other bounds, which may be in

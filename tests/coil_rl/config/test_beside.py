@@ -18,8 +18,10 @@ def push(env, observation):
 
 BESIDE = [
     "env=cart_pole",
-    f"+env.controllers.leaning={__name__}.push",
-    f"+env.controllers.other={__name__}.push",
+    *(
+        f"+env.controllers.{name}={{_target_: {__name__}.push, _partial_: true}}"
+        for name in ("leaning", "other")
+    ),
     "guide=entry",
     "guide.entry.key=[controller,leaning]",
     "run_dir=unused",
