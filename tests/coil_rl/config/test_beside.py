@@ -34,7 +34,7 @@ def composed(*overrides):
 
 
 def beside(env):
-    return list(env.base_env.rows[0].controllers)
+    return list(env.base_env.held.plants[0].controllers)
 
 
 def test_agent_without_a_guide_has_no_controllers():
