@@ -16,8 +16,7 @@ from coil_rl.files import LARGEST_TABLE, read_text
 class RecordedGuide(TensorDictModuleBase):
     """Actions from a CSV file by the number of the step, from the first step of every episode on.
 
-    The last one is held after the end of the file. The steering of a robot's recording is
-    `coil_robot.RecordingGuide`.
+    The last one is held after the end of the file. Recordings of a robot have a guide of their own.
 
     Args:
         file: a CSV of numbers, [T, A] in the env's unit, one line for each step, with commas
