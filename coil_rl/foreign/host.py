@@ -6,6 +6,7 @@ What it is is decided here only, see `role_of`.
 import copy
 import inspect
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
@@ -214,6 +215,7 @@ class Host:
         self.make, self.title, self.row, self.beside = make, title, row, beside
         self.thing: Any = None
         self.steps: int | None = None  # of the episode; unknown after a resume
+        self.seconds = math.inf  # the shortest time that an action took
 
     @property
     def place(self) -> str:
@@ -247,8 +249,10 @@ class Host:
         """
         if self.thing is None:
             self._open()
+        start = time.perf_counter()
         with foreign(self.place, "act"):
             answer = self.thing.act(*observed)
+        self.seconds = min(self.seconds, time.perf_counter() - start)
         try:
             return action_array(answer)
         except ForeignError as error:
