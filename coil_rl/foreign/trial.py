@@ -201,13 +201,15 @@ def tried(guide: TensorDictModuleBase, env: EnvBase) -> Tried:
                 answers.append(AskedGuide(probe, env, recorded).advice())
     except Exception:
         return Tried()
-    is_same = first.hosts[0].thing is again.hosts[0].thing or torch.allclose(*answers)
+    one, other = answers
+    is_same = first.hosts[0].thing is again.hosts[0].thing or torch.allclose(one, other)
     return Tried(own.title, not is_same, first.hosts[0].seconds)
 
 
 def _few_steps(env: EnvBase) -> TensorDictBase:
     """Return data [1, T] of random actions until an episode, or the patience, is over."""
-    data, taken, end = env.reset(), [], time.perf_counter() + LONGEST
+    data, end = env.reset(), time.perf_counter() + LONGEST
+    taken: list[TensorDictBase] = []
     while len(taken) < STEPS and time.perf_counter() < end and not data["done"].any():
         step = env.step(random_action(env, data))
         taken.append(step)
