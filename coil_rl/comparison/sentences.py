@@ -1,6 +1,5 @@
 """The three sentences of a comparison: what to use; what it gained; what is undecided."""
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -21,7 +20,7 @@ def nothing(best: Entry, entries: Mapping[str, Entry]) -> tuple[str, ...]:
     if not any(each.trained for each in entries.values()):
         learned = "and no training finished"
         remedy = "correct what made the trainings fail"
-    elif math.isnan(found.low):
+    elif found.one_case:
         remedy = "give more cases than one"
     return (
         f"Nothing here is clearly better than random actions ({random.shown}): neither the guide "

@@ -47,6 +47,13 @@ def test_guide_that_is_reversed_is_said_to_be_the_wrong_way_round():
     )
 
 
+@pytest.mark.parametrize(("guide", "use"), [(91.0, "guide"), (89.0, "opposite")])
+def test_opposite_takes_the_place_of_the_guide_from_a_tenth_of_the_scale_on(guide, use):
+    found = verdict(entries(guide=guide, opposite=100.0))
+    assert found.use == use
+    assert found.wrong_way_round == (use == "opposite")
+
+
 def test_policy_may_be_better_than_the_opposite_of_a_reversed_guide():
     found = verdict(entries(guide=-90.0, opposite=89.0, ppo=0.0, coil_anchored=95.0))
     assert found.use == "coil_anchored"
