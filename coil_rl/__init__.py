@@ -10,6 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from coil_rl.comparison.compare import compare as compare
     from coil_rl.config.learned_guide import LearnedGuide as LearnedGuide
     from coil_rl.config.load import open_run as open_run
     from coil_rl.config.load import pretrained as pretrained
@@ -84,7 +85,6 @@ if TYPE_CHECKING:
     from coil_rl.transforms import ResidualAction as ResidualAction
     from coil_rl.transforms import RewardCoupling as RewardCoupling
     from coil_rl.transforms import set_progress as set_progress
-    from coil_rl.worth.comparison import compare as compare
 
 _NAMES = {
     "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv McapReplayEnv SimulatedRobotEnv Track "
@@ -119,7 +119,7 @@ _NAMES = {
     "coil_rl.run.parts": "EnvMaker",
     "coil_rl.run.run": "Budget Run",
     "coil_rl.config.trust": "trust_packages",
-    "coil_rl.worth.comparison": "compare",
+    "coil_rl.comparison.compare": "compare",
     "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction NormalisedAction "
     "ResidualAction RewardCoupling set_progress",
 }

@@ -85,7 +85,7 @@ def _same(one: Tensor, other: Tensor) -> bool:
 def _look_at_bounds(env: GymnasiumEnv, steps: int) -> None:
     """Warn of each entry of the observation with a number outside of its space."""
     rollout = env.rollout(steps, break_when_any_done=False)
-    for entry in env.entries:
+    for entry in env.codec.entries:
         parts = [rollout[entry.key], rollout["next", *entry.key]]
         values = torch.cat([part.reshape(-1, *entry.given) for part in parts])
         found = entry.outside(values.cpu().numpy())

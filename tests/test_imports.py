@@ -14,6 +14,7 @@ LINKED = {
     "transforms": "coil_rl.transforms",
     "conf": "coil_rl.conf",
     "paper": "coil_paper",
+    "studies": "coil_studies",
     "robot": "coil_robot",
 }
 TENSOR_LIBRARIES = {"torch", "tensordict", "torchrl"}
@@ -27,10 +28,11 @@ PUBLIC = [
     "coil_rl.guides",
     "coil_rl.imitation",
     "coil_rl.learners",
-    "coil_rl.listening",
     "coil_rl.report",
     "coil_rl.transforms",
     "coil_robot",
+    "coil_studies",
+    "coil_studies.listening",
 ]
 
 # Folder -> allowed imports besides the standard library and the folder itself.

@@ -30,10 +30,10 @@ from coil_rl.run.guide_returns import GuideReturns
 from coil_rl.run.judge import Evaluation, Trial, evaluate_guides, guide_titles
 from coil_rl.run.parts import TEST, TESTS, TRAIN, EnvMaker
 from coil_rl.run.run import Budget, Run
-from coil_rl.run.tuned_run import TunedRun
-from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
+from coil_rl.tune.run import TunedRun
+from coil_rl.tune.search import Search
 
 
 def assemble(config: DictConfig, folder: Path | None = None) -> Run:

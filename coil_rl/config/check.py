@@ -49,10 +49,10 @@ from coil_rl.run.fallback import check_cases_of_guide, critic_beside_guide, no_e
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
 from coil_rl.run.training import INIT
-from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.guide_actions import UnfitActionError
+from coil_rl.tune.search import Search
 
 # Kind of a learner: description and example.
 KINDS = {

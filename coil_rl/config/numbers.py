@@ -23,8 +23,8 @@ from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.controllers import ControllerGuide, PerRow, load
 from coil_rl.guides import classic
 from coil_rl.ranges import yaml_text
-from coil_rl.run.tuned_run import read_tuned
-from coil_rl.run.tuning import Number
+from coil_rl.tune.run import read_tuned
+from coil_rl.tune.search import Number
 
 # Arguments of the parts of this project that are no numbers of a controller.
 OTHERS = ("seed", "size")

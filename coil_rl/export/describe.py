@@ -100,7 +100,7 @@ def title_of(plant: Any) -> str:
         plant: without transforms.
     """
     if isinstance(plant, GymnasiumEnv):
-        return plant.rows[0].gate.name
+        return plant.codec.name
     return type(plant).__name__
 
 
@@ -186,7 +186,7 @@ def _input(
 
 def _source(plant: GymnasiumEnv, key: list[str]) -> dict[str, Any]:
     """Return where an input is in the observation of a Gymnasium env."""
-    for entry in plant.entries:
+    for entry in plant.codec.entries:
         if list(entry.key) == key:
             start = torch.as_tensor(entry.start).reshape(-1)
             start = start.expand(len(entry.choices)) if entry.choices else start[:0]
@@ -217,7 +217,10 @@ def _action(plant: Any, step: PolicyStep, known: Mapping[str, Mapping[str, str]]
         meant["unit"] = "number of a choice"
     space = {"shape": shape, "dtype": dtype}
     if isinstance(plant, GymnasiumEnv):
-        space = {"shape": list(plant.space.shape or ()), "dtype": str(plant.space.dtype)}
+        space = {
+            "shape": list(plant.codec.actions.space.shape or ()),
+            "dtype": str(plant.codec.actions.space.dtype),
+        }
     numbers = (
         _numbering(step) if step.space.choices else {"bounds": _bounds(spec, plant.batch_dims)}
     )

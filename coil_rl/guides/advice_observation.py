@@ -11,9 +11,9 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from coil_rl.foreign.codec import action_spec, check_action_space, lowest_choices
+from coil_rl.foreign.codec import Actions
 from coil_rl.foreign.faults import foreign
-from coil_rl.foreign.plant import controller_of, fitted_action, resolved_controller
+from coil_rl.foreign.plant import controller_of, resolved_controller
 from coil_rl.transforms.action_space import ActionSpace
 
 ADVICE = "guide_action"  # key of the advice in an observation of several entries
@@ -57,11 +57,8 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
         self, env: gymnasium.Env[Any, Any], controller: str | Callable[..., Any] | Any
     ) -> None:
         super().__init__(env)
-        name = type(env.unwrapped).__name__
-        check_action_space(name, env.action_space)
-        spec = action_spec(name, env.action_space, torch.float32)
-        first = torch.as_tensor(lowest_choices(env.action_space)).reshape(-1)
-        self.space = ActionSpace(spec, 0, first if first.any() else None)
+        self.actions = Actions(type(env.unwrapped).__name__, env.action_space, torch.float32)
+        self.space = ActionSpace(self.actions.spec, 0, self.actions.first)
         thing = resolved_controller("advice", controller)
         self.act, self.begin = controller_of("advice", thing, env)
         self.advice: NDArray[np.float32] | None = None
@@ -120,7 +117,7 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _advise(self, observation: Any) -> None:
         with foreign("the controller", "it"):
             given = self.act(observation)
-        action = torch.as_tensor(fitted_action("advice", given, self.env.action_space))
+        action = torch.as_tensor(self.actions.fitted("advice", given))
         shape = self.space.event or action.shape
         vectors = self.space.advice(action.reshape(shape), torch.Size())
         self.advice = self.space.normalise(vectors).flatten().numpy().astype(np.float32)

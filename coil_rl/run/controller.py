@@ -122,8 +122,8 @@ class Controller:
                     f"{'/'.join(key)} is read by the policy or its guide, but is no part of an "
                     "observation"
                 )
-        if isinstance(self.plant, GymnasiumEnv) and self.plant.rows[0].controllers:
-            names = ", ".join(self.plant.rows[0].controllers)
+        if isinstance(self.plant, GymnasiumEnv) and self.plant.held.plants[0].controllers:
+            names = ", ".join(self.plant.held.plants[0].controllers)
             warnings.warn(
                 f"the controller {names} belongs to an env of its own, in which nothing happens: "
                 "its advice is right only if it reads nothing but the observation",

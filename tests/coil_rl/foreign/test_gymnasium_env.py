@@ -321,7 +321,7 @@ def test_actions_too_fine_for_the_dtype_keep_their_own(low, high, own, expected)
     wish = torch.tensor([[edge + 0.125, edge + 0.875]], dtype=torch.float64)
     env.step(state.set("action", wish.to(expected)))
     if expected == torch.float64:
-        assert torch.equal(torch.as_tensor(env.rows[0].gate.env.unwrapped.got), wish[0])
+        assert torch.equal(torch.as_tensor(env.held.plants[0].env.unwrapped.got), wish[0])
 
 
 @pytest.mark.parametrize("dtype", [np.int32, np.uint32, np.int64, float])
@@ -385,7 +385,7 @@ def test_controller_beside_an_env_gets_a_copy_of_its_observation():
     env = GymnasiumEnv(partial(Own, 0.0, 0.5), controllers={"careless": careless})
     seen = env.rollout(3)["next", "observation"]
     assert seen.flatten().tolist() == [0.5, 1.0, 1.5]
-    assert env.rows[0].observation.tolist() == [1.5]
+    assert env.held.plants[0].observation.tolist() == [1.5]
 
 
 def test_matrix_is_a_vector_of_which_controllers_give_the_matrix():
@@ -406,7 +406,7 @@ def test_matrix_is_a_vector_of_which_controllers_give_the_matrix():
     action = data["controller", "ones"]
     assert action.shape == (2, 6)
     env.step(data.set("action", action))
-    assert np.allclose(env.rows[1].gate.env.unwrapped.received, ones(None, None))
+    assert np.allclose(env.held.plants[1].env.unwrapped.received, ones(None, None))
 
 
 @pytest.mark.parametrize(("name", "said"), [("success", False), ("sucess", True)])
@@ -587,7 +587,7 @@ def test_pictures_show_the_first_row():
     assert env.rate == 20
     assert env.render().tolist() == np.full((2, 2, 3), 3).tolist()
     assert build("Echo-v0").render() is None
-    assert [row.gate.env.render_mode for row in env.rows] == ["rgb_array", None, None]
+    assert [plant.env.render_mode for plant in env.held.plants] == ["rgb_array", None, None]
 
 
 def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):

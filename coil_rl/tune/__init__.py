@@ -1,0 +1,1 @@
+"""`method=tune`: better numbers for a guide, searched by CMA-ES in complete episodes."""
