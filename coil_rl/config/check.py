@@ -3,6 +3,7 @@
 A mistake is found in seconds. Nothing is written except the folder of the run, as the last step.
 """
 
+import errno
 import math
 import os
 import warnings
@@ -30,9 +31,10 @@ from coil_rl.config.logger import check_logger
 from coil_rl.config.nodes import build as build_node
 from coil_rl.config.nodes import build_all, check_node
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
+from coil_rl.config.passive import check_passive, passive
 from coil_rl.config.pretrained import run_folder
-from coil_rl.config.replay import check_recordings_to_leave_out, check_replay
 from coil_rl.config.schema import TrainConfig
+from coil_rl.config.sentences import sentence
 from coil_rl.config.values import check_values
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.batch import SeededRows, optional_entries
@@ -89,7 +91,7 @@ def check_parts(config: DictConfig) -> None:
     make_env = build.env_maker(config)
     cases = _count_cases(config)
     if trains:
-        check_replay(config, make_env)
+        check_passive(config, make_env)
     if not _is_of_run(config):
         recorded = build.recorded(build.build_pictures(config))
         _check_env(config, make_env, cases, recorded.values())
@@ -198,8 +200,7 @@ def _check_env(
     if "num_envs" not in config.env:
         raise UserError(
             f"env: {config.env.get('_target_', 'it')} has no key num_envs, so no policy can act in "
-            "it; choose another env (for the actions of policies on a recording: "
-            "coil-replay recording=FILE)"
+            "it; choose another env"
         )
     check_node(config.env, "env")
     env = make_env.bare(1, TEST, None)
@@ -372,11 +373,10 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
         for key in guide.in_keys:
             if key not in known:
                 has = ", ".join(map(_dotted, env.observation_spec.keys()))
-                remedy = ""
-                if getattr(guide, "demonstrates", False):
-                    remedy = "; give env=mcap_replay recording=[FILE,...], see also guide=recorded"
+                remedy = getattr(guide, "remedy", "")  # what gives the entry that it reads
                 raise UserError(
-                    f"{name}: it reads {_dotted(key)}, but the env has only {has}{remedy}"
+                    f"{name}: it reads {_dotted(key)}, but the env has only {has}"
+                    f"{remedy and '; '}{remedy}"
                 )
         advised = TransformedEnv(env, transform)
         advised.step(FollowAdvice(advised)(advised.reset()))
@@ -474,7 +474,13 @@ def _check_validation(config: DictConfig, learner: Learner) -> None:
     """Raise a `UserError` if tracks are to be left out to validate, and there is only one."""
     if not config.track or not learner.validates_groups:
         return
-    if check_recordings_to_leave_out(config):
+    kind = passive(config)
+    if kind is not None:
+        if kind.whole_pass(config.env)[0] == 1:
+            raise UserError(
+                "there is one episode, which cannot be left out to validate; give several, or set "
+                "learner.group_key=null"
+            )
         return
     if len(build_node(config.track.train, "track.train")) == 1:
         raise UserError(
@@ -538,9 +544,6 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
-            raise PermissionError(None, "Permission denied")
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
     except OSError as error:
-        raise UserError(
-            f"the run's folder {folder} cannot be used ({error.strerror}); choose another with "
-            "hydra.run.dir=FOLDER"
-        ) from error
+        raise UserError(sentence(error)) from error

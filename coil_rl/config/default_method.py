@@ -1,5 +1,6 @@
-"""The method of a run that names none."""
+"""The method and the logger of a run that names none."""
 
+from importlib.util import find_spec
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -31,3 +32,12 @@ def default_method(env: str, guide: Any) -> str:
 
 # In the defaults list of train.yaml: ${default_method:${env},${oc.select:guide,several}}
 OmegaConf.register_new_resolver("default_method", default_method, replace=True)
+
+
+def default_logger() -> str:
+    """Return the logger of a run whose command names none: metrics.csv is always written."""
+    return "none" if find_spec("tensorboard") is None else "tensorboard"
+
+
+# In the defaults list of train.yaml: ${default_logger:}
+OmegaConf.register_new_resolver("default_logger", default_logger, replace=True)

@@ -8,16 +8,21 @@ import re
 from collections.abc import Mapping
 from functools import cache
 from importlib import resources
-from importlib.util import find_spec
 from typing import Any
 
 import yaml
 
 from coil_rl.config.nodes import build
 from coil_rl.errors import UserError
+from coil_rl.extras import require
 
 # The packages of TorchRL's loggers, which are extras of this one.
-PACKAGES = {"WandbLogger": "wandb", "MLFlowLogger": "mlflow", "TrackioLogger": "trackio"}
+PACKAGES = {
+    "MLFlowLogger": "mlflow",
+    "TensorboardLogger": "tensorboard",
+    "TrackioLogger": "trackio",
+    "WandbLogger": "wandb",
+}
 PLAIN = r"[\w-]+"  # a name that is no path, no address and no reference
 
 
@@ -53,11 +58,8 @@ def check_logger(node: Mapping[str, Any]) -> None:
         UserError: if it is missing.
     """
     package = PACKAGES.get(str(node["_target_"]).rpartition(".")[2])
-    if package is not None and find_spec(package) is None:
-        raise UserError(
-            f"logger: the package {package} is not installed; python -m pip install "
-            f"'coil-rl[{package}]', or take logger=none"
-        )
+    if package is not None:
+        require("this logger (logger=none needs no package)", package, package)
 
 
 def make_logger(node: Any) -> Any:

@@ -123,6 +123,8 @@ def find_target(path: Any, name: str) -> Callable[..., Any]:
     """
     try:
         target: Callable[..., Any] = hydra.utils.get_object(path)
+    except UserError as error:  # an extra is missing
+        raise UserError(f"{name}: {error}") from error
     except Exception as error:
         raise UserError(
             f"{name}: there is no {path!r}; check the spelling, and that its package is installed"

@@ -324,16 +324,16 @@ def agent_label(config: DictConfig) -> str:
     return learner if name == "ppo" else f"{name}_{learner}"
 
 
-def of_replay(what: str, otherwise: int, *, _root_: DictConfig) -> int:
-    """Return what a training on all scans of recordings takes, see `coil_rl.config.replay`.
+def whole_pass(what: str, otherwise: int, *, _root_: DictConfig) -> int:
+    """Return what `coil_rl.config.passive.whole_pass` does, which imports torch.
 
     Args:
         what: "num_envs", "steps" or "frames".
-        otherwise: the value in other envs.
+        otherwise: the value in an env that reacts.
     """
-    from coil_rl.config import replay
+    from coil_rl.config import passive
 
-    return replay.of_replay(_root_, what) if replay.replays(_root_) else otherwise
+    return passive.whole_pass(what, otherwise, _root_=_root_)
 
 
 def minibatches(count: int, *, _root_: DictConfig) -> int:
@@ -359,8 +359,8 @@ OmegaConf.register_new_resolver(
 # ${label}_seed${seed}_${fingerprint:}
 OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)
 OmegaConf.register_new_resolver("agent_label", lambda *, _root_: agent_label(_root_), replace=True)
-# ${of_replay:steps,2700}
-OmegaConf.register_new_resolver("of_replay", of_replay, replace=True)
+# ${whole_pass:steps,2700}
+OmegaConf.register_new_resolver("whole_pass", whole_pass, replace=True)
 
 _store = ConfigStore.instance().store
 

@@ -2,7 +2,9 @@
 
 import errno
 import re
+import sys
 from pathlib import Path
+from typing import NoReturn
 
 from hydra.errors import (
     ConfigCompositionException,
@@ -47,6 +49,17 @@ def is_no_bug(error: BaseException) -> bool:
     """
     outside = is_outside(error) or isinstance(error, OmegaConfBaseException)
     return outside or getattr(error, "errno", None) in (*NO_SPACE, *IN_THE_WAY)
+
+
+def refuse(name: str, error: BaseException) -> NoReturn:
+    """End a program with one sentence and exit code 2.
+
+    Args:
+        name: of the program.
+        error: with a cause outside of it.
+    """
+    print(f"{name}: {sentence(error)}", file=sys.stderr)
+    sys.exit(2)
 
 
 def sentence(error: BaseException) -> str:

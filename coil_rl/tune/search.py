@@ -18,6 +18,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coil_rl.envs.limits import check_range
+from coil_rl.extras import require
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
 from coil_rl.tune.candidates import Candidates
@@ -213,6 +214,7 @@ class Tuner:
 
     def _begin(self) -> None:
         """Begin the search at the guide's own numbers."""
+        require("method=tune", "tune", "cmaes")
         from cmaes import CMA  # imports scipy.stats, which takes a second in every training
 
         self.told = []

@@ -327,7 +327,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
         # folders
         ("hydra.run.dir=/dev/null/run", "/dev/null/run cannot be used (Not a directory)"),
         (f"label={'x' * 300}", "cannot be used (File name too long); choose a shorter name"),
-        ("run_dir=/dev/null", "the run's folder /dev/null cannot be used (File exists)"),
+        ("run_dir=/dev/null", "/dev/null cannot be used (File exists); choose another folder"),
         # tracks and sweeps
         ("track=folder", "track.dir must be given: write track.dir=VALUE"),
         ("track=folder track.dir=/nowhere", "/nowhere cannot be read (No such file or directory)"),

@@ -128,15 +128,15 @@ def test_python_gives_the_same_run_as_the_command(folder, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["recording=null"], "recording must be an MCAP file or a rosbag2 folder, or a list"),
+        (["recording=null"], "env: recordings is empty"),
         (["recording=[]"], "env: recordings is empty"),
         (["recording=nothing.mcap"], "env: nothing.mcap cannot be read"),
-        (["budget.num_envs=1"], "env.num_envs=1 leaves out recordings, of which there are 2"),
-        (["env.num_envs=1"], "env.num_envs=1 leaves out recordings, of which there are 2"),
-        (["budget.frames=20", "budget.steps=10"], "longest has 33 scans, so the others would be"),
-        (["recording=a.mcap"], "there is one recording, which cannot be left out to validate"),
-        (["method=ppo", "learner=ppo"], "method=ppo cannot learn in env=mcap_replay"),
-        (["method=dagger"], "method=dagger cannot learn in env=mcap_replay"),
+        (["budget.num_envs=1"], "env.num_envs=1 leaves out episodes, of which there are 2"),
+        (["env.num_envs=1"], "env.num_envs=1 leaves out episodes, of which there are 2"),
+        (["budget.frames=20", "budget.steps=10"], "longest has 33, so the others would be"),
+        (["recording=a.mcap"], "there is one episode, which cannot be left out to validate"),
+        (["method=ppo", "learner=ppo"], "method=ppo cannot learn there"),
+        (["method=dagger"], "method=dagger cannot learn there"),
         (
             ["method=coil", "env=cone_track", "learner=ppo", "guide=recording"],
             "guide.recording: it reads info.recorded",
