@@ -240,7 +240,6 @@ def _weight_table(
     """Return the weights of all tasks, one row per weight and one column per task.
 
     Args:
-        tasks: name to weights.
         reward: weights that a task does not set.
     """
     common = RewardWeights()._asdict() | PositionWeights()._asdict() | dict(reward)

@@ -36,22 +36,14 @@ class Candidates(TensorDictModuleBase):
         return all(getattr(guide, "by_row", False) for guide in self.guides)
 
     def replace(self, guides: Sequence[TensorDictModuleBase]) -> None:
-        """Act by other guides of the same class from here on, in new episodes.
-
-        Args:
-            guides: perhaps of another number.
-        """
+        """Act by other guides of the same class from here on, in new episodes."""
         self.guides = nn.ModuleList(guides)
         if self.space is not None:
             self.in_space(self.space)
         self.reads_choices(self.choices)
 
     def in_space(self, space: ActionSpace) -> None:
-        """Tell the guides that ask for it which actions there are.
-
-        Args:
-            space: of the env.
-        """
+        """Tell the guides that ask for it which actions there are."""
         self.space = space
         for guide in self.guides:
             if hasattr(guide, "in_space"):
