@@ -93,6 +93,7 @@ def test_action_is_in_the_numbering_of_the_env(tmp_path):
     assert controller.act([0.0, 0.0, 0.0, 0.0]) in (0, 1)
 
 
+@pytest.mark.slow
 def test_controller_is_the_guide_of_another_run(tmp_path):
     first = coil_rl.open_run(learned(tmp_path / "first", "residual"))
     observations, actions = executed(first)
