@@ -22,10 +22,8 @@ class ActionDelay(Delay):
     `last_action` are told the one in force. With `LastAction` an agent can know what is on its way.
 
     Args:
-        min_lag: smallest delay in steps.
         max_lag: largest delay in steps, at most 10,000.
         action_key: entry of the action.
-        seed: of the draws.
         memory_key: entry for the lag of each row, and for the actions on their way, oldest first.
 
     Raises:

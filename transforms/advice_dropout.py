@@ -20,7 +20,6 @@ class AdviceDropout(GuideTransform):
         probability: of an episode without advice, in training; from 0 to 1, else a `ValueError`.
         in_evaluation: whether there is advice in evaluation.
         seed: of the draws.
-        action_key: entry of the env's action.
         advice_key: entry of the advice, [*batch, n_guides, A]; that of all guides is left out.
     """
 

@@ -30,8 +30,6 @@ class CombinedAction(GuideTransform):
 
     Args:
         guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     written: tuple[str, ...] = (EXECUTED,)
@@ -79,13 +77,7 @@ class CombinedAction(GuideTransform):
     def _spec_of_rows(
         self, kind: Callable[..., TensorSpec], *bounds: float, dtype: torch.dtype
     ) -> TensorSpec:
-        """Return the spec of one number a row, [*batch, 1].
-
-        Args:
-            kind: class of the spec.
-            bounds: its arguments.
-            dtype: of the number.
-        """
+        """Return the spec of one number a row, [*batch, 1]."""
         shape = (*self.parent.batch_size, 1)
         return kind(*bounds, shape=shape, device=self.parent.device, dtype=dtype)
 
@@ -98,9 +90,6 @@ class ResidualAction(CombinedAction):
 
     Args:
         scale: a number or a schedule over the run; with 0 the guide acts alone.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     mdp_parameter = "scale"
@@ -127,9 +116,6 @@ class MixedAction(CombinedAction):
 
     Args:
         weight: of the agent, a number or a schedule over the run; with 1 the agent acts alone.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     mdp_parameter = "weight"
@@ -171,9 +157,6 @@ class AdaptiveMixedAction(CombinedAction):
             drawn from `low` to `warm_up_high` instead.
         warm_up_high: largest weight of the warm-up, from `low` to `high`.
         seed: of the draws.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
 
     Raises:
         ValueError: for weights that are not in order within [0, 1], or uncertainties not in order.
@@ -253,9 +236,6 @@ class _ActionSwitch(CombinedAction):
 
     Args:
         seed: of the draws.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     written: tuple[str, ...] = (EXECUTED, ACTS)
@@ -319,10 +299,6 @@ class Takeover(_ActionSwitch):
             over the run.
         frames: number of steps at the start of the run, over all rows, after which the agent always
             acts, as in RLPD and WSRL; None for no limit.
-        seed: of the draws.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     def __init__(
@@ -356,10 +332,6 @@ class GradualResidual(Takeover):
         probability: of the guide's action alone, from 0 to 1, a number or a schedule over the run.
         frames: number of steps at the start of the run, over all rows, after which the agent's
             action is always added; None for no limit.
-        seed: of the draws.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     mdp_parameter = "scale"
@@ -401,10 +373,6 @@ class JumpStart(_ActionSwitch):
         horizon: steps of the guide, a number or a schedule over the run; a decreasing schedule is a
             curriculum.
         random: draw the horizon of each episode uniformly from 0 to `horizon`.
-        seed: of the draws.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     written = (EXECUTED, ACTS, REMAINING)

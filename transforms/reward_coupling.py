@@ -30,8 +30,6 @@ class RewardCoupling(GuideTransform):
         norm: of the distance, "l1", "l2" or "linf"; another is a `ValueError`. Discrete actions are
             one-hot: l1 is 0 or 2, l2 is 0 or the root of 2.
         guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
 
     Example:
         >>> from torchrl.envs import TransformedEnv
