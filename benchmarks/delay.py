@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, open_dict
 
-from coil_rl.config.build import assemble
-from coil_rl.config.saved import read_config
+from coil_rl.config.assemble import assemble
+from coil_rl.config.folder import read_config
 from coil_rl.files import write_text
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.statistics import interval

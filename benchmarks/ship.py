@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from coil_rl.config.pretrained import CARD, CHECKSUMS, LARGEST
+from coil_rl.config.folder import CARD, CHECKSUMS, LARGEST
 from coil_rl.files import write_text
 from coil_rl.plain_yaml import read_yaml, yaml_of
 from coil_rl.record import COMMAND, DELIVERY, SECONDS, VERSIONS

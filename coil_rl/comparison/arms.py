@@ -8,8 +8,8 @@ import yaml
 from omegaconf import DictConfig
 from torchrl.envs import EnvBase
 
+from coil_rl.config.compose import key_of
 from coil_rl.config.python import Named
-from coil_rl.config.written import key_of
 from coil_rl.errors import UserError
 
 GUIDE, OPPOSITE, ZERO, RANDOM, NETWORK = "guide", "opposite", "zero", "random", "first network"

@@ -16,9 +16,10 @@ from torchrl.envs import EnvBase
 
 from coil_rl.comparison.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, ZERO
 from coil_rl.comparison.entry import FIRST_CHOICE, MIDDLE, ZERO_ACTIONS
-from coil_rl.config.build import assemble, build_evaluation, env_maker
+from coil_rl.config.assemble import assemble
+from coil_rl.config.folder import read_config
 from coil_rl.config.nodes import build_all
-from coil_rl.config.saved import read_config
+from coil_rl.config.parts import build_evaluation, env_maker
 from coil_rl.errors import file_of_a_run
 from coil_rl.report import write_csv
 from coil_rl.run import checkpoint

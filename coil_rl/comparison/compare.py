@@ -40,8 +40,8 @@ from coil_rl.comparison.page import command_of, delayed_sentence, draw, guide_li
 from coil_rl.comparison.same import identity_of, keep_plan, known_plan
 from coil_rl.comparison.timing import Plan
 from coil_rl.comparison.verdict import NOTHING, Verdict, verdict
-from coil_rl.config.build import env_maker
 from coil_rl.config.check import check_parts
+from coil_rl.config.parts import env_maker
 from coil_rl.config.python import Named, composed, named
 from coil_rl.config.trust import trust_own
 from coil_rl.config.unread import check_read

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from coil_rl.config.messages import is_no_bug, sentence
 from coil_rl.config.python import Named, prepared
-from coil_rl.config.sentences import is_no_bug, sentence
 from coil_rl.files import FAILED_JOBS
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.output import decoration, progress, quietly, say

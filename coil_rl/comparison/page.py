@@ -17,8 +17,8 @@ from coil_rl.comparison.arms import ANCHORED, ARMS, TUNE
 from coil_rl.comparison.entry import Entry, difference
 from coil_rl.comparison.outcome import Outcome
 from coil_rl.comparison.verdict import Verdict
+from coil_rl.config.compose import key_of
 from coil_rl.config.python import Named
-from coil_rl.config.written import key_of
 from coil_rl.learners.anchor import StartTest
 from coil_rl.report import markdown_table, style
 from coil_rl.report.curves import RETURNS, draw_guides, mean_curve, points

@@ -26,9 +26,9 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 import coil_rl.config.schema  # noqa: F401  the types that the configurations begin with
-from coil_rl.config.sentences import sentence
+from coil_rl.config.compose import quoted
+from coil_rl.config.messages import sentence
 from coil_rl.config.trust import trust_packages
-from coil_rl.config.written import quoted
 from coil_rl.errors import UserError
 from coil_rl.programs import app, folders
 

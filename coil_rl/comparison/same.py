@@ -11,9 +11,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from coil_rl.comparison.timing import Plan
 from coil_rl.config import source
+from coil_rl.config.folder import identity
 from coil_rl.config.given import kept
 from coil_rl.config.python import Named
-from coil_rl.config.saved import identity
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
 from coil_rl.run.folder import check_same

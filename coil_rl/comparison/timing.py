@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.comparison.arms import POINTS, SHARE, TUNE, Arm, curve_cases
 from coil_rl.comparison.baselines import Acting
-from coil_rl.config.build import build_learner, env_maker
+from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.run.evaluation import episodes
 from coil_rl.run.parts import TEST, EnvMaker
 from coil_rl.run.rollout import Rollout

@@ -19,22 +19,21 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Composite
 from torchrl.envs import EnvBase, TransformedEnv
 
-from coil_rl.config import build
+from coil_rl.config import parts
 from coil_rl.config.choices import about_choices, needs_numbers
-from coil_rl.config.distillation import (
+from coil_rl.config.folder import run_folder
+from coil_rl.config.messages import sentence
+from coil_rl.config.nodes import build, build_all, check_node
+from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
+from coil_rl.config.passive import check_passive, passive
+from coil_rl.config.proxies import (
     frames_of_proxies,
     guides_with_untrained_proxies,
     guides_without_parameters,
     proxy_config,
 )
-from coil_rl.config.logger import check_logger
-from coil_rl.config.nodes import build as build_node
-from coil_rl.config.nodes import build_all, check_node
-from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
-from coil_rl.config.passive import check_passive, passive
-from coil_rl.config.pretrained import run_folder
 from coil_rl.config.schema import TrainConfig
-from coil_rl.config.sentences import sentence
+from coil_rl.config.trust import check_logger
 from coil_rl.config.values import check_values
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.batch import SeededRows, optional_entries
@@ -88,12 +87,12 @@ def check_parts(config: DictConfig) -> None:
     if trains:
         _check_tuning(config)
         _check_delivery(config, has_agent=has_agent)
-    make_env = build.env_maker(config)
+    make_env = parts.env_maker(config)
     cases = _count_cases(config)
     if trains:
         check_passive(config, make_env)
     if not _is_of_run(config):
-        recorded = build.recorded(build.build_pictures(config))
+        recorded = parts.recorded(parts.build_pictures(config))
         _check_env(config, make_env, cases, recorded.values())
     build_all(config.evaluation.advice, "evaluation.advice")
     if has_agent:
@@ -121,12 +120,12 @@ def _count_cases(config: DictConfig) -> int:
     """Return the number of cases of an evaluation; 0 if they are the tracks of a run."""
     if _is_of_run(config) and OmegaConf.is_dict(config.evaluation.cases):
         return 0
-    return len(build.build_evaluation(config).cases)
+    return len(parts.build_evaluation(config).cases)
 
 
 def _check_kind(config: DictConfig) -> None:
     """Raise a `UserError` if the learner is of another kind than the method needs."""
-    kind, needed = build.learner_kind(config), config.method.learner
+    kind, needed = parts.learner_kind(config), config.method.learner
     if kind != needed:
         purpose, example = KINDS[needed]
         learner = config.learner["_target_"].rpartition(".")[2]
@@ -150,7 +149,7 @@ def _check_tuning(config: DictConfig) -> None:
             f"delivery={config.delivery}: method={config.method.name} always tests what it hands "
             "over; leave it out"
         )
-    build_node(config.method.search, "method.search", Search)
+    build(config.method.search, "method.search", Search)
     numbers = numbers_to_tune(config)
     make_guide = GuideWithNumbers(config)
     for end in (0.0, 1.0):
@@ -216,8 +215,8 @@ def _check_env(
                 "no guide whose advice could be degraded; leave it out, or give guide=NAME"
             )
         return
-    guides = build.build_guides(config)
-    demonstrations = build.demonstrations(config)
+    guides = parts.build_guides(config)
+    demonstrations = parts.demonstrations(config)
     for name, guide in guides.items():
         its_env = make_env.bare(1, TRAIN, None) if name in demonstrations else env
         check_guide_in_env(guide, its_env, f"guide.{name}")
@@ -226,7 +225,7 @@ def _check_env(
         if OmegaConf.get_type(config) is TrainConfig:
             _say_cost_of_curve(config, found)
     build_all(config.degrade, "degrade")
-    if build.build_disturbances(config, TEST):
+    if parts.build_disturbances(config, TEST):
         transformed(env, make_env.disturb(TEST), "disturb")
     if config.degrade:
         _check_cases(cases, partial(make_env.guided, cases, TEST, guides))
@@ -409,23 +408,23 @@ def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
         _check_curve(config, make_env)
         make_env()
         return
-    if not build.observed_keys(config):
+    if not parts.observed_keys(config):
         raise UserError(
             "observes=[]: the agent has no observations; give the entries of the env that it "
             "observes"
         )
     env = make_env()
-    trains = build.trains_guides(config)
+    trains = parts.trains_guides(config)
     if trains and config.degrade:
         raise UserError(
             f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out"
         )
-    guides = build.build_guides(config) if trains else {}
+    guides = parts.build_guides(config) if trains else {}
     replaced = guides_without_parameters(guides)
     check_proxies(config, replaced)
     _check_frames_of_proxies(config, replaced)
     untrained = guides_with_untrained_proxies(config) if guides else None
-    learner = build.build_learner(config, env, untrained)
+    learner = parts.build_learner(config, env, untrained)
     if config.evaluation.fallback:
         check_cases_of_guide(make_env, Path(config.run_dir))
         critic_beside_guide(env, learner, Path(config.run_dir))
@@ -482,7 +481,7 @@ def _check_validation(config: DictConfig, learner: Learner) -> None:
                 "learner.group_key=null"
             )
         return
-    if len(build_node(config.track.train, "track.train")) == 1:
+    if len(build(config.track.train, "track.train")) == 1:
         raise UserError(
             "track.train gives one track, which cannot be left out to validate; set "
             "learner.group_key=null, or learner.validate=false"

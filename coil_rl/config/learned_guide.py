@@ -13,9 +13,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Unbounded
 from torchrl.envs import ExplorationType, TensorDictPrimer, set_exploration_type
 
-from coil_rl.config.build import assemble
-from coil_rl.config.pretrained import run_folder
-from coil_rl.config.saved import read_config
+from coil_rl.config.assemble import assemble
+from coil_rl.config.folder import read_config, run_folder
 from coil_rl.errors import UserError
 from coil_rl.run.parts import TRAIN
 from coil_rl.transforms import GuideActions

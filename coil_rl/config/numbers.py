@@ -17,8 +17,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf, open_dict
 from tensordict.nn import TensorDictModuleBase
 
-from coil_rl.config.arguments import is_foreign
-from coil_rl.config.nodes import build, find_target
+from coil_rl.config.nodes import build, find_target, is_foreign
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.controllers import ControllerGuide, PerRow, load
 from coil_rl.guides import classic

@@ -37,9 +37,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 import coil_rl.config  # noqa: F401  registers the root configurations
 from coil_rl import programs
-from coil_rl.config.sentences import is_no_bug, refuse
+from coil_rl.config.compose import keep_written, key_of
+from coil_rl.config.messages import is_no_bug, refuse
 from coil_rl.config.trust import trust_packages
-from coil_rl.config.written import keep_written, key_of
 from coil_rl.errors import UserError
 from coil_rl.output import SafeStream
 from coil_rl.programs.folders import spelled
@@ -186,7 +186,7 @@ def check_run(config: DictConfig) -> None:
 
     See `coil_rl.config.check.check`.
     """
-    from coil_rl.config.saved import holds
+    from coil_rl.config.folder import holds
     from coil_rl.run.folder import is_evaluated
 
     folder = Path(config.run_dir)

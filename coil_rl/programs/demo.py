@@ -61,9 +61,9 @@ def driven() -> EvaluationResult:
 
     import torch
 
-    from coil_rl.config.build import assemble, build_evaluation
-    from coil_rl.config.pretrained import folder_of
-    from coil_rl.config.saved import read_config
+    from coil_rl.config.assemble import assemble
+    from coil_rl.config.folder import folder_of, read_config
+    from coil_rl.config.parts import build_evaluation
     from coil_rl.run.judge import PolicyAndGuides
     from coil_rl.run.parts import TEST
     from coil_rl.run.policy_batch import TracedPolicy

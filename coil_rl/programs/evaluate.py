@@ -34,8 +34,9 @@ def evaluate(config: DictConfig) -> float:
     """Evaluate a run or guides; return the mean reward of the deterministic policy."""
     import torch
 
-    from coil_rl.config.build import assemble, env_maker, trial
-    from coil_rl.config.pretrained import run_folder
+    from coil_rl.config.assemble import assemble, trial
+    from coil_rl.config.folder import run_folder
+    from coil_rl.config.parts import env_maker
     from coil_rl.run.judge import judge, report_outcome
     from coil_rl.run.parts import SOME_ROWS
 
@@ -93,9 +94,9 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
         UserError: for a folder without a run, one without tracks although tracks are given, or an
             env that does not write what is measured.
     """
-    from coil_rl.config.build import env_maker
     from coil_rl.config.check import check_measures
-    from coil_rl.config.saved import read_config
+    from coil_rl.config.folder import read_config
+    from coil_rl.config.parts import env_maker
     from coil_rl.config.values import check_values
     from coil_rl.run.parts import SOME_ROWS, TEST
 
@@ -119,7 +120,7 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
 
 def _check_advice(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> None:
     """Raise a `UserError` if degraded advice is asked for, but the policy has no advice."""
-    from coil_rl.config.build import advises
+    from coil_rl.config.parts import advises
 
     if advises(config) and not resolved.get("exported"):
         return

@@ -16,7 +16,7 @@ def export(config: DictConfig) -> None:
     """Export the policy of a run, and print what to type next."""
     import torch
 
-    from coil_rl.config.load import open_run
+    from coil_rl.config.python import open_run
     from coil_rl.export import export_policy
 
     torch.set_num_threads(config.threads)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, ListConfig
 
-from coil_rl.config.pretrained import PREFIX
+from coil_rl.config.folder import PREFIX
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.programs import app
 

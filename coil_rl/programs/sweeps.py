@@ -22,8 +22,8 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.sentences import is_no_bug, refuse, sentence
-from coil_rl.config.written import Job, keep_written
+from coil_rl.config.compose import Job, keep_written
+from coil_rl.config.messages import is_no_bug, refuse, sentence
 from coil_rl.errors import RunningError, UserError
 from coil_rl.files import FAILED_JOBS
 from coil_rl.output import say

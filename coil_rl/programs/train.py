@@ -8,7 +8,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from coil_rl.config.pretrained import PREFIX
+from coil_rl.config.folder import PREFIX
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
@@ -21,7 +21,7 @@ BESIDE_RESUME = ("trust=", "budget.frames=")
 
 def train(config: DictConfig) -> float:
     """Do one run and return the mean test reward of its deterministic policy."""
-    from coil_rl.config.start import run_configured
+    from coil_rl.config.assemble import run_configured
 
     if config.resume is not None:
         raise UserError(
@@ -58,9 +58,9 @@ def resume(folder: Path, frames: int | None = None) -> float:
         UserError: for a folder without a run, or one that cannot be resumed or would write outside
             of its folder.
     """
-    from coil_rl.config.build import assemble
+    from coil_rl.config.assemble import assemble
     from coil_rl.config.check import check
-    from coil_rl.config.saved import read_config
+    from coil_rl.config.folder import read_config
     from coil_rl.run.folder import is_evaluated, locked
 
     config = read_config(folder, "resume", goes_on=True)

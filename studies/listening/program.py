@@ -29,9 +29,10 @@ def listen(config: DictConfig) -> None:
     """
     import torch
 
-    from coil_rl.config.build import assemble, build_evaluation
+    from coil_rl.config.assemble import assemble
+    from coil_rl.config.folder import run_folder
     from coil_rl.config.nodes import build
-    from coil_rl.config.pretrained import run_folder
+    from coil_rl.config.parts import build_evaluation
     from coil_rl.files import write_text
     from coil_rl.report import write_csv
     from coil_studies.listening import WholeEpisode

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_module
 from programs import called
 
 import coil_rl
-from coil_rl.config.build import env_maker
+from coil_rl.config.parts import env_maker
 from coil_rl.envs import McapReplayEnv, Perception, SimulatedRobotEnv, record_drives
 from coil_rl.envs import simulated_cone_classifier as classifier
 from coil_rl.envs.splines import least_squares_parabola

@@ -16,7 +16,7 @@ from coil_rl.comparison.baselines import (
     read_baselines,
 )
 from coil_rl.comparison.outcome import read_outcome
-from coil_rl.config.build import build_evaluation, env_maker
+from coil_rl.config.parts import build_evaluation, env_maker
 from coil_rl.errors import UserError
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.report import write_csv

@@ -9,7 +9,8 @@ import pytest
 from coil_rl.comparison.entry import Entry
 from coil_rl.comparison.page import command_of, delayed_sentence, few_cases
 from coil_rl.comparison.verdict import Verdict
-from coil_rl.config.python import Named, compose_train
+from coil_rl.config.compose import compose_train
+from coil_rl.config.python import Named
 from coil_rl.report.runs import Run
 
 

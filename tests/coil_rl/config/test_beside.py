@@ -4,8 +4,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from torchrl.envs import RenameTransform
 
-from coil_rl.config.beside import unread_controllers
-from coil_rl.config.build import env_maker
+from coil_rl.config.parts import env_maker, unread_controllers
 from coil_rl.run.parts import TEST
 
 pytest.importorskip("gymnasium.envs.classic_control")

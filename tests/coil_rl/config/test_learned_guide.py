@@ -7,9 +7,9 @@ from omegaconf import OmegaConf
 from run_folders import make_untrained_run
 from torchrl.data import Bounded, Categorical, Unbounded
 
-from coil_rl.config.build import build_guides, env_maker
 from coil_rl.config.learned_guide import LONGEST_CHAIN, LearnedGuide
-from coil_rl.config.load import open_run
+from coil_rl.config.parts import build_guides, env_maker
+from coil_rl.config.python import open_run
 from coil_rl.errors import UserError
 from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.testing import check_guide

@@ -4,7 +4,7 @@ import pytest
 import yaml
 from programs import CONF
 
-from coil_rl.config.logger import check_logger, make_logger, shipped_logger
+from coil_rl.config.trust import check_logger, make_logger, shipped_logger
 from coil_rl.errors import UserError
 
 SHIPPED = {path.stem: yaml.safe_load(path.read_text()) for path in (CONF / "logger").iterdir()}

@@ -9,9 +9,10 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from coil_rl.config import build, given, trust
-from coil_rl.config.distillation import proxy_config
-from coil_rl.config.saved import read_config, settings
+from coil_rl.config import assemble as assembling
+from coil_rl.config import given, trust
+from coil_rl.config.folder import read_config, settings
+from coil_rl.config.proxies import proxy_config
 from coil_rl.config.schema import TrainConfig
 from coil_rl.errors import UserError
 from coil_rl.programs import train
@@ -31,7 +32,7 @@ CODE = """
     tensordict.load sklearn.utils.fixes.os.system torchrl.envs.GymEnv cloudpickle.loads
     coil_rl.programs.app.os.system coil_rl.programs.app.shutil.rmtree coil_rl.files.write_text
     coil_rl.envs.save_track coil_rl.envs.save_drive coil_rl.envs.RecordingWriter
-    coil_rl.config.start.run_configured coil_rl.config.trust.trust_packages
+    coil_rl.config.assemble.run_configured coil_rl.config.trust.trust_packages
     coil_rl.guides.SplineGuide.__init__ coil_rl.guides.spline.math.sqrt сoil_rl.guides.SplineGuide
     torchrl.record.loggers.WandbLogger
 """.split()  # noqa: SIM905
@@ -425,7 +426,7 @@ def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatc
     for key, value in outside.items():
         OmegaConf.update(config, key, value)
     OmegaConf.save(config, folder / "config.yaml")
-    resumed, assemble = [], build.assemble
+    resumed, assemble = [], assembling.assemble
 
     def remembered(config, folder):
         resumed.append(config)
@@ -433,7 +434,7 @@ def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatc
         run.finish_begun = lambda: 0.0
         return run
 
-    monkeypatch.setattr(build, "assemble", remembered)
+    monkeypatch.setattr(assembling, "assemble", remembered)
     train.resume(folder)
     (config,) = resumed
     assert config.run_dir == config.logger.log_dir == str(folder)

@@ -22,9 +22,9 @@ from run_folders import make_untrained_run
 
 import coil_rl
 import coil_rl.run.run  # noqa: F401  before `started` replaces functions that it imports
-from coil_rl.config.build import build_learner, env_maker
 from coil_rl.config.check import check
-from coil_rl.config.sentences import sentence
+from coil_rl.config.messages import sentence
+from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.errors import UserError
 from coil_rl.programs import app, train
 from coil_rl.run import checkpoint, judge

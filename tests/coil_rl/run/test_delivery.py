@@ -11,7 +11,7 @@ from programs import called
 from slow import some_fast
 
 from coil_rl import open_run
-from coil_rl.config.build import env_maker
+from coil_rl.config.parts import env_maker
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.record import DELIVERY
 from coil_rl.run import checkpoint

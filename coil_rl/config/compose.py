@@ -1,22 +1,78 @@
-"""What a person wrote is what runs: values of YAML files, and of the command line.
+"""From the words of a command line and YAML files to a configuration: Hydra composes it.
+
+What a person wrote is what runs: values of YAML files, and of the command line.
 
 Hydra composes the groups in a fixed order, env before learner before method. So a value of a later
 group replaces the one that a user wrote in a file of an earlier group, `learner: {normalise: true}`
 in a file of an env for example, and nobody says so. Here every value that is written in a file of
 somebody else than coil-rl is put into its place again, unless the command line gives another one.
+
+The YAML files of guests: packages beside coil-rl that bring envs, guides, experiments, programs.
+
+A guest names the package of its files by an entry point, and Hydra then finds them like those of
+coil-rl, by the names of their folders:
+
+    [project.entry-points."coil_rl.conf"]
+    my_package = "my_package.conf"
 """
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
 from typing import Any, NamedTuple
 
+from hydra import compose, initialize_config_module
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.guest_files import shipped_places
+from coil_rl.config.messages import sentence
 from coil_rl.errors import UserError
+
+CORE = "coil_rl.conf"  # the package of our own files, and the group of the entry points
+
+
+@cache
+def packages() -> tuple[str, ...]:
+    """Return the packages with YAML files, coil-rl's own first."""
+    return (CORE, *sorted(entry.value for entry in metadata.entry_points(group=CORE)))
+
+
+@cache
+def shipped_places() -> tuple[str, ...]:
+    """Return where Hydra finds its own files, and those that are installed with coil-rl."""
+    entries = metadata.entry_points(group=CORE)
+    ours = sorted(each.value for each in entries if each.dist and each.dist.name == "coil-rl")
+    return ("pkg://hydra", "structured://", *(f"pkg://{package}" for package in (CORE, *ours)))
+
+
+class GuestFiles(SearchPathPlugin):
+    """Lets Hydra find the files of all of them in a program whose own file is in one of them."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append what is not there.
+
+        Args:
+            search_path: of the program.
+        """
+        places = [f"pkg://{package}" for package in packages()]
+        known = {element.path for element in search_path.get_path()}
+        if not known.isdisjoint(places):
+            for place in places:
+                if place not in known:
+                    search_path.append(CORE, place)
+
+
+Plugins.instance().register(GuestFiles)
+
 
 SEVERAL = ("guide", "disturb", "degrade")  # groups of which several files may be chosen
 REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
@@ -191,3 +247,40 @@ def leaves(node: Any, name: str) -> Iterator[tuple[str, Any]]:
         return
     for key, value in node.items():
         yield from leaves(value, f"{name}.{key}" if name else str(key))
+
+
+def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConfig:
+    """Return the configuration that `coil-train` composes from the words of its command line.
+
+    Args:
+        words: such as "method=coil" and "+experiment=placebo". YAML files of another package are
+            found with "hydra.searchpath=[pkg://PACKAGE.conf]".
+        with_hydra: whether the configuration has Hydra's own part, such as the folders of a sweep.
+
+    Raises:
+        UserError: for words that do not fit the configuration, with one sentence.
+    """
+    try:
+        with _own_hydra():
+            config = compose("train", list(words), return_hydra_config=with_hydra)
+            task = [word for word in words if not word.startswith("hydra.")]
+            keep_written(config, "train", task, [w for w in words if w not in task])
+            return config
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(sentence(error)) from error
+
+
+@contextmanager
+def _own_hydra() -> Iterator[None]:
+    """Compose files of this package in the block.
+
+    This works inside a program of Hydra with its own files, too.
+    """
+    program = GlobalHydra.instance()
+    outer = program.hydra
+    program.clear()
+    try:
+        with initialize_config_module("coil_rl.conf", version_base="1.3"):
+            yield
+    finally:
+        GlobalHydra.instance().hydra = outer

@@ -8,10 +8,11 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
-from coil_rl.config import distillation, load
-from coil_rl.config.build import disturbances, env_maker
+from coil_rl.config.assemble import load_guides
 from coil_rl.config.check import check
-from coil_rl.config.python import Named, named
+from coil_rl.config.parts import disturbances, env_maker
+from coil_rl.config.proxies import PROXIES, copy_proxies, frames_of, proxy_config
+from coil_rl.config.python import Named, named, open_run
 from coil_rl.config.python import composed as composed_in_python
 from coil_rl.errors import UserError
 from coil_rl.programs.distill import distill
@@ -72,7 +73,7 @@ def proxies(tmp_path_factory):
 def test_folder_of_a_proxy_follows_from_guide_env_and_settings():
     def folder(*overrides, guide="spline"):
         config = composed("guide=[spline,constant]", "run_dir=unused", *overrides)
-        return Path(distillation.proxy_config(config, guide).run_dir)
+        return Path(proxy_config(config, guide).run_dir)
 
     assert folder() == folder("seed=3", "method=ppo", "budget.frames=64", "run_dir=other")
     assert folder().parent == Path("outputs/proxies")
@@ -86,7 +87,7 @@ def test_folder_of_a_proxy_follows_from_guide_env_and_settings():
 def test_proxy_is_trained_behind_the_delays_and_noise_of_the_run():
     def proxy(*overrides):
         config = composed("guide=spline", "run_dir=unused", *overrides)
-        return distillation.proxy_config(config, "spline")
+        return proxy_config(config, "spline")
 
     words = ["disturb=[observation_delay]", "+evaluation.disturb.observation_delay.max_lag=7"]
     disturbed = proxy(*words)
@@ -110,7 +111,7 @@ def folder_of_proxy(guide):
     given = named("Pendulum-v1", guide, "place")
     words = [*given.words, "method=dynamic_coil_sequential"]
     config = composed_in_python(Named(words, given.nodes), "unused")
-    return distillation.proxy_config(config, "controller").run_dir
+    return proxy_config(config, "controller").run_dir
 
 
 def test_proxies_of_other_objects_are_other_ones():
@@ -164,7 +165,7 @@ def test_proxy_in_an_env_is_another_one_after_a_change_of_its_code(words, tmp_pa
         with initialize_config_module("coil_rl.conf", version_base="1.3"):
             given = ["env=gym", *words, "guide=constant", "method=dynamic_coil_sequential"]
             config = compose("train", [*given, "run_dir=unused"])
-        folders.append(distillation.proxy_config(config, "constant").run_dir)
+        folders.append(proxy_config(config, "constant").run_dir)
     assert folders[0] == folders[1] != folders[2]
 
 
@@ -208,8 +209,8 @@ def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path, ca
 @pytest.mark.parametrize(("asked", "taken"), [(1, 64), (64, 64), (65, 128)])
 def test_frames_of_a_proxy_are_whole_batches(asked, taken):
     words = ["guide=spline", "method=dynamic_coil_sequential", f"proxy.budget.frames={asked}"]
-    proxy = distillation.proxy_config(composed(*words, "run_dir=unused"), "spline")
-    assert distillation.frames_of(proxy.budget) == taken
+    proxy = proxy_config(composed(*words, "run_dir=unused"), "spline")
+    assert frames_of(proxy.budget) == taken
 
 
 @pytest.mark.slow
@@ -237,13 +238,13 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
     used = [next(proxies.glob(f"{name}_*")) / "metrics.csv" for name in ("spline", "zero")]
     taken = sum(METRICS.read(curve.parent)[-1]["frames"] for curve in used)
     assert METRICS.read(tmp_path / "run")[0]["frames/before"] == taken
-    guides = load.load_guides(tmp_path / "run", config)
+    guides = load_guides(tmp_path / "run", config)
     network, state = (
         guides["spline"],
         torch.load(next(proxies.glob("spline_*")) / "policy_last.pt", weights_only=True),
     )
     assert all(torch.equal(value, state[key]) for key, value in network.state_dict().items())
-    assert load.open_run(tmp_path / "run").policy()[0].names == ["spline", "zero"]
+    assert open_run(tmp_path / "run").policy()[0].names == ["spline", "zero"]
 
 
 def test_degraded_advice_is_refused_for_guides_that_learn():
@@ -258,12 +259,12 @@ def test_proxies_are_copied_whole_or_not_at_all(tmp_path):
     run, folder = tmp_path / "run", tmp_path / "folder"
     for made in (run, folder):
         made.mkdir()
-    (folder / load.PROXIES).write_text("a file in their place")
+    (folder / PROXIES).write_text("a file in their place")
     with pytest.raises(
         UserError, match="proxies is a file, but a folder is to be made there; remove it"
     ):
-        distillation.copy_proxies({"guide": run}, folder)
-    (folder / load.PROXIES).unlink()
+        copy_proxies({"guide": run}, folder)
+    (folder / PROXIES).unlink()
     with pytest.raises(FileNotFoundError):
-        distillation.copy_proxies({"guide": run}, folder)
+        copy_proxies({"guide": run}, folder)
     assert not list(folder.iterdir())

@@ -1,7 +1,15 @@
-"""The configuration in the folder of a run: written, read without running code, and compared."""
+"""The configuration in the folder of a run: written, read without running code, and compared.
+
+The folder may be that of a shipped policy: a finished run that is a part of the package, and is
+opened by its name. Wherever a program takes the folder of a run to read, `pretrained:NAME` names
+one. Its files are checked by their SHA-256 before any of them is read.
+"""
 
 import copy
+import hashlib
+import json
 from collections.abc import Mapping
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +17,13 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.logger import shipped_logger
-from coil_rl.config.measured import complete_measures, is_complete
+from coil_rl.config.messages import sentence
 from coil_rl.config.old_names import renamed
 from coil_rl.config.schema import IGNORED_KEYS, TrainConfig
-from coil_rl.config.sentences import sentence
-from coil_rl.config.trust import check_config
-from coil_rl.errors import UserError
+from coil_rl.config.trust import check_config, shipped_logger
+from coil_rl.config.values import complete_measures, is_complete
+from coil_rl.errors import UserError, did_you_mean
+from coil_rl.files import LARGEST_NUMBERS, read_file, read_text
 from coil_rl.plain_yaml import read_yaml
 from coil_rl.run.folder import CONFIG, check_same, is_begun
 
@@ -45,7 +53,7 @@ def read_config(
         key: of the calling program that names the folder, for the message.
         changes: new values of top-level keys.
         goes_on: whether the run may be trained further, so that its logger is needed. A shipped one
-            is taken by its name, see `coil_rl.config.logger`; another one must be trusted as any
+            is taken by its name, see `coil_rl.config.trust`; another one must be trusted as any
             part, and is left out where the run is only evaluated.
 
     Raises:
@@ -123,3 +131,81 @@ def _flat(node: Any, name: str = "") -> dict[str, Any]:
     for key, value in node.items():
         result |= _flat(value, f"{name}.{key}" if name else str(key))
     return result
+
+
+PREFIX = "pretrained:"
+CHECKSUMS, CARD = "checksums.json", "card.md"
+LARGEST = 200_000  # bytes of a file of a shipped policy
+
+
+def pretrained_names() -> list[str]:
+    """Return the names of the shipped policies."""
+    return sorted(_checksums())
+
+
+def pretrained_card(name: str) -> str:
+    """Return the card of a shipped policy: what it was trained for, and how well it does.
+
+    Args:
+        name: of the policy.
+
+    Raises:
+        UserError: for a name that does not exist, and for files that are not those that were
+            shipped.
+    """
+    return read_text(folder_of(name) / CARD, LARGEST)
+
+
+def run_folder(text: str | Path) -> Path:
+    """Return the folder that a text names: that of a shipped policy for `pretrained:NAME`.
+
+    Args:
+        text: of the user.
+
+    Raises:
+        UserError: for a name that does not exist, and for files that are not those that were
+            shipped.
+    """
+    if str(text).startswith(PREFIX):
+        return folder_of(str(text).removeprefix(PREFIX))
+    return Path(text).expanduser()
+
+
+def folder_of(name: str) -> Path:
+    """Return the folder of a shipped policy, whose files have been checked.
+
+    Args:
+        name: of the policy.
+
+    Raises:
+        UserError: for a name that does not exist, and for files that are not those that were
+            shipped.
+    """
+    known = _checksums()
+    if name not in known:
+        raise UserError(
+            f"{PREFIX}{name} does not exist; there are {', '.join(sorted(known))}"
+            f"{did_you_mean(name, known)}"
+        )
+    folder = _place() / name
+    for file, digest in known[name].items():
+        path = folder / file
+        content = read_file(path, LARGEST) if path.is_file() else b""
+        if hashlib.sha256(content).hexdigest() != digest:
+            raise UserError(
+                f"{path} is not the file that was shipped: its SHA-256 is not {digest}; install "
+                "coil-rl again"
+            )
+    return folder
+
+
+def _place() -> Path:
+    return Path(str(resources.files("coil_rl.policies")))
+
+
+def _checksums() -> Mapping[str, Mapping[str, str]]:
+    """Return the SHA-256 of each file by policy."""
+    found: Mapping[str, Mapping[str, str]] = json.loads(
+        read_text(_place() / CHECKSUMS, LARGEST_NUMBERS)
+    )
+    return found

@@ -1,6 +1,7 @@
-"""From a configuration to a run: its envs, guides, learner, evaluation and budget."""
+"""The parts that a configuration describes: its envs, guides, learner and evaluation."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -12,158 +13,18 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, Transform
 
 from coil_rl.config import given
-from coil_rl.config.beside import unread_controllers
-from coil_rl.config.logger import make_logger
-from coil_rl.config.measured import complete_measures
 from coil_rl.config.nodes import build, build_all, find_target
-from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune, with_tuned
-from coil_rl.config.pretrained import run_folder
-from coil_rl.config.saved import identity, settings
+from coil_rl.config.numbers import with_tuned
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import MEAN_CASE, measures_of
 from coil_rl.report import Returns
 from coil_rl.report.pictures import Picture
-from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run.evaluation import EvaluationResult
-from coil_rl.run.guide_returns import GuideReturns
-from coil_rl.run.judge import Evaluation, Trial, evaluate_guides, guide_titles
+from coil_rl.run.judge import Evaluation, evaluate_guides
 from coil_rl.run.parts import TEST, TESTS, TRAIN, EnvMaker
-from coil_rl.run.run import Budget, Run
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
-from coil_rl.tune.run import TunedRun
-from coil_rl.tune.search import Search
-
-
-def assemble(config: DictConfig, folder: Path | None = None) -> Run:
-    """Return the run that a configuration describes; nothing is built or written yet.
-
-    Args:
-        config: of `coil-train`, composed or read from a folder; its measures are completed.
-        folder: of the run, instead of `run_dir`.
-    """
-    complete_measures(config)
-    # Here, because proxies are runs themselves.
-    from coil_rl.config.distillation import distil
-    from coil_rl.config.load import load_guides
-
-    folder = Path(config.run_dir) if folder is None else folder
-    make_env = env_maker(config, folder)
-    trains = trains_guides(config)
-
-    def make_learner(env: EnvBase) -> Learner:
-        return build_learner(config, env, load_guides(folder, config) if trains else None)
-
-    def guide_returns(learner: Learner) -> list[GuideReturns]:
-        each_phase = config.evaluation.guides == "phases"
-        return [GuideReturns(make_env, learner.guides, each_phase=each_phase)] if trains else []
-
-    has_learner = config.method.observes is not None and not config.method.search
-    make_run: Callable[..., Run] = Run
-    if config.method.search:
-        make_run = partial(TunedRun, **_searched(config))
-    return make_run(
-        folder,
-        make_env,
-        make_learner if has_learner else None,
-        partial(trial, config, make_env),
-        budget(config),
-        label=config.label,
-        seed=config.seed,
-        watch=OmegaConf.to_container(config.watch),
-        failure=measures_of(config.evaluation.measures).get("crashed"),
-        noise_correlation=config.training.noise_correlation,
-        logger=partial(make_logger, config.logger) if config.logger else None,
-        callbacks=guide_returns,
-        prepare=partial(distil, config, folder) if trains else lambda: 0,
-        init=run_folder(config.init) if config.init else None,
-        delivery=config.delivery,
-        which=config.evaluation.policy,
-        fallback=config.evaluation.fallback,
-        compiled=config.compile,
-        device=config.device,
-        threads=config.threads,
-        settings=settings(config),
-        identity=identity(config),
-    )
-
-
-def _searched(config: DictConfig) -> dict[str, Any]:
-    """Return the arguments of a run that tunes its guide, besides those of any run."""
-    return {
-        "numbers": numbers_to_tune(config),
-        "make_guide": GuideWithNumbers(config),
-        "search": build(config.method.search, "method.search", Search),
-    }
-
-
-def budget(config: DictConfig) -> Budget:
-    """Return how much a run learns, and how often it looks at itself."""
-    curve = config.evaluation.curve
-    return Budget(
-        frames=config.budget.frames,
-        steps=config.budget.steps,
-        stages=list(config.budget.stages),
-        points=curve.points,
-        batches=curve.batches,
-        checkpoint_every=config.checkpoint_every,
-    )
-
-
-def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
-    """Return how the policy of a run is evaluated.
-
-    Raises:
-        UserError: if the configuration names no cases.
-    """
-    pictures = build_pictures(config)
-    has_agent = config.method.observes is not None
-    notes = [
-        f"guide.{name} sees: {what}; it may know more than the agent."
-        for name, what in what_guides_see(config).items()
-    ]
-    if has_agent:
-        tested = OmegaConf.select(config, "delivery") == "tested"
-        notes += about_returns(make_env.sizes, tested=tested)
-    return Trial(
-        OmegaConf.select(config, "label") or "",  # the programs without an agent have none
-        build_evaluation(config, recorded(pictures)),
-        make_env,
-        pictures=pictures,
-        guides=guide_titles(driving_guides(config)),
-        guide_results=partial(guide_results, config),
-        together=has_agent
-        and not config.method.search
-        and advises_only(config)
-        and not demonstrations(config),
-        advice=list(config.evaluation.advice) if advises(config) else [],
-        repeats=config.evaluation.repeats,
-        compiled=config.compile,
-        notes=notes,
-    )
-
-
-def about_returns(sizes: Mapping[str, int], *, tested: bool = False) -> list[str]:
-    """Return what the return of the progress bar, of the curve and of the table counts.
-
-    Args:
-        sizes: number of cases of each set.
-        tested: whether a test at the end of the run decides what is handed over.
-    """
-    sentences = [
-        "All returns are sums of the env's own rewards: `training` beside the progress bar is the "
-        "mean of the last 100 episodes, with exploration; `curve` and learning_curve.png are means "
-        "of deterministic episodes in the cases of the curve; the table has those of the test."
-    ]
-    if EVALUATION in sizes:
-        chosen = ""
-        if SELECTION in sizes and not tested:
-            chosen = f", and the best policy of a report is chosen in {sizes[SELECTION]} others"
-        sentences.append(
-            f"The curve rests on {sizes[EVALUATION]} cases{chosen}; none of them is in the table."
-        )
-    return sentences
 
 
 def build_evaluation(
@@ -493,3 +354,44 @@ def driving_guides(config: DictConfig) -> dict[str, Any]:
     nodes: Any = OmegaConf.to_container(config.guide, resolve=True)
     left_out = demonstrations(config)
     return {name: node for name, node in nodes.items() if name not in left_out}
+
+
+# Parts of a configuration that name entries of the env of a method; its guides are parts of
+# `method.transforms`.
+READERS = ("observes", "method", "watch", "learner", "degrade", "action", "evaluation")
+
+
+def unread_controllers(config: DictConfig, transforms: Iterable[Transform]) -> set[str]:
+    """Return the names of the controllers beside an env that its agent does without.
+
+    They are those that neither a transform reads nor any part of the configuration names: the
+    observation, the method, what is logged, measures and pictures.
+
+    Args:
+        config: of a run.
+        transforms: of the env.
+    """
+    names = set(OmegaConf.select(config, "env.controllers") or ())
+    keys = [key for part in transforms for key in (part.in_keys or ())]
+    named = set(_texts(keys))
+    for reader in READERS:
+        node = OmegaConf.select(config, reader)
+        named |= set(_texts(OmegaConf.to_container(node) if OmegaConf.is_config(node) else node))
+    return {name for name in names if not any(_mentions(text, name) for text in named)}
+
+
+def _mentions(text: str, name: str) -> bool:
+    """Return whether a text has a name as a whole word."""
+    return re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) is not None
+
+
+def _texts(node: Any) -> Iterator[str]:
+    """Yield the texts in nested lists and mappings, but not the keys of mappings."""
+    if isinstance(node, str):
+        yield node
+    elif isinstance(node, dict):
+        for value in node.values():
+            yield from _texts(value)
+    elif isinstance(node, (list, tuple)):
+        for value in node:
+            yield from _texts(value)

@@ -9,7 +9,7 @@ its proxies into its own folder.
 import hashlib
 import math
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +17,17 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from coil_rl.config import load
-from coil_rl.config.build import build_guides, build_learner, env_maker
 from coil_rl.config.given import kept_objects
 from coil_rl.config.nodes import find_target
+from coil_rl.config.parts import build_guides, build_learner, env_maker
 from coil_rl.config.schema import TrainConfig, fingerprint
 from coil_rl.config.source import code_of_user, identity_of
-from coil_rl.config.start import run_configured
 from coil_rl.errors import UserError
 from coil_rl.files import temporary, whole_file
 from coil_rl.guides import ControllerGuide
 from coil_rl.transforms.normalised_action import in_unit_of
 
+PROXIES = "proxies"  # subfolder of a run with the networks that replace guides without parameters
 FILES = ("config.yaml", "policy_last.pt")  # files of a run that are needed to load its policy
 
 
@@ -91,17 +90,22 @@ def _hash_of_user(config: DictConfig, name: str) -> list[str]:
     return [hashlib.sha256(" ".join(found).encode()).hexdigest()[:10]]
 
 
-def distil(config: DictConfig, folder: Path) -> int:
+def distil(config: DictConfig, folder: Path, run: Callable[[DictConfig], float]) -> int:
     """Put a proxy of each guide without parameters into the folder of a run, unless it is there.
+
+    Args:
+        config: of the run.
+        folder: of the run.
+        run: does the run of a proxy, or finishes it.
 
     Returns:
         The frames that the proxies took, now or earlier. Their last batch is a whole one.
     """
     names = guides_without_parameters(build_guides(config))
     proxies = {name: proxy_config(config, name) for name in names}
-    if not (folder / load.PROXIES).is_dir():
+    if not (folder / PROXIES).is_dir():
         for proxy in proxies.values():
-            run_configured(proxy, wait=True)
+            run(proxy)
         copy_proxies({name: Path(proxy.run_dir) for name, proxy in proxies.items()}, folder)
     return frames_of_proxies(config, names)
 
@@ -131,7 +135,7 @@ def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:
 
     `runs` are their run folders by the name of the guide. A file in their place is a `UserError`.
     """
-    proxies = folder / load.PROXIES
+    proxies = folder / PROXIES
     if proxies.is_file():
         raise UserError(f"{proxies} is a file, but a folder is to be made there; remove it")
     unfinished = temporary(proxies)

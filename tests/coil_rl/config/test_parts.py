@@ -7,7 +7,8 @@ from omegaconf import OmegaConf
 from programs import shipped
 from slow import some_fast
 
-from coil_rl.config.build import (
+from coil_rl.config.nodes import build
+from coil_rl.config.parts import (
     build_bare_env,
     build_guides,
     build_learner,
@@ -17,8 +18,7 @@ from coil_rl.config.build import (
     env_maker,
     trains_guides,
 )
-from coil_rl.config.distillation import guides_with_untrained_proxies
-from coil_rl.config.nodes import build
+from coil_rl.config.proxies import guides_with_untrained_proxies
 from coil_rl.errors import UserError
 from coil_rl.run.parts import TEST, TESTS, TRAIN
 from coil_rl.testing import check_env, check_guide
