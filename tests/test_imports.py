@@ -1,4 +1,5 @@
 import ast
+import graphlib
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -185,3 +186,16 @@ def test_every_folder_with_python_files_is_a_package() -> None:
     assert [
         str(path.relative_to(ROOT)) for path in folders if not (path / "__init__.py").is_file()
     ] == []
+
+
+def test_no_files_import_each_other() -> None:
+    files = [path for folder in ["coil_rl", *LINKED] for path in source_files(folder)]
+    modules = {path: ".".join([*package_of(path), path.stem]) for path in files}
+    names = {name.removesuffix(".__init__") for name in modules.values()}
+    graph = {}
+    for path, module in modules.items():
+        found = imported_modules(path.read_text(encoding="utf-8"), package_of(path))
+        graph[module.removesuffix(".__init__")] = {
+            name if name in names else name.rpartition(".")[0] for name in found
+        } - {module.removesuffix(".__init__")}
+    graphlib.TopologicalSorter(graph).prepare()  # a circle is a CycleError
