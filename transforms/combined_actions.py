@@ -9,6 +9,7 @@ learners with replay learn from the executed action where the agent could have c
 """
 
 from collections.abc import Callable, Mapping
+from typing import Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -16,8 +17,14 @@ from tensordict.utils import expand_as_right
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
+from coil_rl.ranges import Share, checked
 from coil_rl.transforms.action_space import ChoicesError
-from coil_rl.transforms.guide_transform import GuideTransform, Schedule, SeededGenerator
+from coil_rl.transforms.guide_transform import (
+    GuideSettings,
+    GuideTransform,
+    Schedule,
+    SeededGenerator,
+)
 from coil_rl.transforms.link import State
 
 EXECUTED, WEIGHT, ACTS, REMAINING = "executed_action", "agent_weight", "agent_acts", "guide_steps"
@@ -29,19 +36,14 @@ class CombinedAction(GuideTransform):
     After a reset that entry is 0.
 
     Args:
-        guide: row of the advice, the index of the guide.
+        settings: further ones of `GuideTransform`.
     """
 
     written: tuple[str, ...] = (EXECUTED,)
     adds = False  # whether the guide's action is added to the agent's, not put in its place
 
-    def __init__(
-        self,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
-    ) -> None:
-        super().__init__(guide, action_key, advice_key)
+    def __init__(self, **settings: Unpack[GuideSettings]) -> None:
+        super().__init__(**settings)
         # Steps in training, over all rows.
         self.taken: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
@@ -98,12 +100,9 @@ class ResidualAction(CombinedAction):
     def __init__(
         self,
         scale: float | Schedule = 1.0,
-        *,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(guide, action_key, advice_key)
+        super().__init__(**settings)
         self.scale = scale
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
@@ -111,6 +110,7 @@ class ResidualAction(CombinedAction):
         return self.action_space.added(self.advice(tensordict), action, scale)
 
 
+@checked
 class MixedAction(CombinedAction):
     """Weighted mean: the env action is weight * a + (1 - weight) * g, clamped.
 
@@ -123,15 +123,10 @@ class MixedAction(CombinedAction):
 
     def __init__(
         self,
-        weight: float | Schedule,
-        *,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        weight: Share | Schedule,
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(guide, action_key, advice_key)
-        if isinstance(weight, (int, float)) and not 0 <= weight <= 1:
-            raise ValueError(f"weight={weight} must be at least 0 and at most 1")
+        super().__init__(**settings)
         self.weight = weight
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
@@ -174,12 +169,9 @@ class AdaptiveMixedAction(CombinedAction):
         warm_up: int = 10_000,
         warm_up_high: float = 0.3,
         seed: int = 0,
-        *,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(guide, action_key, advice_key)
+        super().__init__(**settings)
         if not (0 <= low <= warm_up_high <= high <= 1 and 0 <= certain < uncertain):
             raise ValueError(
                 f"low={low}, warm_up_high={warm_up_high} and high={high} must be in this order, "
@@ -240,14 +232,8 @@ class _ActionSwitch(CombinedAction):
 
     written: tuple[str, ...] = (EXECUTED, ACTS)
 
-    def __init__(
-        self,
-        seed: int = 0,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
-    ) -> None:
-        super().__init__(guide, action_key, advice_key)
+    def __init__(self, seed: int = 0, **settings: Unpack[GuideSettings]) -> None:
+        super().__init__(**settings)
         self.rng = SeededGenerator(seed)
 
     def _draw(self, data: TensorDictBase) -> Tensor:
@@ -288,6 +274,7 @@ class _ActionSwitch(CombinedAction):
         return observation_spec
 
 
+@checked
 class Takeover(_ActionSwitch):
     """Random takeover by the guide in each step.
 
@@ -303,15 +290,13 @@ class Takeover(_ActionSwitch):
 
     def __init__(
         self,
-        probability: float | Schedule = 1.0,
+        probability: Share | Schedule = 1.0,
         frames: int | None = None,
         *,
         seed: int = 0,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(seed, guide, action_key, advice_key)
+        super().__init__(seed, **settings)
         self.probability, self.frames = probability, frames
 
     def _agent_acts(self, data: TensorDictBase, state: State) -> Tensor:
@@ -341,21 +326,12 @@ class GradualResidual(Takeover):
         self,
         scale: float | Schedule = 0.2,
         *,
-        probability: float | Schedule = 1.0,
+        probability: Share | Schedule = 1.0,
         frames: int | None = None,
         seed: int = 0,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(
-            probability,
-            frames,
-            seed=seed,
-            guide=guide,
-            action_key=action_key,
-            advice_key=advice_key,
-        )
+        super().__init__(probability, frames, seed=seed, **settings)
         self.scale = scale
 
     def _of_agent(self, tensordict: TensorDictBase) -> Tensor:
@@ -384,11 +360,9 @@ class JumpStart(_ActionSwitch):
         random: bool = False,
         *,
         seed: int = 0,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(seed, guide, action_key, advice_key)
+        super().__init__(seed, **settings)
         self.horizon, self.random = horizon, random
 
     def _agent_acts(self, data: TensorDictBase, state: State) -> Tensor:
