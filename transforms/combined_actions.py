@@ -92,6 +92,7 @@ class ResidualAction(CombinedAction):
 
     Args:
         scale: a number or a schedule over the run; with 0 the guide acts alone.
+        settings: further ones of `GuideTransform`.
     """
 
     mdp_parameter = "scale"
@@ -116,6 +117,7 @@ class MixedAction(CombinedAction):
 
     Args:
         weight: of the agent, a number or a schedule over the run; with 1 the agent acts alone.
+        settings: further ones of `GuideTransform`.
     """
 
     mdp_parameter = "weight"
@@ -152,6 +154,7 @@ class AdaptiveMixedAction(CombinedAction):
             drawn from `low` to `warm_up_high` instead.
         warm_up_high: largest weight of the warm-up, from `low` to `high`.
         seed: of the draws.
+        settings: further ones of `GuideTransform`.
 
     Raises:
         ValueError: for weights that are not in order within [0, 1], or uncertainties not in order.
@@ -228,6 +231,7 @@ class _ActionSwitch(CombinedAction):
 
     Args:
         seed: of the draws.
+        settings: further ones of `GuideTransform`.
     """
 
     written: tuple[str, ...] = (EXECUTED, ACTS)
@@ -286,6 +290,7 @@ class Takeover(_ActionSwitch):
             over the run.
         frames: number of steps at the start of the run, over all rows, after which the agent always
             acts, as in RLPD and WSRL; None for no limit.
+        settings: further ones of `GuideTransform`.
     """
 
     def __init__(
@@ -317,6 +322,7 @@ class GradualResidual(Takeover):
         probability: of the guide's action alone, from 0 to 1, a number or a schedule over the run.
         frames: number of steps at the start of the run, over all rows, after which the agent's
             action is always added; None for no limit.
+        settings: further ones of `GuideTransform`.
     """
 
     mdp_parameter = "scale"
@@ -349,6 +355,7 @@ class JumpStart(_ActionSwitch):
         horizon: steps of the guide, a number or a schedule over the run; a decreasing schedule is a
             curriculum.
         random: draw the horizon of each episode uniformly from 0 to `horizon`.
+        settings: further ones of `GuideTransform`.
     """
 
     written = (EXECUTED, ACTS, REMAINING)
