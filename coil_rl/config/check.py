@@ -38,7 +38,7 @@ from coil_rl.config.values import check_values
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.batch import SeededRows, optional_entries
 from coil_rl.foreign.faults import ForeignError
-from coil_rl.foreign.trial import Tried, tried
+from coil_rl.foreign.trial import Tried, tried, unrepeated
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.off_policy import OffPolicy
@@ -225,7 +225,7 @@ def _check_repeats(env: EnvBase) -> None:
     """
     if not isinstance(env, SeededRows):
         return
-    key = env.unrepeated()
+    key = unrepeated(env)
     if key is not None:
         warnings.warn(
             f"the env does not obey its seed: {_dotted(key)} differs when an episode is repeated, "
