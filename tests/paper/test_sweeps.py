@@ -99,7 +99,7 @@ def test_sweep_is_started_until_all_its_runs_are_finished(authors, started, monk
 
 def test_wrong_override_or_experiment_is_refused():
     with pytest.raises(
-        UserError, match=r"coil-train .* \+experiment=paper_dynamic learner.gama=1: there is no key"
+        UserError, match=r"coil-train \+experiment=paper_dynamic learner.gama=1: there is no key"
     ):
         planned("paper_dynamic", ["learner.gama=1"])
     with pytest.raises(UserError, match="there is no experiment=papr; experiment can be"):
