@@ -47,11 +47,12 @@ def test_guide_that_is_reversed_is_said_to_be_the_wrong_way_round():
     )
 
 
-@pytest.mark.parametrize(("guide", "use"), [(91.0, "guide"), (89.0, "opposite")])
-def test_opposite_takes_the_place_of_the_guide_from_a_tenth_of_the_scale_on(guide, use):
-    found = verdict(entries(guide=guide, opposite=100.0))
-    assert found.use == use
-    assert found.wrong_way_round == (use == "opposite")
+@pytest.mark.parametrize(("opposite", "is_reversed"), [(55.2, False), (56.2, True)])
+def test_opposite_must_be_better_by_a_tenth_of_the_way_from_random_to_the_best(
+    opposite, is_reversed
+):
+    found = verdict(entries(guide=50.0, opposite=opposite))
+    assert (found.use == "opposite") == found.wrong_way_round == is_reversed
 
 
 def test_policy_may_be_better_than_the_opposite_of_a_reversed_guide():
