@@ -272,7 +272,7 @@ def _do(
     _draw_into_files()
     if is_sweep() and "existing" in config:
         config.existing = "resume"  # so that a sweep goes on by the same command
-    keep_written(config, str(HydraConfig.get().job.config_name), *typed())
+    keep_written(config, HydraConfig.get(), *typed())
     trust_packages(config.get("trust", []), config)
     has_folder = bool(config.get("run_dir"))
     made = _missing(Path(config.run_dir).absolute()) if has_folder else []

@@ -159,8 +159,7 @@ def _words(config: DictConfig) -> list[str]:
 def _composed(loader: Any, config: DictConfig, job: Sequence[str]) -> DictConfig:
     """Return the configuration of a job of a sweep."""
     composed: DictConfig = loader.load_sweep_config(config, list(job))
-    name = str(config.hydra.job.config_name)
-    keep_written(composed, name, job, _plain(config, "hydra"))
+    keep_written(composed, composed.hydra, job, _plain(config, "hydra"))
     return composed
 
 
