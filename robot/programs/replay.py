@@ -79,7 +79,7 @@ def replay(config: DictConfig) -> None:
 def _load_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Policies]:
     """Return the runs and all policies by name, guides first."""
     from coil_rl.config.assemble import assemble
-    from coil_rl.config.check import check_guide_in_env
+    from coil_rl.config.fits import check_guide_in_env
     from coil_rl.config.folder import read_config, run_folder
     from coil_rl.config.parts import build_guides
     from coil_robot.replay.open_loop import RECORDED

@@ -7,8 +7,7 @@ from gymnasium import spaces
 from hydra import compose, initialize_config_module
 from programs import shipped
 
-from coil_rl.config.check import check_parts
-from coil_rl.config.choices import WITH_CHOICES
+from coil_rl.config.check import WITH_CHOICES, check_parts
 from coil_rl.errors import UserError
 
 METHODS = shipped("method")
