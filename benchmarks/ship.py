@@ -108,9 +108,7 @@ def card(run: Path, name: str, settings: Mapping[str, Any]) -> str:
         f"deterministic actions, sampled ones {settings['evaluation']['repeats']} a case:",
         markdown_table(numbers, columns),
     ]
-    sentence = handed_over(run)
-    if sentence:
-        parts.append(sentence)
+    parts += handed_over(run)
     parts.append(
         f"`coil-evaluate run=pretrained:{name}` repeats the evaluation; in Python "
         f'`coil_rl.pretrained("{name}").controller()` is the policy with all that belongs to it.'

@@ -90,6 +90,7 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
         "coil_rl": [
             "*.py",
             "*.html",
+            "*.j2",
             "*.json",
             "py.typed",
             *(f"policies/**/*{end}" for end in SHIPPED),

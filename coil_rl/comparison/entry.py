@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.comparison.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, TUNE, ZERO
-from coil_rl.report.statistics import mean_interval
+from coil_rl.report.statistics import interval
 from coil_rl.report.table import return_format
 
 Array = NDArray[np.float64]
@@ -85,10 +85,7 @@ class Difference:
 
 def difference(one: Entry, other: Entry) -> Difference:
     """Return how much more one entry has than another in the same cases."""
-    cases = one.returns.mean(0) - other.returns.mean(0)
-    mean, low, high = float(cases.mean()), math.nan, math.nan
-    if len(cases) > 1:
-        mean, low, high = map(float, mean_interval(cases))
+    mean, low, high = interval(one.returns.mean(0) - other.returns.mean(0))[:3]
     of_seeds, of_others = one.returns.mean(1), other.returns.mean(1)
     if len(of_seeds) == len(of_others):
         seeds = of_seeds - of_others

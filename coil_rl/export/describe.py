@@ -122,6 +122,7 @@ def guide_itself(controller: Controller, step: PolicyStep) -> str | None:
 def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
     tested = which == HANDED_OVER and run.delivery == "tested"  # so a test may have chosen it
     delivery = record.DELIVERY.read(run.folder) if tested else None
+    said = handed_over(run.folder) if tested else []
     method = run.settings.get("method") or {}
     acts = LEARNED
     if guide is not None:
@@ -134,7 +135,7 @@ def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
         "seed": run.seed,
         "frames": run.budget.frames,
         "which": which,
-        "chosen": (tested and handed_over(run.folder)) or "the last policy of the training",
+        "chosen": " ".join(said) or "the last policy of the training",
         "acts": acts,
         "actions": "deterministic",
     }

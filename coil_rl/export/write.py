@@ -18,7 +18,7 @@ from coil_rl.export.files import as_onnx, as_torch, traced
 from coil_rl.export.parity import LIMIT, WITH_GUIDE, Parity, compare, expected
 from coil_rl.export.policy import ExportedPolicy
 from coil_rl.export.recording import Recording, record
-from coil_rl.export.step import NotExportableError, PolicyStep, check_transforms
+from coil_rl.export.step import NotExportableError, PolicyStep, exportable
 from coil_rl.extras import require
 from coil_rl.files import temporary
 from coil_rl.foreign.controllers import EntryGuide, PerRow
@@ -63,7 +63,7 @@ def export_policy(
     check_range(1, 1_000_000, observations=observations)
     controller = run.controller(which)
     try:
-        check_transforms(controller)
+        exportable(controller)
     except NotExportableError as error:
         raise UserError(_impossible(run, str(error))) from error
     recording = _recorded(run, controller, observations, seed)

@@ -13,6 +13,7 @@ import numpy as np
 
 from coil_rl.report.configurations import guide_follows_seed, of_guide
 from coil_rl.report.runs import GUIDE, Run
+from coil_rl.report.sentences import REPORT, listed
 from coil_rl.report.statistics import Array
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
 SAME_RETURN = 1e-5  # of the range of the compared returns; the rest is rounding
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
-MOST_SHOWN = 3  # labels in a sentence, and parts of the seeds of each
 MOST_SEEDS = 4  # in a part
 
 
@@ -57,10 +57,7 @@ class Guide:
 
     def listed(self) -> str:
         """Return the labels as a text, the first ones of many."""
-        more = len(self.labels) - LABELS_IN_NAME
-        if more <= 1:
-            return ", ".join(self.labels)
-        return f"{', '.join(self.labels[:LABELS_IN_NAME])} and {more} more"
+        return listed(self.labels, LABELS_IN_NAME)
 
     def rows(self) -> pd.DataFrame:
         """Return all different evaluations, numbered by the column `seed`."""
@@ -112,17 +109,9 @@ def of_changed_guides(runs: Sequence[Run]) -> list[str]:
     for run, name, of_seeds in _guides_without_seed(runs):
         parts = _alike(of_seeds)
         if len(parts) > 1:
-            shown = [_some(list(map(str, seeds)), MOST_SEEDS) for seeds in parts]
-            found.setdefault(name, []).append(f"{run.label} seeds {_some(shown, joint=' / ')}")
-    warnings = []
-    for name, labels in found.items():
-        warnings.append(
-            f"The {name} has different returns in the same cases in runs of the same configuration "
-            f"({_some(labels, joint='; ')}): either the env, the guide or what they use changed "
-            "between these runs, and they are not to be pooled, or the guide or the env draws "
-            "random numbers of its own."
-        )
-    return warnings
+            shown = listed((listed(seeds, MOST_SEEDS) for seeds in parts), joint=" / ")
+            found.setdefault(name, []).append(f"{run.label} seeds {shown}")
+    return REPORT.said("changed_guides", guides=found)
 
 
 def of_guides_of_labels(runs: Sequence[Run]) -> list[str]:
@@ -143,15 +132,7 @@ def of_guides_of_labels(runs: Sequence[Run]) -> list[str]:
         if others and not any(_share(results, theirs) for _, _, theirs in others):
             differ.setdefault(name, []).append(f"{others[0][0]} / {run.label}")
         known.append((run.label, settings, results))
-    warnings = []
-    for name, labels in differ.items():
-        warnings.append(
-            f"The {name} has different returns in the same cases in runs of different labels, "
-            f"whose guide, env and cases have one configuration ({_some(labels, joint='; ')}): "
-            "either the env, the guide or what they use changed between these runs, and they are "
-            "not to be compared, or the guide or the env draws random numbers of its own."
-        )
-    return warnings
+    return REPORT.said("guides_of_labels", guides=differ)
 
 
 def _guides_without_seed(
@@ -200,17 +181,6 @@ def _alike(of_seeds: Mapping[int, pd.DataFrame]) -> list[list[int]]:
     for seed in sorted(of_seeds):
         parts[_position(results, of_seeds[seed])].append(seed)
     return sorted(parts)
-
-
-def _some(texts: Sequence[str], most: int = MOST_SHOWN, joint: str = ", ") -> str:
-    """Return texts as one, the first ones of many.
-
-    Args:
-        texts: to join.
-        most: number of the texts that are shown.
-        joint: between them.
-    """
-    return joint.join([*texts[:most], *(["..."] if len(texts) > most else [])])
 
 
 def _different(results: Iterable[pd.DataFrame]) -> list[pd.DataFrame]:

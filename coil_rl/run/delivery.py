@@ -25,7 +25,7 @@ from coil_rl import record
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.anchor import hold_of
 from coil_rl.learners.learner import Learner
-from coil_rl.report.statistics import mean_interval
+from coil_rl.report.statistics import difference
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
 from coil_rl.run.curve import EvaluationCurve
@@ -265,7 +265,7 @@ class Delivery:
         """
         ahead = None
         if chosen not in ("last", record.UNTESTED):
-            ahead = mean_interval((returns[chosen] - returns["last"]).tolist())
+            ahead = difference(returns[chosen].tolist(), returns["last"].tolist())[:3]
         report = record.Delivery(
             policy=chosen,
             cases=len(returns["last"]),

@@ -39,9 +39,14 @@ class EvaluationResult:
     rate: float = float("nan")
 
     @property
+    def rewards(self) -> list[float]:
+        """Reward of each episode."""
+        return [float(episode["reward"]) for episode in self.episodes]
+
+    @property
     def mean_reward(self) -> float:
         """Mean of the episodes."""
-        return float(sum(episode["reward"] for episode in self.episodes) / len(self.episodes))
+        return sum(self.rewards) / len(self.episodes)
 
     def split(self, parts: int) -> list[EvaluationResult]:
         """Return consecutive parts of equally many episodes."""

@@ -161,7 +161,7 @@ class Experiment:
         self.metrics.describe(self.identity)
         if self.updates == 0:
             first = self._measure({})
-            if (sentence := start_test(first)) is not None:
+            for sentence in start_test(first):
                 say(sentence, error=True)
             self.frames_before = self.before + self.tested
             first |= self._taken()

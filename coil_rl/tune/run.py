@@ -112,8 +112,7 @@ class TunedRun(Run):
         values = read_tuned(self.folder, self.numbers)
         if values is not None:
             found.append(numbers_sentence(values, {each.name: each.own for each in self.numbers}))
-        beyond = beyond_budget(self.folder, self.budget.frames)
-        return found if beyond is None else [*found, beyond]
+        return [*found, *beyond_budget(self.folder, self.budget.frames)]
 
     def _env_of(self, candidates: Candidates) -> Any:
         """Return what makes the env in which candidates act."""

@@ -19,9 +19,10 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from coil_rl.cones import draw_listening_map
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.track import AS_COMPLEX, Array, Track, resample
-from coil_rl.report import draw_listening_map, style, write_csv
+from coil_rl.report import style, write_csv
 from coil_studies.listening.measures import drawn
 
 if TYPE_CHECKING:

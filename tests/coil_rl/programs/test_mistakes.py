@@ -199,7 +199,7 @@ def refusal(name, *arguments):
             "guide.spline._target_=coil_rl.guides.Nope",
             "guide.spline: there is no 'coil_rl.guides.Nope'; check",
         ),
-        ("guide.spline._target_=coil_rl.guides.spline.FAR", "is 1000.0, which cannot be called"),
+        ("guide.spline._target_=coil_rl.cones.spline.FAR", "is 1000.0, which cannot be called"),
         ("guide=zero guide.zero._target_=builtins.dict", "makes dict, not TensorDictModuleBase"),
         (
             "guide=zero guide.zero._target_=subprocess.run",

@@ -92,7 +92,7 @@ def test_rows_that_need_nothing_may_be_computed_too(
         return env.rollout(40, FollowAdvice(env), break_when_any_done=False)
 
     chosen = drive()
-    for module in ("coil_rl.guides.spline_memory", "coil_rl.envs.boundaries"):
+    for module in ("coil_rl.cones.spline_memory", "coil_rl.envs.boundaries"):
         # As on a GPU, where reading the mask would cost more.
         monkeypatch.setattr(f"{module}.rows_in_use", lambda mask: torch.arange(len(mask)))
     assert (drive() == chosen).all()

@@ -8,8 +8,9 @@ from matplotlib.colors import to_rgb
 from ovals import oval_line, oval_track, ring_track
 from PIL import Image, ImageSequence
 
-from coil_rl.report import draw_listening_map, style
-from coil_rl.report.lines import animate_lines, draw_lines
+from coil_rl.cones import draw_listening_map
+from coil_rl.cones.lines import animate_lines, draw_lines
+from coil_rl.report import style
 
 TRACKS = [ring_track("small", 8.0), ring_track("large", 11.0)]
 

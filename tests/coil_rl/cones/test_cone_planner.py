@@ -7,8 +7,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from coil_rl.cones.cone_planner import ConePlannerGuide
 from coil_rl.envs import SimulatedRobotEnv
-from coil_rl.guides.cone_planner import ConePlannerGuide
 from coil_rl.testing import check_guide
 
 INSTALLED = importlib.util.find_spec("fsd_path_planning") is not None

@@ -11,12 +11,12 @@ from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
+from coil_rl.cones.spline import TARGET_REACHED, SplineGuide
 from coil_rl.envs.constants import constant
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.sight import SIGHT, Frame, field_of_view_margin
 from coil_rl.envs.sorting import append, first_come, rows_in_use
 from coil_rl.envs.splines import slots_in_use
-from coil_rl.guides.spline import TARGET_REACHED, SplineGuide
 
 TARGETS, CONES = 192, 128  # room for targets, and for the cones of a side
 CANDIDATES = 15  # targets of one path, at most

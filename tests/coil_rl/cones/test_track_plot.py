@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from ovals import ring_track
 
+from coil_rl.cones.track_plot import TrackPlot
 from coil_rl.envs import Track, robot_track
-from coil_rl.report.track_plot import TrackPlot
 
 
 @pytest.mark.parametrize(("scale", "bar"), [(7, "10 m"), (1, "1 m")])

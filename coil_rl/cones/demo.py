@@ -29,8 +29,8 @@ def demo(path: Path) -> None:
     Args:
         path: of the picture.
     """
+    from coil_rl.cones.lines import draw_lines
     from coil_rl.envs import shipped_track
-    from coil_rl.report.lines import draw_lines
 
     print(f"demo: one lap on a track that {POLICY} has never seen ...", flush=True)
     agent, guide = driven().split(2)

@@ -22,10 +22,10 @@ from matplotlib.patheffects import Stroke as StrokeEffect
 from numpy.typing import ArrayLike
 from PIL import Image
 
+from coil_rl.cones.track_plot import Array, TrackPlot
 from coil_rl.files import whole_file
 from coil_rl.output import progress
 from coil_rl.report import style
-from coil_rl.report.track_plot import Array, TrackPlot
 
 if TYPE_CHECKING:
     from coil_rl.envs.track import Track

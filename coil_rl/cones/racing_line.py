@@ -8,9 +8,9 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor
 
+from coil_rl.cones.spline import TARGET_REACHED, SplineGuide, first_point
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.splines import slots_in_use
-from coil_rl.guides.spline import TARGET_REACHED, SplineGuide, first_point
 
 
 class RacingLineGuide(SplineGuide):
