@@ -122,7 +122,9 @@ def keep_written(
     Raises:
         UserError: for a value that two files give differently, or that has no place.
     """
+    loader = GlobalHydra.instance().config_loader()
     groups = {str(group).replace("/", ".") for group in hydra.runtime.choices}
+    groups |= set(loader.list_groups(""))  # a choice of several files is not among the first
     for text in task:
         group, value = key_of(text), text.partition("=")[2]
         if group in groups.difference(SEVERAL) and value.startswith("["):
@@ -133,7 +135,6 @@ def keep_written(
     places = [f"{place.schema}://{place.path}" for place in hydra.runtime.config_sources]
     # To look for files of users takes as long as to compose all files.
     if not all(place.startswith(shipped_places()) for place in places):
-        loader = GlobalHydra.instance().config_loader()
         name, words = hydra.job.config_name, [*task, *others]
         defaults = loader.compute_defaults_list(name, words, RunMode.RUN).defaults
         # A choice of a file, such as method=coil, gives no value.
