@@ -23,6 +23,7 @@ CONFS = (CONF, Path(coil_robot.conf.__path__[0]))
 # Programs of guests, by command.
 GUESTS = {
     "compare": "coil_rl.comparison.program",
+    "export": "coil_rl.export.program",
     "demo": "coil_rl.cones.demo",
     "listen": "coil_studies.listening.program",
     "drive": "coil_robot.programs.drive",

@@ -3,15 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from coil_rl.config.folder import holds, identity, read_config, run_folder, settings
-from coil_rl.config.nodes import build
-from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
+from coil_rl.config.own_run import own_run
 from coil_rl.config.parts import (
     advises,
     advises_only,
@@ -40,8 +38,6 @@ from coil_rl.run.judge import Trial, guide_titles
 from coil_rl.run.parts import EnvMaker
 from coil_rl.run.run import Budget, Run
 from coil_rl.transforms.normalised_action import in_unit_of
-from coil_rl.tune.run import TunedRun
-from coil_rl.tune.search import Search
 
 
 def assemble(config: DictConfig, folder: Path | None = None) -> Run:
@@ -64,10 +60,9 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         return [GuideReturns(make_env, learner.guides, each_phase=each_phase)] if trains else []
 
     run_of_proxy = partial(run_configured, wait=True)
-    has_learner = config.method.observes is not None and not config.method.search
-    make_run: Callable[..., Run] = Run
-    if config.method.search:
-        make_run = partial(TunedRun, **_searched(config))
+    has_learner = config.method.observes is not None and config.method.learner != "none"
+    own = own_run(config)
+    make_run: Callable[..., Run] = Run if own is None else own.maker(config)
     return make_run(
         folder,
         make_env,
@@ -92,15 +87,6 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         settings=settings(config),
         identity=identity(config),
     )
-
-
-def _searched(config: DictConfig) -> dict[str, Any]:
-    """Return the arguments of a run that tunes its guide, besides those of any run."""
-    return {
-        "numbers": numbers_to_tune(config),
-        "make_guide": GuideWithNumbers(config),
-        "search": build(config.method.search, "method.search", Search),
-    }
 
 
 def budget(config: DictConfig) -> Budget:
@@ -139,7 +125,7 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         guides=guide_titles(driving_guides(config)),
         guide_results=partial(guide_results, config),
         together=has_agent
-        and not config.method.search
+        and not config.method.run
         and advises_only(config)
         and not demonstrations(config),
         advice=list(config.evaluation.advice) if advises(config) else [],

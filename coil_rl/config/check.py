@@ -27,7 +27,7 @@ from coil_rl.config.fits import (
 from coil_rl.config.folder import run_folder
 from coil_rl.config.messages import sentence
 from coil_rl.config.nodes import build, build_all, check_node
-from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
+from coil_rl.config.own_run import own_run
 from coil_rl.config.passive import check_passive, passive
 from coil_rl.config.proxies import (
     frames_of_proxies,
@@ -51,7 +51,6 @@ from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
 from coil_rl.run.training import INIT
 from coil_rl.transforms.action_space import ChoicesError, choices_of, nested_key
-from coil_rl.tune.search import Search
 
 # Methods that take choices as actions, the most useful ones first.
 WITH_CHOICES = (
@@ -97,7 +96,7 @@ def check_parts(config: DictConfig) -> None:
     if has_agent:
         _check_kind(config)
     if trains:
-        _check_tuning(config)
+        _check_own_run(config)
         _check_delivery(config, has_agent=has_agent)
     make_env = parts.env_maker(config)
     cases = _count_cases(config)
@@ -147,28 +146,16 @@ def _check_kind(config: DictConfig) -> None:
         )
 
 
-def _check_tuning(config: DictConfig) -> None:
-    """Raise a `UserError` for numbers that cannot be tuned, or that nothing tunes."""
-    if not config.method.search:
-        if config.tune:
-            raise UserError(
-                f"tune has no effect: method={config.method.name} does not tune its guide; give "
-                "method=tune, or leave tune out"
-            )
-        return
-    if config.delivery != "tested":
+def _check_own_run(config: DictConfig) -> None:
+    """Raise a `UserError` for what the own run of a method cannot do, or for `tune` without one."""
+    own = own_run(config)
+    if own is not None:
+        own.check(config)
+    elif config.tune:
         raise UserError(
-            f"delivery={config.delivery}: method={config.method.name} always tests what it hands "
-            "over; leave it out"
+            f"tune has no effect: method={config.method.name} does not tune its guide; give "
+            "method=tune, or leave tune out"
         )
-    build(config.method.search, "method.search", Search)
-    numbers = numbers_to_tune(config)
-    make_guide = GuideWithNumbers(config)
-    for end in (0.0, 1.0):
-        try:
-            make_guide({number.name: number.value(end) for number in numbers})
-        except UserError as error:
-            raise UserError(f"tune: a bound is no value of the guide: {error}") from error
 
 
 def _check_delivery(config: DictConfig, *, has_agent: bool) -> None:
@@ -176,7 +163,7 @@ def _check_delivery(config: DictConfig, *, has_agent: bool) -> None:
 
     So it is for values that need a policy, where none is trained.
     """
-    trains_policy = has_agent and not config.method.search
+    trains_policy = has_agent and not config.method.run
     if config.evaluation.fallback and not trains_policy:
         raise UserError(no_effect(Path(config.run_dir), "there is no agent"))
     if config.init and not trains_policy:
@@ -279,9 +266,7 @@ def _say_cost_of_curve(config: DictConfig, found: Tried) -> None:
     command would make another run on a busier machine.
     """
     curve = config.evaluation.curve
-    asks = config.method.observes is not None and (
-        config.method.search or "advice" in config.method.transforms
-    )
+    asks = config.method.observes is not None and "advice" in config.method.transforms
     sets = 1 if config.delivery == "tested" else len(curve.cases)
     episodes = (curve.points + 1) * curve.num_envs * sets
     minutes = STEPS_SAID * episodes * found.seconds / 60
@@ -306,7 +291,7 @@ def _check_cases(cases: int, make: Callable[[], Any]) -> None:
 
 
 def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
-    if config.method.search:
+    if config.method.run:
         _check_curve(config, make_env)
         make_env()
         return

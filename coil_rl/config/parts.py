@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, Transform
 
 from coil_rl.config import given
 from coil_rl.config.nodes import build, build_all, find_target
-from coil_rl.config.numbers import with_tuned
+from coil_rl.config.own_run import own_run
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import MEAN_CASE, measures_of
@@ -134,7 +134,9 @@ def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
     """
 
     def transforms(advice: str) -> list[Transform]:
-        return build_transforms(config if folder is None else with_tuned(config, folder), advice)
+        own = None if folder is None else own_run(config)
+        found = config if own is None or folder is None else own.found(config, folder)
+        return build_transforms(found, advice)
 
     def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
         return build_bare_env(config, cases_node(config, rows, cases, count))
@@ -286,7 +288,7 @@ def learner_kind(config: DictConfig) -> str:
 
     It is `none` for a method that has no learner.
     """
-    if config.method.search:
+    if config.method.learner == "none":
         return "none"
     target = find_target(config.learner.get("_target_"), "learner")
     if isinstance(target, type) and issubclass(target, Learner):

@@ -162,8 +162,8 @@ class EvaluationConfig(NodeConfig):
 class MethodConfig(NodeConfig):
     """A method: transforms of the agent, the kind of its learner, and what it observes.
 
-    `observes` are entries besides those of the env. `search` is for a method that tunes its guide
-    instead of training a learner; its learner is "none".
+    `observes` are entries besides those of the env. `run` makes the run of a method that
+    trains no policy, see `coil_rl.config.own_run`; its learner is "none".
     """
 
     name: str = MISSING
@@ -171,7 +171,7 @@ class MethodConfig(NodeConfig):
     transforms: dict[str, Any] = field(default_factory=dict)
     needs_guide: bool = MISSING
     learner: Annotated[str, one_of("agent", "imitation", "guides", "none")] = "agent"
-    search: dict[str, Any] = field(default_factory=dict)  # of the numbers of a guide
+    run: dict[str, Any] = field(default_factory=dict)  # instead of a training
 
 
 @dataclass

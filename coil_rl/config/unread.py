@@ -72,13 +72,13 @@ def unread(config: DictConfig, task: Iterable[str]) -> Iterator[str]:
 def _unread_nodes(config: DictConfig) -> Iterator[str]:
     """Yield the nodes that a run does not read, whatever they hold."""
     has_agent = config.method.observes is not None
-    learns = has_agent and not config.method.search
+    learns = has_agent and not config.method.run
     anchored = OmegaConf.select(config, "learner.anchor") is not None
     if not has_agent:
         yield from OF_A_TRAINING
     if not learns:
         yield from (*OF_A_LEARNER, "training.noise_correlation")
-    if not (anchored or config.method.search or config.delivery == "tested"):
+    if not (anchored or config.delivery == "tested"):
         yield "training.tests"
     if not trains_guides(config):
         yield "proxy"

@@ -68,11 +68,11 @@ def with_exported(config: DictConfig, file: str) -> DictConfig:
     Raises:
         UserError: for a file that cannot be used, or a policy whose guide is outside.
     """
-    from coil_rl.export import ExportedGuide
+    from coil_rl.config.nodes import build
 
-    ExportedGuide(file)
-    alone = config.copy()
     target = {"_target_": "coil_rl.export.ExportedGuide", "file": str(file)}
+    build(target, "exported")
+    alone = config.copy()
     with open_dict(alone):
         alone.guide["exported"] = target
         # Degraded advice is not a part of a policy that acts.

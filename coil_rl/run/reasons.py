@@ -36,22 +36,6 @@ def start_test(row: Mapping[str, float]) -> list[str]:
     return SENTENCES.said("start_test", cases=cases, tested=known, weight=weight, better=better)
 
 
-def beyond_budget(folder: Path, frames: int) -> list[str]:
-    """Return the sentence for a search that took more frames than its budget; none for another.
-
-    Args:
-        folder: of the run.
-        frames: the budget.
-
-    Raises:
-        UserError: if the file is damaged.
-    """
-    report = DELIVERY.read(folder)
-    if report is None or report.steps <= frames:
-        return []
-    return SENTENCES.said("beyond_budget", steps=report.steps, frames=frames)
-
-
 def handed_over(folder: Path) -> list[str]:
     """Return the sentences that say what a run handed over and why; none without a test.
 

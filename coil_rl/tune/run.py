@@ -30,13 +30,12 @@ from coil_rl.run.experiment import PUT_BACK, check_identity
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.parts import TESTS
-from coil_rl.run.reasons import beyond_budget
 from coil_rl.run.run import Run
 from coil_rl.run.stopping import STOP, resume_command
 from coil_rl.tune.candidates import Candidates
 from coil_rl.tune.search import BEST, MEAN, OWN, MakeGuide, Number, Search, Tuner, Values, chosen
 
-TUNED = record.TUNED.name
+TUNED = record.json_file("tuned.json", dict[str, float], PUT_BACK)  # numbers of the guide
 NAMES = {OWN: "guide", MEAN: "tuned", BEST: "best_candidate"}  # in delivery.json
 
 
@@ -71,9 +70,8 @@ class TunedRun(Run):
             UserError: if the run is not finished, or its files are damaged.
         """
         if read_tuned(self.folder, self.numbers) is None:
-            raise UserError(
-                f"{self.folder} has no {TUNED} yet; finish it with {resume_command(self.folder)}"
-            )
+            finish = resume_command(self.folder)
+            raise UserError(f"{self.folder} has no {TUNED.name} yet; finish it with {finish}")
         return self._loaded(GuideActs(env), env, which)
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
@@ -204,7 +202,7 @@ class TunedRun(Run):
         values = {OWN: tuner.own, MEAN: tuner.mean, BEST: tuner.best}
         returns = tuner.test()
         name = chosen(returns)
-        record.TUNED.write(self.folder, dict(values[name]))
+        TUNED.write(self.folder, dict(values[name]))
         for which in ("last", HANDED_OVER):
             checkpoint.save({GUIDE: torch.tensor(0)}, weights_file(self.folder, which))
         report = record.Delivery(
@@ -247,6 +245,25 @@ class TunedRun(Run):
         return {number.name: row[f"tune/number/{number.name}"] for number in self.numbers}
 
 
+def beyond_budget(folder: Path, frames: int) -> list[str]:
+    """Return the sentence for a search that took more frames than its budget; none for another.
+
+    Args:
+        folder: of the run.
+        frames: the budget.
+
+    Raises:
+        UserError: if the file is damaged.
+    """
+    report = record.DELIVERY.read(folder)
+    if report is None or report.steps <= frames:
+        return []
+    return [
+        f"The search took {report.steps:,} frames, more than budget.frames={frames:,}: that is "
+        "too little for a generation and a test of its result."
+    ]
+
+
 def numbers_sentence(values: Values, own: Values) -> str:
     """Return the sentence that says which numbers a guide got.
 
@@ -255,7 +272,7 @@ def numbers_sentence(values: Values, own: Values) -> str:
         own: those that it had.
     """
     listed = (f"{name} {value:.4g} (its own {own[name]:.4g})" for name, value in values.items())
-    return f"The guide's numbers: {', '.join(listed)}; all digits are in {TUNED}."
+    return f"The guide's numbers: {', '.join(listed)}; all digits are in {TUNED.name}."
 
 
 def read_tuned(folder: Path, numbers: Sequence[Number]) -> Values | None:
@@ -268,10 +285,10 @@ def read_tuned(folder: Path, numbers: Sequence[Number]) -> Values | None:
     Raises:
         UserError: for a file that holds other numbers, or numbers out of their bounds.
     """
-    saved = record.TUNED.read(folder)
+    saved = TUNED.read(folder)
     if saved is None:
         return None
-    with file_of_a_run(folder / record.TUNED.name, PUT_BACK):
+    with file_of_a_run(folder / TUNED.name, PUT_BACK):
         values = {number.name: saved[number.name] for number in numbers}
         for number in numbers:
             low, high = min(number.low, number.own), max(number.high, number.own)

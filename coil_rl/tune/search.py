@@ -9,7 +9,7 @@ unless others are clearly better. Hansen 2016, The CMA evolution strategy: a tut
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from coil_rl.envs.limits import check_range
-from coil_rl.extras import require
 from coil_rl.guides.simple import FollowAdvice
+from coil_rl.ranges import Count, Ge, Interval, checked
 from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
 from coil_rl.tune.candidates import Candidates
 
@@ -65,6 +64,7 @@ class Number:
         return math.log(max(value, self.low)) if self.log else value
 
 
+@checked
 @dataclass(frozen=True)
 class Search:
     """Settings of the search.
@@ -79,16 +79,10 @@ class Search:
         ValueError: for a value out of range.
     """
 
-    population: int | None = None
-    cases: int = 4
-    spread: float = 0.25
-    share: float = 0.15
-
-    def __post_init__(self) -> None:
-        check_range(3, population=3 if self.population is None else self.population)
-        check_range(1, cases=self.cases)
-        check_range(0, 1, above=True, spread=self.spread)
-        check_range(0, 0.5, above=True, share=self.share)
+    population: Annotated[int, Ge(3)] | None = None
+    cases: Count = 4
+    spread: Annotated[float, Interval(gt=0, le=1)] = 0.25
+    share: Annotated[float, Interval(gt=0, le=0.5)] = 0.15
 
     def size(self, numbers: int) -> int:
         """Return the number of candidates in a generation.
@@ -214,7 +208,6 @@ class Tuner:
 
     def _begin(self) -> None:
         """Begin the search at the guide's own numbers."""
-        require("method=tune", "tune", "cmaes")
         from cmaes import CMA  # imports scipy.stats, which takes a second in every training
 
         self.told = []

@@ -11,7 +11,7 @@ def run_with(folder, seed, **numbers):
     place = folder / f"tune_seed{seed}"
     place.mkdir()
     if numbers:
-        (place / TUNED).write_text(json.dumps(numbers))
+        (place / TUNED.name).write_text(json.dumps(numbers))
     return Run(place, "tune", seed, needs_guide=True, settings={})
 
 

@@ -8,7 +8,7 @@ import pytest
 from coil_rl.errors import UserError
 from coil_rl.learners.anchor import StartTest
 from coil_rl.record import DELIVERY
-from coil_rl.run.reasons import beyond_budget, handed_over, start_test
+from coil_rl.run.reasons import handed_over, start_test
 
 
 def row(*numbers):
@@ -55,14 +55,6 @@ def test_handing_over_is_said_with_its_reason(changes, part, tmp_path):
     (tmp_path / DELIVERY.name).write_text(json.dumps(report))
     (sentence,) = handed_over(tmp_path)
     assert part in sentence
-
-
-def test_search_beyond_its_budget_is_said_from_a_file_that_may_be_missing(tmp_path):
-    assert beyond_budget(tmp_path, 300) == []
-    report = {"policy": "own", "cases": 4, "returns": {}, "frames": None, "steps": 1800}
-    (tmp_path / DELIVERY.name).write_text(json.dumps(report))
-    assert "took 1,800 frames, more than budget.frames=300" in str(beyond_budget(tmp_path, 300))
-    assert beyond_budget(tmp_path, 1800) == []
 
 
 def test_damaged_file_is_one_sentence(tmp_path):

@@ -195,7 +195,7 @@ def test_spline_guide_is_tuned_side_by_side_in_one_env(tmp_path):
         "training.tests.starts=20",
         "tune={gain: [0.1, 2]}",
         "budget.frames=1500",
-        "method.search.cases=8",
+        "method.run.cases=8",
         "evaluation.curve.env.time_limit=1",
         "evaluation.pictures={}",
     )

@@ -11,7 +11,6 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -22,7 +21,6 @@ from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.controllers import ControllerGuide, PerRow, load
 from coil_rl.guides import classic
 from coil_rl.ranges import yaml_text
-from coil_rl.tune.run import read_tuned
 from coil_rl.tune.search import Number
 
 # Arguments of the parts of this project that are no numbers of a controller.
@@ -240,20 +238,13 @@ class GuideWithNumbers:
         return guide
 
 
-def with_tuned(config: DictConfig, folder: Path) -> DictConfig:
-    """Return a configuration whose guide has the numbers that a run has found.
-
-    It is the same one for a run that tunes nothing, or has found none yet.
+def with_values(config: DictConfig, values: Mapping[str, float]) -> DictConfig:
+    """Return a configuration whose guide has other numbers.
 
     Args:
-        config: of the run.
-        folder: of the run.
+        config: with one guide; it stays as it is.
+        values: by name.
     """
-    if not config.method.search:
-        return config
-    values = read_tuned(folder, numbers_to_tune(config))
-    if values is None:
-        return config
     name, node = tuned_guide(config)
     guides = {name: with_numbers(node, f"guide.{name}", values)}
     config = copy.deepcopy(config)

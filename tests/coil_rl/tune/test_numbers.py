@@ -8,14 +8,14 @@ from hydra import compose, initialize_config_module
 
 from coil_rl.config.given import keep
 from coil_rl.config.nodes import build
-from coil_rl.config.numbers import (
+from coil_rl.errors import UserError
+from coil_rl.tune.numbers import (
     GuideWithNumbers,
     _number,
     numbers_of,
     numbers_to_tune,
     with_numbers,
 )
-from coil_rl.errors import UserError
 
 
 class PID:

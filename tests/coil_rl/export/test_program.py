@@ -6,7 +6,7 @@ import pytest
 from programs import called
 
 from coil_rl.export.contract import CONTRACT
-from coil_rl.programs.export import next_step
+from coil_rl.export.program import next_step
 
 RUN = "run=pretrained:pendulum/coil"
 
