@@ -1,16 +1,14 @@
 """From the words of a command line and YAML files to a configuration: Hydra composes it.
 
-What a person wrote is what runs: values of YAML files, and of the command line.
+What a person wrote is what runs. Hydra composes the groups in a fixed order, env before learner
+before method. So a value of a later group replaces the one that a user wrote in a file of an
+earlier group, `learner: {normalise: true}` in a file of an env for example, and nobody says so.
+Here every value that is written in a file of somebody else than coil-rl is put into its place
+again, unless the command line gives another one.
 
-Hydra composes the groups in a fixed order, env before learner before method. So a value of a later
-group replaces the one that a user wrote in a file of an earlier group, `learner: {normalise: true}`
-in a file of an env for example, and nobody says so. Here every value that is written in a file of
-somebody else than coil-rl is put into its place again, unless the command line gives another one.
-
-The YAML files of guests: packages beside coil-rl that bring envs, guides, experiments, programs.
-
-A guest names the package of its files by an entry point, and Hydra then finds them like those of
-coil-rl, by the names of their folders:
+Guests, packages beside coil-rl, bring YAML files of envs, guides, experiments and programs. A guest
+names the package of its files by an entry point, and Hydra then finds them like those of coil-rl,
+by the names of their folders:
 
     [project.entry-points."coil_rl.conf"]
     my_package = "my_package.conf"
@@ -25,7 +23,7 @@ from importlib import metadata, resources
 from importlib.resources.abc import Traversable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from hydra import compose, initialize_config_module
 from hydra.core.config_search_path import ConfigSearchPath
@@ -37,10 +35,13 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.messages import sentence
+from coil_rl.config.messages import SEVERAL, sentence
 from coil_rl.errors import UserError
 
 CORE = "coil_rl.conf"  # the package of our own files, and the group of the entry points
+
+
+REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
 
 
 @cache
@@ -77,10 +78,6 @@ class GuestFiles(SearchPathPlugin):
 Plugins.instance().register(GuestFiles)
 
 
-SEVERAL = ("guide", "disturb", "degrade")  # groups of which several files may be chosen
-REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
-
-
 @dataclass(frozen=True)
 class Written:
     """A value in a file of a user.
@@ -98,15 +95,8 @@ class Written:
     files: frozenset[str]
 
 
-class Job(NamedTuple):
-    """A run of a sweep, and all that differ from it by their seed only."""
-
-    words: Sequence[str]  # for the program, also those of the sweep
-    config: DictConfig  # composed
-
-
 def keep_written(
-    config: DictConfig, hydra: DictConfig, task: Sequence[str], others: Sequence[str] = ()
+    config: DictConfig, hydra: Any, task: Sequence[str], others: Sequence[str] = ()
 ) -> None:
     """Put the values of users' files into their places, after Hydra has composed all files.
 

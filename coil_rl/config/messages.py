@@ -42,6 +42,24 @@ NO_INTEGER = re.compile(
 )
 
 
+# Names of hyper-parameters elsewhere (Stable-Baselines3, CleanRL, rsl_rl), and ours.
+OTHER_NAMES = {
+    "lr": "learning_rate",
+    "total_timesteps": "frames",
+    "n_steps": "steps",
+    "num_steps": "steps",
+    "n_envs": "num_envs",
+    "n_epochs": "epochs",
+    "clip_range": "clip",
+    "ent_coef": "entropy",
+    "net_arch": "hidden",
+    "env_id": "id",
+}
+SEVERAL = ("guide", "disturb", "degrade")  # groups of which several files may be chosen
+OF_ENVS = {"env.id": "gym", "env.of": "torchrl", "env.options": "gym", "env.wrappers": "gym"}
+MOST = 2  # places that a hint names
+
+
 def is_no_bug(error: BaseException) -> bool:
     """Return whether an error has a cause outside of the program.
 
@@ -225,24 +243,6 @@ def _first_paragraph(error: BaseException) -> str:
         if line.strip() and not line.startswith((" ", "\t", "See http")):
             kept.append(line.strip())
     return " ".join(kept) or type(error).__name__
-
-
-# Names of hyper-parameters elsewhere (Stable-Baselines3, CleanRL, rsl_rl), and ours.
-OTHER_NAMES = {
-    "lr": "learning_rate",
-    "total_timesteps": "frames",
-    "n_steps": "steps",
-    "num_steps": "steps",
-    "n_envs": "num_envs",
-    "n_epochs": "epochs",
-    "clip_range": "clip",
-    "ent_coef": "entropy",
-    "net_arch": "hidden",
-    "env_id": "id",
-}
-SEVERAL = ("guide", "disturb", "degrade")  # groups whose files are nodes by their names
-OF_ENVS = {"env.id": "gym", "env.of": "torchrl", "env.options": "gym", "env.wrappers": "gym"}
-MOST = 2  # places that a hint names
 
 
 def similar(given: str, known: Iterable[str]) -> str:
