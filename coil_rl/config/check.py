@@ -40,7 +40,7 @@ from coil_rl.config.trust import check_logger
 from coil_rl.config.values import check_values
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.batch import SeededRows
-from coil_rl.foreign.trial import Tried, tried
+from coil_rl.foreign.trial import Tried, tried, unrepeated
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.output import say
@@ -237,7 +237,7 @@ def _check_repeats(env: EnvBase) -> None:
     """
     if not isinstance(env, SeededRows):
         return
-    key = env.unrepeated()
+    key = unrepeated(env)
     if key is not None:
         warnings.warn(
             f"the env does not obey its seed: {dotted(key)} differs when an episode is repeated, "

@@ -32,7 +32,7 @@ from coil_rl.foreign.makers import (
     metadata_of,
     name_of,
 )
-from coil_rl.foreign.plant import GymnasiumPlant, resolved_controller
+from coil_rl.foreign.plant import GymnasiumPlant
 from coil_rl.foreign.rows import GymnasiumRows
 from coil_rl.foreign.workers import AUTO, Workers, choose, timed
 
@@ -73,13 +73,13 @@ class GymnasiumEnv(SeededRows):
         cases: number of different episodes, by default `num_envs`; needs `first_seed`.
         info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], NaN where
             missing.
-        controllers: by name, a controller or its import path "PACKAGE.MODULE:THING". A class gets
-            one object an env, `THING(env)`, with a method `act(observation)` and, if it wants,
-            `reset()`, called at the start of an episode; a function is called as `THING(env,
-            observation)`. Either may be a `functools.partial`. Its action for the present
+        controllers: by name. A class gets one object an env, `THING(env)`, with a method
+            `act(observation)` and, if it wants, `reset()`, called at the start of an episode;
+            without it each episode gets a new object. A function is called as
+            `THING(env, observation)`. Either may be a `functools.partial`. An object with `act`,
+            or a trained model with `predict`, is used as it is. Its action for the present
             observation is written as ("controller", NAME), not clamped, in the env's own
-            numbering; after a termination it is the last one. An object with `act`, or a trained
-            model with `predict`, is used as it is.
+            numbering; after a termination it is the last one.
         fresh: whether every episode has a new env, for those whose reset leaves something of the
             past. BipedalWalker is one: without `fresh`, its episodes depend on the seed and, a
             little, on those before.
@@ -99,7 +99,7 @@ class GymnasiumEnv(SeededRows):
 
     Raises:
         ValueError: if the env cannot be made, has a space that is not supported or an entry with a
-            reserved name or bounds that leave no choice, or if a controller cannot be imported.
+            reserved name or bounds that leave no choice, or if a controller cannot act.
         ForeignError: at a reset or a step, for what the env or a controller raises or returns that
             does not fit; see `coil_rl.foreign.faults`.
 
@@ -125,7 +125,7 @@ class GymnasiumEnv(SeededRows):
         first_seed: int | None = None,
         cases: int | None = None,
         info: Sequence[str] = (),
-        controllers: Mapping[str, str | Callable[..., Any]] | None = None,
+        controllers: Mapping[str, Any] | None = None,
         fresh: bool = False,
         render: bool = False,
         workers: int | str = 0,
@@ -134,9 +134,7 @@ class GymnasiumEnv(SeededRows):
     ) -> None:
         check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
         _check_workers(workers)
-        makers = {
-            name: resolved_controller(name, thing) for name, thing in (controllers or {}).items()
-        }
+        makers = dict(controllers or {})
         settings = dict(options or {})
         if max_steps is not None:
             settings["max_episode_steps"] = max_steps

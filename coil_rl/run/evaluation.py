@@ -194,6 +194,17 @@ class Totals:
         return results
 
 
+@torch.no_grad()
+def totals_of(
+    env: EnvBase, policy: TensorDictModuleBase, measures: Mapping[str, Measure], **options: Any
+) -> Totals:
+    """Return the measures of one episode on every row of an env; `options` as for `episodes`."""
+    totals = Totals(measures)
+    for after, running in episodes(env, policy, **options):
+        totals.add(after, running)
+    return totals
+
+
 def _flags(entry: Tensor) -> Tensor:
     """Return an entry as flags of the rows: a number is one if it is neither 0 nor NaN."""
     return entry.reshape(-1).nan_to_num() != 0

@@ -557,8 +557,8 @@ def test_controllers_act_beside_their_envs():
 
 
 def test_heuristic_of_gymnasium_lands():
-    path = "gymnasium.envs.box2d.lunar_lander:heuristic"
-    env = build("LunarLander-v3", 4, first_seed=0, controllers={"heuristic": path})
+    heuristic = pytest.importorskip("gymnasium.envs.box2d.lunar_lander").heuristic
+    env = build("LunarLander-v3", 4, first_seed=0, controllers={"heuristic": heuristic})
     carrier, total = env.reset(), torch.zeros(4, 1)
     while not carrier["done"].all():
         carrier = env.step(carrier.set("action", carrier["controller", "heuristic"]))["next"]
@@ -577,7 +577,7 @@ def test_discrete_controller_gives_indices():
 @pytest.mark.parametrize("advice", [[0.0], [0.0, float("nan")], None])
 def test_wrong_advice_names_the_controller(advice):
     env = GymnasiumEnv("Echo-v0", controllers={"broken": lambda env, observation: advice})
-    with pytest.raises(ValueError, match=r"controller broken gave .*, not an action of Box"):
+    with pytest.raises(ValueError, match="the controller broken beside the env Echo-v0 "):
         env.reset()
 
 
@@ -620,17 +620,12 @@ def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
         (
             "CartPole-v1",
             {"controllers": {"pid": "math:PID"}},
-            "controller pid: 'math:PID' cannot be imported",
+            r"'math:PID' is a text; write {_target_: math.PID, _partial_: true}",
         ),
         (
             "CartPole-v1",
-            {"controllers": {"pid": "builtins:str"}},
+            {"controllers": {"pid": str}},
             r"controller pid: str needs a method act\(obs",
-        ),
-        (
-            "CartPole-v1",
-            {"controllers": {"pid": "fractions:Fraction"}},
-            "controller pid cannot be made with its env",
         ),
         (
             "Echo-v0",
