@@ -50,7 +50,7 @@ from coil_rl.run.fallback import check_cases_of_guide, critic_beside_guide, no_e
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
 from coil_rl.run.training import INIT
-from coil_rl.transforms.action_space import ChoicesError, choices_of, nested_key
+from coil_rl.transforms.action_space import ChoicesError, nested_key
 
 # Methods that take choices as actions, the most useful ones first.
 WITH_CHOICES = (
@@ -113,7 +113,7 @@ def check_parts(config: DictConfig) -> None:
         except UserError as error:
             if not needs_numbers(error):
                 raise
-            raise UserError(about_choices(config, make_env.bare(1, TEST, None))) from error
+            raise UserError(about_choices(config)) from error
         if config.method.transforms:
             for advice in config.evaluation.advice:
                 _check_cases(cases, partial(make_env, cases, TEST, advice))
@@ -442,31 +442,16 @@ def needs_numbers(error: BaseException | None) -> bool:
     return error is not None
 
 
-def about_choices(config: DictConfig, env: EnvBase) -> str:
-    """Return why a method cannot be used with the actions of an env, and which ones can.
+def about_choices(config: DictConfig) -> str:
+    """Return why a method cannot be used where actions are choices, and which ones can.
 
     Args:
         config: composed, of a method that needs numbers.
-        env: without transforms.
     """
-    needs = f"method={config.method.name} needs numbers as actions"
+    needs = f"method={config.method.name}"
     if config.method.name in WITH_CHOICES:  # then it is another learner than the method's own
-        learner = config.learner["_target_"].rpartition(".")[2].lower()
-        needs = f"learner={learner} needs numbers as actions"
-    if config.action:
-        return (
-            f"{needs}, but action=choices makes choices of them; leave action= out, or take "
-            f"learner=dqn or learner=ppo with method={', '.join(WITH_CHOICES)}"
-        )
-    name = OmegaConf.select(config, "env.id") or OmegaConf.select(config, "env.of._target_")
-    of_env = f"env.id={name}" if "id" in config.env else f"the env {name or config.env._target_}"
+        needs = f"learner={config.learner['_target_'].rpartition('.')[2].lower()}"
     return (
-        f"{needs}, but the action of {of_env} is {_described(choices_of(env.action_spec))}; "
-        f"with choices take learner=ppo and method={', '.join(WITH_CHOICES)}"
+        f"{needs} needs numbers as actions, but they are choices here; with choices take "
+        f"learner=ppo and method={', '.join(WITH_CHOICES)}"
     )
-
-
-def _described(choices: list[int]) -> str:
-    if len(choices) == 1:
-        return f"one of {choices[0]} choices"
-    return f"{len(choices)} choices at once, of {', '.join(map(str, choices))} options"

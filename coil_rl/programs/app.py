@@ -47,7 +47,6 @@ from coil_rl.programs.sweeps import Jobs, is_sweep, remove_unused
 from coil_rl.run.stopping import STOP
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
-MOST_PROCESSES = 64  # of joblib, or four for each processor if those are more
 
 
 class NoSweepError(UserError):
@@ -370,7 +369,3 @@ def _check_options(config_name: str) -> None:
     for override in parser.parse_args().overrides:
         if override.startswith("="):
             error(f"{override!r} has no key, write KEY=VALUE")
-        jobs = re.fullmatch(r"\+*hydra\.launcher\.n_jobs=(-?\d+)", override)
-        most = max(MOST_PROCESSES, 4 * (os.cpu_count() or 1))
-        if jobs and abs(int(jobs[1])) > most:
-            error(f"{override} must be at most {most} on this machine")
