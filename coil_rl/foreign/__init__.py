@@ -11,6 +11,6 @@ sentence with its place.
 | `rows`, `workers`, `batch` | plants side by side, over processes, and as a batched env |
 | `gymnasium_env`, `torchrl_env` | the two envs, made by `makers` |
 | `host` | whatever acts for one row; the only place that decides what it is |
-| `controllers`, `shared`, `remembered` | hosts as guides, one a row or one for all, and checkpoints |
+| `controllers`, `shared`, `remembered` | as guides, one a row or one for all; checkpoints |
 | `trial` | a few steps of an env and of a controller, twice |
 """
