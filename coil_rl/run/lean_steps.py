@@ -14,7 +14,7 @@ from torch import Tensor, where
 from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from coil_rl.envs.seeded_env import SeededEnv
-from coil_rl.learners.lean_policy import Entries, LeanPolicy
+from coil_rl.learners.policy import Entries, Policy, by_key
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.normalised_action import NormalisedAction
 
@@ -97,7 +97,7 @@ class LeanSteps:
     """
 
     def __init__(self, env: EnvBase, policy: Any, keys: Sequence[NestedKey]) -> None:
-        self.policy, self.env = LeanPolicy(policy), LeanEnv(env)
+        self.policy, self.env = policy, LeanEnv(env)
         self.before = [key for key in keys if not _is_next(key)]
         self.after = {key: _in_next(key) for key in keys if _is_next(key)}
         self.carried = [*_observed(policy, keys), *self.env.sums]
@@ -106,8 +106,8 @@ class LeanSteps:
     def covers(env: EnvBase, policy: Any, keys: Sequence[NestedKey] | None) -> bool:
         """Return whether the steps of an env and a policy have this form.
 
-        They have if those of the env have, see `LeanEnv`, if the policy has a lean form, and if all
-        that it observes is written by the env.
+        They have if those of the env have, see `LeanEnv`, if the policy has none but modules of
+        this project, and if all that it observes is written by the env.
 
         Args:
             env: with transforms.
@@ -116,7 +116,8 @@ class LeanSteps:
         """
         return (
             keys is not None
-            and LeanPolicy.covers(policy)
+            and isinstance(policy, Policy)
+            and by_key(policy)
             and LeanEnv.covers(env)
             and set(_observed(policy, keys)) <= set(env.observation_spec.keys(True, True))
         )
@@ -131,7 +132,7 @@ class LeanSteps:
         Args:
             entries: what is read in this step; it gets what the policy writes.
         """
-        after = self.env.step(self.policy.act(entries)["action"], entries)
+        after = self.env.step(self.policy(entries)["action"], entries)
         kept = {key: entries[key] for key in self.before}
         kept |= {key: after[name] for key, name in self.after.items()}
         return kept, self._begun(after)
