@@ -41,7 +41,7 @@ from benchmarks.training import (
     measure_training,
 )
 from coil_rl.config.check import check_parts
-from coil_rl.config.sentences import sentence
+from coil_rl.config.messages import sentence
 from coil_rl.errors import UserError
 from coil_rl.programs.app import program
 from coil_rl.run.folder import versions

@@ -12,7 +12,6 @@ is that of the mean over seeds.
 """
 
 import argparse
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,11 +20,11 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, open_dict
 
-from coil_rl.config.build import assemble
-from coil_rl.config.saved import read_config
+from coil_rl.config.assemble import assemble
+from coil_rl.config.folder import read_config
 from coil_rl.files import write_text
 from coil_rl.report import markdown_table, write_csv
-from coil_rl.report.statistics import mean_interval
+from coil_rl.report.statistics import interval
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.parts import SOME_ROWS, TEST
 from coil_rl.run.policy_batch import PoliciesBeside
@@ -121,18 +120,16 @@ def row_of(label: str, turns: str, missing: float, results: Sequence[Any]) -> di
     def shares(name: str) -> np.ndarray:
         return np.array([np.mean([row[name] for row in each.episodes]) for each in results])
 
-    crashed, low, high = shares("crashed"), math.nan, math.nan
-    if len(crashed) > 1:
-        _, low, high = mean_interval(crashed)
+    crashed = interval(shares("crashed"))
     counts = [sum(bool(row["crashed"]) for row in each.episodes) for each in results]
     return {
         "label": label,
         "missing": missing,
         "turns": turns,
         "seeds": len(results),
-        "crashed": float(crashed.mean()),
-        "low": float(low),
-        "high": float(high),
+        "crashed": crashed.mean,
+        "low": crashed.low,
+        "high": crashed.high,
         "completed": float(shares("completed").mean()),
         "smoothness": float(shares("smoothness").mean()),
         "by_seed": " ".join(map(str, counts)),

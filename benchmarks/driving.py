@@ -23,7 +23,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 import coil_rl.config.schema  # noqa: F401  registers the schema
 from benchmarks.timing import Row, measure, median_ratio, medians, synchronise
 from coil_rl.compiled import compile_steps
-from coil_rl.config.build import build_bare_env, build_guides
+from coil_rl.config.parts import build_bare_env, build_guides
 from coil_rl.envs import (
     Perception,
     SimulatedRobotEnv,

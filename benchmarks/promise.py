@@ -33,7 +33,7 @@ from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.configurations import differing
 from coil_rl.report.curves import points
 from coil_rl.report.runs import GUIDE, RETURN, Run, read_runs
-from coil_rl.report.statistics import mean_interval
+from coil_rl.report.statistics import difference
 
 PPO, ALONE, INTACT, RANDOM = "ppo", "alone", "intact", "random"
 Key = tuple[str, str]  # method and arm
@@ -229,7 +229,7 @@ def _row(arm: Arm, alone: Arm, scale: float) -> dict[str, object]:
     better = of_ppo
     if guide > of_ppo.mean():
         better = np.full(len(seeds), guide)
-    mean, low, high = (100 * each / scale for each in _interval(ends - better))
+    mean, low, high = (100 * each / scale for each in difference(ends, better)[:3])
     curves = [arm.runs[seed].curve for seed in seeds if arm.runs[seed].curve]
     lowest = [_lowest(arm.runs[seed]) for seed in seeds]
     held = [each for each in lowest if not math.isnan(each)]  # their number is in the column `held`
@@ -250,14 +250,6 @@ def _row(arm: Arm, alone: Arm, scale: float) -> dict[str, object]:
         "handed_over": _counted(arm.runs[seed].handed_over for seed in seeds),
         "time": float(np.median([a / b for a, b in seconds if a and b] or [math.nan])),
     }
-
-
-def _interval(values: np.ndarray) -> tuple[float, float, float]:
-    """Return the mean over seeds and its interval, NaN with fewer than two seeds."""
-    if len(values) < 2:
-        return float(values[0]) if len(values) else math.nan, math.nan, math.nan
-    mean, low, high = mean_interval(values)
-    return float(mean), float(low), float(high)
 
 
 def verdict(mean: float, low: float, high: float) -> str:

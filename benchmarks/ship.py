@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from coil_rl.config.pretrained import CARD, CHECKSUMS, LARGEST
+from coil_rl.config.folder import CARD, CHECKSUMS, LARGEST
 from coil_rl.files import write_text
 from coil_rl.plain_yaml import read_yaml, yaml_of
 from coil_rl.record import COMMAND, DELIVERY, SECONDS, VERSIONS
@@ -108,9 +108,7 @@ def card(run: Path, name: str, settings: Mapping[str, Any]) -> str:
         f"deterministic actions, sampled ones {settings['evaluation']['repeats']} a case:",
         markdown_table(numbers, columns),
     ]
-    sentence = handed_over(run)
-    if sentence:
-        parts.append(sentence)
+    parts += handed_over(run)
     parts.append(
         f"`coil-evaluate run=pretrained:{name}` repeats the evaluation; in Python "
         f'`coil_rl.pretrained("{name}").controller()` is the policy with all that belongs to it.'

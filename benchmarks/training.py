@@ -20,13 +20,8 @@ from benchmarks.driving import train_config
 from benchmarks.ppo import PlainPPO
 from benchmarks.timing import Row, Stopwatch, Work, clock_of, measure, median_ratio, medians
 from coil_rl.compiled import compile_steps
-from coil_rl.config.build import (
-    build_bare_env,
-    build_guides,
-    build_learner,
-    env_maker,
-)
 from coil_rl.config.nodes import build
+from coil_rl.config.parts import build_bare_env, build_guides, build_learner, env_maker
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import read_runs

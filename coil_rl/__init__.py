@@ -10,14 +10,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from coil_rl.comparison.compare import compare as compare
+    from coil_rl.config.compose import compose_train as compose_train
+    from coil_rl.config.folder import pretrained_card as pretrained_card
+    from coil_rl.config.folder import pretrained_names as pretrained_names
     from coil_rl.config.learned_guide import LearnedGuide as LearnedGuide
-    from coil_rl.config.load import open_run as open_run
-    from coil_rl.config.load import pretrained as pretrained
     from coil_rl.config.nodes import build as build
-    from coil_rl.config.pretrained import pretrained_card as pretrained_card
-    from coil_rl.config.pretrained import pretrained_names as pretrained_names
-    from coil_rl.config.python import compose_train as compose_train
+    from coil_rl.config.python import open_run as open_run
     from coil_rl.config.python import prepare as prepare
+    from coil_rl.config.python import pretrained as pretrained
     from coil_rl.config.python import train as train
     from coil_rl.config.schema import NodeConfig as NodeConfig
     from coil_rl.config.schema import ProgramConfig as ProgramConfig
@@ -84,7 +85,6 @@ if TYPE_CHECKING:
     from coil_rl.transforms import ResidualAction as ResidualAction
     from coil_rl.transforms import RewardCoupling as RewardCoupling
     from coil_rl.transforms import set_progress as set_progress
-    from coil_rl.worth.comparison import compare as compare
 
 _NAMES = {
     "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv McapReplayEnv SimulatedRobotEnv Track "
@@ -105,10 +105,10 @@ _NAMES = {
     "coil_rl.testing": "check_env check_guide check_transform",
     "coil_rl.run.evaluation": "EvaluationResult evaluate_policy",
     "coil_rl.run.judge": "Evaluation Trial guide_titles",
-    "coil_rl.config.load": "open_run pretrained",
     "coil_rl.config.nodes": "build",
-    "coil_rl.config.pretrained": "pretrained_card pretrained_names",
-    "coil_rl.config.python": "compose_train prepare train",
+    "coil_rl.config.folder": "pretrained_card pretrained_names",
+    "coil_rl.config.compose": "compose_train",
+    "coil_rl.config.python": "open_run prepare pretrained train",
     "coil_rl.config.schema": "NodeConfig ProgramConfig",
     "coil_rl.config.values": "check_values",
     "coil_rl.programs.app": "NoSweepError run_program",
@@ -119,7 +119,7 @@ _NAMES = {
     "coil_rl.run.parts": "EnvMaker",
     "coil_rl.run.run": "Budget Run",
     "coil_rl.config.trust": "trust_packages",
-    "coil_rl.worth.comparison": "compare",
+    "coil_rl.comparison.compare": "compare",
     "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction NormalisedAction "
     "ResidualAction RewardCoupling set_progress",
 }

@@ -16,15 +16,16 @@ from typing import Any
 
 
 def lazy_names(
-    package: str, file: str
+    package: str, file: str, **others: str
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` of a package.
 
     Args:
         package: its name.
         file: its `__init__.py`, whose `from MODULE import NAME as NAME` are read.
+        others: modules by name that it may not import, not even for type checkers.
     """
-    modules: dict[str, str] = {}
+    modules = dict(others)
     for node in ast.walk(ast.parse(Path(file).read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module:
             names = {alias.name for alias in node.names if alias.name == alias.asname}
@@ -33,6 +34,8 @@ def lazy_names(
     def get(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        if modules[name] == package:  # a module of it
+            return importlib.import_module(f"{package}.{name}")
         return getattr(importlib.import_module(modules[name]), name)
 
     return get, lambda: sorted(modules), sorted(modules)

@@ -125,9 +125,7 @@ def summarise(
         episodes: `case`, `reward` and the measures of each.
         measures: by name.
     """
-    cases: dict[str, list[Mapping[str, Any]]] = {}
-    for episode in episodes:
-        cases.setdefault(episode["case"], []).append(episode)
+    cases = _by_case(episodes)
 
     def pool(
         case: str, rows: Sequence[Mapping[str, Any]], shares: Mapping[str, Sequence[float]]
@@ -140,6 +138,13 @@ def summarise(
     rows = [pool(case, group, {}) for case, group in cases.items()]
     shares = {name: [_share(group, name) for group in cases.values()] for name in measures}
     return [*rows, pool(MEAN_CASE, rows, shares)]
+
+
+def _by_case(episodes: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    cases: dict[str, list[Mapping[str, Any]]] = {}
+    for episode in episodes:
+        cases.setdefault(episode["case"], []).append(episode)
+    return cases
 
 
 def _share(episodes: Sequence[Mapping[str, Any]], name: str) -> float:
@@ -159,12 +164,8 @@ def denominators(
     Returns:
         A row for each of `summarise`: `episodes`, and by name the number of those with a number.
     """
-    names = ("reward", *measures)
-    cases: dict[str, list[Mapping[str, Any]]] = {}
-    for episode in episodes:
-        cases.setdefault(episode["case"], []).append(episode)
-    counts = []
-    for group in (*cases.values(), episodes):
+    names, counts = ("reward", *measures), []
+    for group in (*_by_case(episodes).values(), episodes):
         known = {name: sum(not math.isnan(row[name]) for row in group) for name in names}
         counts.append({"episodes": len(group)} | known)
     return counts

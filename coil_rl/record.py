@@ -259,4 +259,3 @@ GUIDE_EPISODES = json_file(
     "guide_episodes.json", GuideEpisodes, "remove it, and they are driven again", LARGEST_TABLE
 )
 SECONDS = json_file("training_time.json", dict[str, float], "remove it, and no time is shown")
-TUNED = json_file("tuned.json", dict[str, float], PUT_BACK)

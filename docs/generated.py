@@ -26,7 +26,7 @@ CONF = ROOT / "conf"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # Headings of the API, by the beginning of the module that defines a name; the first that fits.
 PARTS = {
-    "Runs": ("coil_rl.run", "coil_rl.config", "coil_rl.worth", "coil_rl.measures"),
+    "Runs": ("coil_rl.run", "coil_rl.config", "coil_rl.comparison", "coil_rl.measures"),
     "Envs": ("coil_rl.envs",),
     "Transforms": ("coil_rl.transforms",),
     "Guides": ("coil_rl.guides",),

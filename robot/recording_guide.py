@@ -19,6 +19,7 @@ class RecordingGuide(TensorDictModuleBase):
     """
 
     demonstrates = True
+    remedy = "give env=mcap_replay recording=[FILE,...], see also guide=recorded"
 
     in_keys, out_keys = [RECORDED, "observation"], ["action"]
 

@@ -20,6 +20,16 @@ ROOT = Path(__file__).parents[1]
 CONF = Path(coil_rl.conf.__path__[0])  # of the library that is tested, which may be a wheel
 CONFS = (CONF, Path(coil_robot.conf.__path__[0]))
 
+# Programs of guests, by command.
+GUESTS = {
+    "compare": "coil_rl.comparison.program",
+    "export": "coil_rl.export.program",
+    "demo": "coil_rl.cones.demo",
+    "listen": "coil_studies.listening.program",
+    "drive": "coil_robot.programs.drive",
+    "replay": "coil_robot.programs.replay",
+    "reproduce": "coil_paper.program",
+}
 TRACK = ["track=folder", f"track.dir={ROOT / 'tests' / 'ring.csv'}"]
 LAP = [*TRACK, "env.laps=1", "env.rate=6"]
 SHORT_LAP = [*LAP, "env.time_limit=2"]
@@ -69,9 +79,7 @@ def shipped(group):
 
 def module(name):
     """Return the module of a program."""
-    if name == "reproduce":
-        return "coil_paper.program"
-    return f"{'coil_robot' if name in ('drive', 'replay') else 'coil_rl'}.programs.{name}"
+    return GUESTS.get(name, f"coil_rl.programs.{name}")
 
 
 def command(name, *arguments):

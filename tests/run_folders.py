@@ -13,7 +13,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 import coil_rl.config.schema  # noqa: F401 registers the configuration schema
-from coil_rl.config.build import build_learner, env_maker
+from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.report import write_csv
 from coil_rl.run import checkpoint
 

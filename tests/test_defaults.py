@@ -13,7 +13,7 @@ from programs import CONF
 import coil_paper.conf
 import coil_robot.conf
 
-PROJECT = ("coil_rl.", "coil_paper.", "coil_robot.")
+PROJECT = ("coil_rl.", "coil_paper.", "coil_robot.", "coil_studies.")
 # Folders in which a file changes the defaults of a class for a method or an experiment.
 VARIATION_FOLDERS = ("experiment", "method", "preset", "paper/experiment")
 # Other deliberate variations, by file. A key stands for all keys that begin with it.

@@ -26,16 +26,17 @@ from programs import CONF, ROOT
 import coil_paper
 import coil_rl
 import coil_robot
+import coil_studies
 
 MODULES = [
     module.name
-    for package in (coil_rl, coil_paper, coil_robot)
+    for package in (coil_rl, coil_paper, coil_robot, coil_studies)
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
     if ">>>" in (importlib.util.find_spec(module.name).loader.get_source(module.name) or "")
 ]
 API = (coil_rl, coil_rl.envs, coil_rl.transforms, coil_rl.guides, coil_rl.learners)
-FOLDERS = ("coil_rl", "envs", "transforms", "paper", "benchmarks", "docs")
-TARGET = re.compile(r"_target_: *(coil_rl\.[\w.]+)")
+FOLDERS = ("coil_rl", "envs", "transforms", "paper", "studies", "benchmarks", "docs")
+TARGET = re.compile(r"_target_: *(coil_(?:rl|studies)\.[\w.]+)")
 NAME = re.compile(r"    (\*{0,2}\w[\w, *]*):")
 
 Public = Callable[..., Any]
@@ -71,7 +72,7 @@ def public() -> list[Public]:
             is_class and issubclass(thing, BaseException)
         ):
             continue
-        if thing.__module__.startswith("coil_rl."):
+        if thing.__module__.startswith(("coil_rl.", "coil_studies.")):
             found[f"{thing.__module__}.{thing.__qualname__}"] = thing
     return [found[name] for name in sorted(found)]
 
@@ -83,7 +84,7 @@ def parameters(thing: Public) -> list[inspect.Parameter]:
             function = thing.__new__
         else:
             owner = next(base for base in thing.__mro__ if "__init__" in vars(base))
-            if not owner.__module__.startswith("coil_rl."):
+            if not owner.__module__.startswith(("coil_rl.", "coil_studies.")):
                 return []  # it has no constructor of its own
             function = owner.__init__
         return list(inspect.signature(function).parameters.values())[1:]

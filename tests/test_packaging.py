@@ -20,6 +20,7 @@ LINKS = {
     "coil_rl/transforms": "../transforms",
     "coil_rl/conf": "../conf",
     "coil_paper": "paper",
+    "coil_studies": "studies",
     "coil_robot": "robot",
 }
 
@@ -89,6 +90,7 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
         "coil_rl": [
             "*.py",
             "*.html",
+            "*.j2",
             "*.json",
             "py.typed",
             *(f"policies/**/*{end}" for end in SHIPPED),
@@ -96,8 +98,14 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
         "envs": ["*.py", "*.json", "tracks/**/*.csv"],
     }
     patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"], "paper": ["*.py", "*.yaml"]}
+    patterns["studies"] = ["*.py", "*.yaml"]
     patterns["robot"] = ["*.py", "*.yaml", "*.json"]
-    installed_as = {"coil_rl": "coil_rl", "paper": "coil_paper", "robot": "coil_robot"}
+    installed_as = {
+        "coil_rl": "coil_rl",
+        "paper": "coil_paper",
+        "robot": "coil_robot",
+        "studies": "coil_studies",
+    }
     expected = set()
     for folder, globs in patterns.items():
         package = installed_as.get(folder, f"coil_rl/{folder}")
@@ -119,6 +127,7 @@ def test_wheel_has_three_import_names(wheel: Path) -> None:
     assert {name for name in top if not name.endswith(".dist-info")} == {
         "coil_rl",
         "coil_paper",
+        "coil_studies",
         "coil_robot",
     }
 

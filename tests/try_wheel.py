@@ -36,7 +36,7 @@ NEED_A_CHECKOUT = [
     "test_style.py",
     "test_your_env.py",
 ]
-EXTRAS = "gym,export"  # whose parts the tests use
+EXTRAS = "gym,export,imitate,robot,tensorboard,tune"  # whose parts the tests use
 
 
 def run(*command: str | Path, cwd: Path, **options: Any) -> subprocess.CompletedProcess[str]:

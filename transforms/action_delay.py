@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
 from torchrl.data import Bounded, TensorSpec, Unbounded
 
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.disturbance import Delay
+from coil_rl.transforms.link import State
 
 
 class ActionDelay(Delay):
@@ -51,7 +52,6 @@ class ActionDelay(Delay):
     ) -> None:
         super().__init__(min_lag, max_lag, seed, memory_key)
         self.action_key: NestedKey = nested_key(action_key)
-        self._chosen_key: NestedKey = self._of_memory("chosen")
 
     def _kept(self) -> dict[NestedKey, TensorSpec]:
         # Not the spec of the action, as zeros, which stand for no action yet, need not be one.
@@ -59,44 +59,34 @@ class ActionDelay(Delay):
         kept = Unbounded(spec.shape, device=spec.device, dtype=spec.dtype)
         return {self._of_memory("past"): kept}
 
-    def _memory_spec(self) -> dict[NestedKey, TensorSpec]:
+    @property
+    def state(self) -> Mapping[NestedKey, TensorSpec]:
+        """Lag and age of each row, and the actions on their way."""
+        if not self.max_lag:
+            return {}
         shape, device = (*self.parent.batch_size, 1), self.parent.device
         age = Bounded(0, self.max_lag, shape, device=device, dtype=torch.int64)
-        return {**super()._memory_spec(), self._of_memory("age"): age}
+        return {**super().state, self._of_memory("age"): age}
 
     @cached_property
-    def _empty(self) -> dict[NestedKey, Tensor]:
+    def _empty(self) -> State:
         """The memory at the start of an episode."""
-        return {key: spec.zero() for key, spec in self._memory_spec().items()}
+        return {key: spec.zero() for key, spec in self.state.items()}
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Draw the lags."""
+        return {**self._empty, self._of_memory("lag"): self._drawn(data)} if self.max_lag else {}
+
+    def act(self, data: TensorDictBase, state: State) -> State:
+        """Write the action that takes effect now, and keep the one that was chosen."""
         if not self.max_lag:
-            return tensordict
-        chosen = tensordict[self.action_key]
-        lag, age = tensordict[self._of_memory("lag")], tensordict[self._of_memory("age")]
-        late = self._late(self._values(tensordict, chosen), torch.minimum(lag, age))
-        return tensordict.set(self._chosen_key, chosen).set(self.action_key, late)
-
-    def _values(self, tensordict: TensorDictBase, chosen: Tensor) -> Tensor:
-        """Return the past actions and the one that was chosen, [*batch, max_lag + 1, *A]."""
-        dim = tensordict.ndim
-        return torch.cat([tensordict[self._of_memory("past")], chosen.unsqueeze(dim)], dim)
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if not self.max_lag:
-            return next_tensordict
-        values = self._values(tensordict, tensordict[self._chosen_key])
-        age = (tensordict[self._of_memory("age")] + 1).clamp(max=self.max_lag)
-        next_tensordict.set(self._of_memory("lag"), tensordict[self._of_memory("lag")])
-        next_tensordict.set(self._of_memory("age"), age)
-        past = values.narrow(next_tensordict.ndim, 1, self.max_lag)
-        return next_tensordict.set(self._of_memory("past"), past)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        if not self.max_lag:
-            return tensordict_reset
-        for key, value in self._empty.items():
-            tensordict_reset.set(key, value)
-        return tensordict_reset.set(self._of_memory("lag"), self._drawn(tensordict_reset))
+            return state
+        past, age = self._of_memory("past"), self._of_memory("age")
+        values = torch.cat([state[past], data[self.action_key].unsqueeze(data.ndim)], data.ndim)
+        lag = torch.minimum(state[self._of_memory("lag")], state[age])
+        data.set(self.action_key, self._late(values, lag))
+        return {
+            **state,
+            age: (state[age] + 1).clamp(max=self.max_lag),
+            past: values.narrow(data.ndim, 1, self.max_lag),
+        }

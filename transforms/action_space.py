@@ -26,8 +26,9 @@ from torchrl.data import (
     TensorSpec,
     Unbounded,
 )
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import EnvBase
 
+from coil_rl.transforms.link import Link
 from coil_rl.transforms.normalised_action import ActionUnits, given_units, units_of
 
 Key = TypeVar("Key", NestedKey, NestedKey | None)
@@ -317,6 +318,14 @@ class ActionSpace:
         batch = vectors.shape[: vectors.ndim - 1 - len(self.agents)]
         return best.reshape((*batch, *self.event)).to(self.spec.dtype)
 
+    def executed(self, action: Tensor) -> Tensor:
+        """Return an action of the env [*batch, *A] within its bounds, in the numbering of it."""
+        if self.continuous:
+            return self.clamp(action)
+        if self.first is None:
+            return action
+        return action + self.first.to(action).reshape(self.event)
+
     def _encoded(self, indices: Tensor) -> Tensor:
         """Return the one-hot vectors of indices [..., n] side by side."""
         parts = [
@@ -347,7 +356,7 @@ class ActionSpace:
         return Bounded(low, high, shape, device=device, dtype=self.dtype)
 
 
-class ActionTransform(Transform):
+class ActionTransform(Link):
     """Base class of transforms that use the action of their env."""
 
     action_key: NestedKey
@@ -376,22 +385,6 @@ class ActionTransform(Transform):
         if self.given_units is not None:
             vectors = self.given_units.normalise(vectors)
         return self.action_space.clamp(vectors)
-
-
-class ChosenActionTransform(ActionTransform):
-    """Base class of transforms that use the action that the agent chose.
-
-    Transforms between it and the env may give the env another one, such as a late one.
-    """
-
-    chosen_key: str  # entry for the chosen action, within a step
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set(self.chosen_key, tensordict[self.action_key])
-
-    def chosen_vectors(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the chosen action of a step as vectors of `action_space` [..., A]."""
-        return self.action_space.vectors(tensordict[self.chosen_key])
 
 
 def first_choices(env: EnvBase) -> Tensor | None:

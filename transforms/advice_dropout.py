@@ -1,11 +1,13 @@
 """Dropout of advice: whole episodes without it, so that the policy also learns to act alone."""
 
+from collections.abc import Mapping
+
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
-from torchrl.data import Binary, Composite
+from torchrl.data import Binary, TensorSpec
 
 from coil_rl.transforms.guide_transform import GuideTransform, SeededGenerator
+from coil_rl.transforms.link import State
 
 
 class AdviceDropout(GuideTransform):
@@ -23,6 +25,7 @@ class AdviceDropout(GuideTransform):
     """
 
     written = ("advice_given",)
+    constant = True
 
     def __init__(
         self,
@@ -39,29 +42,26 @@ class AdviceDropout(GuideTransform):
         self.probability, self.in_evaluation = probability, in_evaluation
         self.rng = SeededGenerator(seed)
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        shape = (*self.parent.batch_size, 1)
-        # A number for every row, so that later draws do not depend on which rows are reset.
-        given = self.rng.sample(torch.rand, shape) >= self.probability
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Draw which rows get advice in this episode."""
+        shape = (*data.batch_size, 1)
         if not self.learns:
             given = torch.full(shape, self.in_evaluation)
-        return self._write(tensordict_reset, given.to(self.parent.device))
+        else:
+            # A number for every row, so that later draws do not depend on which rows are reset.
+            given = self.rng.sample(torch.rand, shape) >= self.probability
+        return {"advice_given": given.to(data.device or "cpu")}
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._write(next_tensordict, tensordict["advice_given"])
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write the advice, or zeros where there is none."""
+        advice = data[self.advice_key]
+        shape = (*data.batch_size, *[1] * (advice.ndim - data.ndim))
+        given = state["advice_given"].reshape(shape).to(advice.dtype)
+        data.set(self.advice_key, advice * given)
+        return state
 
-    def _write(self, tensordict: TensorDictBase, given: Tensor) -> TensorDictBase:
-        """Write the advice, or zeros where it is not `given` [*batch, 1]."""
-        advice = tensordict[self.advice_key]
-        shape = (*tensordict.batch_size, *[1] * (advice.ndim - tensordict.ndim))
-        advice = advice * given.reshape(shape).to(advice.dtype)
-        return tensordict.set(self.advice_key, advice).set("advice_given", given)
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add `advice_given`."""
-        observation_spec = super().transform_observation_spec(observation_spec)
+    @property
+    def state(self) -> Mapping[NestedKey, TensorSpec]:
+        """Whether there is advice in this episode."""
         shape, device = (*self.parent.batch_size, 1), self.parent.device
-        observation_spec["advice_given"] = Binary(1, shape=shape, device=device, dtype=torch.bool)
-        return observation_spec
+        return {"advice_given": Binary(1, shape=shape, device=device, dtype=torch.bool)}

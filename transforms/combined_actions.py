@@ -8,7 +8,7 @@ was given is `("next", "executed_action")` [*batch, *A], in the unit of the agen
 learners with replay learn from the executed action where the agent could have chosen it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -18,8 +18,9 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from coil_rl.transforms.action_space import ChoicesError
 from coil_rl.transforms.guide_transform import GuideTransform, Schedule, SeededGenerator
+from coil_rl.transforms.link import State
 
-EXECUTED = "executed_action"
+EXECUTED, WEIGHT, ACTS, REMAINING = "executed_action", "agent_weight", "agent_acts", "guide_steps"
 
 
 class CombinedAction(GuideTransform):
@@ -46,23 +47,24 @@ class CombinedAction(GuideTransform):
         # Steps in training, over all rows.
         self.taken: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        executed = self._executed(tensordict)
+    def act(self, data: TensorDictBase, state: State) -> State:
+        """Write the action to execute."""
+        if self.training:
+            self.taken = self.taken + data.numel()
+        executed = self._executed(data)
         # The transform next to the env is the last one here, so its action remains.
-        return tensordict.set(self.action_key, executed).set(EXECUTED, executed)
+        data.set(self.action_key, executed).set(EXECUTED, executed)
+        return state
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
         """Return the action to execute, [*batch, *A], by the observation and the agent's action."""
         raise NotImplementedError
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self.taken = self.taken + self.training * tensordict.numel()
-        return next_tensordict.set(EXECUTED, tensordict[EXECUTED])
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset.set(EXECUTED, self.action_space.spec.zero())
+    @property
+    def records(self) -> Mapping[NestedKey, TensorSpec]:
+        """The executed action."""
+        spec = self.action_space.spec  # not its own spec, as 0 need not be an action
+        return {EXECUTED: Unbounded(spec.shape, device=self.parent.device, dtype=spec.dtype)}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add what it writes; raises a `ChoicesError` if choices would have to be added."""
@@ -72,12 +74,7 @@ class CombinedAction(GuideTransform):
                 f"{self.action_space.size} discrete ones; use Takeover, which replaces the agent's "
                 "action in some steps"
             )
-        return super().transform_observation_spec(observation_spec).update(self._specs())
-
-    def _specs(self) -> dict[str, TensorSpec]:
-        """Return the specs of what it writes."""
-        spec = self.action_space.spec  # not its own spec, as 0 need not be an action
-        return {EXECUTED: Unbounded(spec.shape, device=self.parent.device, dtype=spec.dtype)}
+        return super().transform_observation_spec(observation_spec)
 
     def _spec_of_rows(
         self, kind: Callable[..., TensorSpec], *bounds: float, dtype: torch.dtype
@@ -182,7 +179,7 @@ class AdaptiveMixedAction(CombinedAction):
         ValueError: for weights that are not in order within [0, 1], or uncertainties not in order.
     """
 
-    written = (EXECUTED, "agent_weight")
+    written = (EXECUTED, WEIGHT)
     adds = True
 
     def __init__(
@@ -209,7 +206,7 @@ class AdaptiveMixedAction(CombinedAction):
         self.warm_up, self.warm_up_high, self.rng = warm_up, warm_up_high, SeededGenerator(seed)
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
-        advice, weight = self.advice(tensordict), tensordict["agent_weight"].squeeze(-1)
+        advice, weight = self.advice(tensordict), tensordict[WEIGHT].squeeze(-1)
         weight = expand_as_right(weight, advice)
         return self.action_space.clamp(weight * tensordict[self.action_key] + (1 - weight) * advice)
 
@@ -225,24 +222,30 @@ class AdaptiveMixedAction(CombinedAction):
         share = (uncertainty - self.certain) / (self.uncertain - self.certain)
         return self.high - (self.high - self.low) * share.clamp(0, 1).to(weight.dtype)
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        doubt = next_tensordict.pop("uncertainty", None)
-        weight = self.weight_after(tensordict["agent_weight"], doubt)
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Return the smallest weight."""
+        space, shape = self.action_space, (*data.batch_size, 1)
+        return {WEIGHT: torch.full(shape, self.low, dtype=space.dtype, device=data.device)}
+
+    def act(self, data: TensorDictBase, state: State) -> State:
+        """Write the action to execute, and return the weight in the next step."""
+        weight = self.weight_after(state[WEIGHT], data.get(("next", "uncertainty"), None))
         if self.learns:
             draw = self.rng.sample(torch.rand, weight.shape).to(weight)
             drawn = self.low + (self.warm_up_high - self.low) * draw
             weight = torch.where((self.taken < self.warm_up).to(weight.device), drawn, weight)
-        return super()._step(tensordict, next_tensordict).set("agent_weight", weight)
+        return {**super().act(data, state), WEIGHT: weight}
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        weight = self.advice(tensordict_reset).new_full((*tensordict_reset.batch_size, 1), self.low)
-        return super()._reset(tensordict, tensordict_reset).set("agent_weight", weight)
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Leave the uncertainty of the step before out, which the policy wrote."""
+        data.pop("uncertainty", None)
+        return state
 
-    def _specs(self) -> dict[str, TensorSpec]:
-        weight = self._spec_of_rows(Bounded, self.low, self.high, dtype=self.action_space.dtype)
-        return super()._specs() | {"agent_weight": weight}
+    @property
+    def state(self) -> Mapping[NestedKey, TensorSpec]:
+        """The weight of the agent."""
+        dtype = self.action_space.dtype
+        return {WEIGHT: self._spec_of_rows(Bounded, self.low, self.high, dtype=dtype)}
 
 
 class _ActionSwitch(CombinedAction):
@@ -255,7 +258,7 @@ class _ActionSwitch(CombinedAction):
         advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
-    written: tuple[str, ...] = (EXECUTED, "agent_acts")
+    written: tuple[str, ...] = (EXECUTED, ACTS)
 
     def __init__(
         self,
@@ -267,10 +270,9 @@ class _ActionSwitch(CombinedAction):
         super().__init__(guide, action_key, advice_key)
         self.rng = SeededGenerator(seed)
 
-    def _draw(self) -> Tensor:
+    def _draw(self, data: TensorDictBase) -> Tensor:
         """Draw a uniform number for every row, so that later draws do not depend on the data."""
-        shape = (*self.parent.batch_size, 1)
-        return self.rng.sample(torch.rand, shape).to(self.parent.device)
+        return self.rng.sample(torch.rand, (*data.batch_size, 1)).to(data.device or "cpu")
 
     def _of_agent(self, tensordict: TensorDictBase) -> Tensor:
         """Return the env's action where the agent acts."""
@@ -282,25 +284,28 @@ class _ActionSwitch(CombinedAction):
             return action
         advice = self.action_space.actions(self.advice(tensordict))
         # `agent_acts` has one more dimension than a discrete action.
-        agent = tensordict["agent_acts"].reshape(tensordict.batch_size)
+        agent = tensordict[ACTS].reshape(tensordict.batch_size)
         return torch.where(expand_as_right(agent, action), action, advice)
 
-    def _agent_acts(self, tensordict: TensorDictBase) -> Tensor:
-        """Return whether the agent acts in a state, [*batch, 1]."""
+    def _agent_acts(self, data: TensorDictBase, state: State) -> Tensor:
+        """Return whether the agent acts in a state, [*batch, 1], in training."""
         raise NotImplementedError
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        after = super()._step(tensordict, next_tensordict)
-        return after.set("agent_acts", self._agent_acts(next_tensordict))
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write whether the agent acts."""
+        if self.learns:
+            acts = self._agent_acts(data, state)
+        else:
+            shape, device = (*data.batch_size, 1), data.device or "cpu"
+            acts = torch.ones(shape, dtype=torch.bool, device=device)
+        data.set(ACTS, acts)
+        return state
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        after = super()._reset(tensordict, tensordict_reset)
-        return after.set("agent_acts", self._agent_acts(tensordict_reset))
-
-    def _specs(self) -> dict[str, TensorSpec]:
-        return super()._specs() | {"agent_acts": self._spec_of_rows(Binary, 1, dtype=torch.bool)}
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add `agent_acts` and what is remembered and recorded."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        observation_spec[ACTS] = self._spec_of_rows(Binary, 1, dtype=torch.bool)
+        return observation_spec
 
 
 class Takeover(_ActionSwitch):
@@ -333,11 +338,8 @@ class Takeover(_ActionSwitch):
         super().__init__(seed, guide, action_key, advice_key)
         self.probability, self.frames = probability, frames
 
-    def _agent_acts(self, tensordict: TensorDictBase) -> Tensor:
-        draw = self._draw()
-        if not self.learns:
-            return torch.ones_like(draw, dtype=torch.bool)
-        agent = draw >= self.current(self.probability)
+    def _agent_acts(self, data: TensorDictBase, state: State) -> Tensor:
+        agent = self._draw(data) >= self.current(self.probability)
         if self.frames is None:
             return agent
         return agent | (self.taken >= self.frames).to(agent.device)
@@ -405,7 +407,8 @@ class JumpStart(_ActionSwitch):
         advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
-    written = (EXECUTED, "agent_acts", "guide_steps")
+    written = (EXECUTED, ACTS, REMAINING)
+    constant = True
 
     def __init__(
         self,
@@ -420,24 +423,26 @@ class JumpStart(_ActionSwitch):
         super().__init__(seed, guide, action_key, advice_key)
         self.horizon, self.random = horizon, random
 
-    def _agent_acts(self, tensordict: TensorDictBase) -> Tensor:
-        return tensordict["guide_steps"] == 0
+    def _agent_acts(self, data: TensorDictBase, state: State) -> Tensor:
+        return state[REMAINING] == 0
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        draw = self._draw()
-        horizon = max(self.current(self.horizon), 0.0) if self.learns else 0.0
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Return the steps of the guide in this episode; none in evaluation."""
+        if not self.learns:
+            zero = torch.zeros((*data.batch_size, 1), dtype=torch.int64)
+            return {REMAINING: zero.to(data.device or "cpu")}
+        draw, horizon = self._draw(data), max(self.current(self.horizon), 0.0)
         if self.random:
             # Rounded down, so that 0, 1 ... horizon are equally likely.
-            steps = (draw * (horizon + 1)).long()
-        else:
-            steps = torch.full_like(draw, horizon).long()
-        return super()._reset(tensordict, tensordict_reset.set("guide_steps", steps))
+            return {REMAINING: (draw * (horizon + 1)).long()}
+        return {REMAINING: torch.full_like(draw, horizon).long()}
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        next_tensordict.set("guide_steps", (tensordict["guide_steps"] - 1).clamp(0))
-        return super()._step(tensordict, next_tensordict)
+    def act(self, data: TensorDictBase, state: State) -> State:
+        """Write the action to execute, and count down."""
+        state = super().act(data, state)
+        return {REMAINING: (state[REMAINING] - 1).clamp(0)} if self.learns else state
 
-    def _specs(self) -> dict[str, TensorSpec]:
-        return super()._specs() | {"guide_steps": self._spec_of_rows(Unbounded, dtype=torch.int64)}
+    @property
+    def state(self) -> Mapping[NestedKey, TensorSpec]:
+        """The remaining steps of the guide."""
+        return {REMAINING: self._spec_of_rows(Unbounded, dtype=torch.int64)}

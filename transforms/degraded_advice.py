@@ -7,7 +7,7 @@ shuffled and removed advice are placebos.
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Literal
 
@@ -15,16 +15,17 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
-from torchrl.envs import Transform
 
-from coil_rl.transforms.action_space import ActionSpace, ChosenActionTransform, nested_key
+from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
+from coil_rl.transforms.link import Link, State
 from coil_rl.transforms.normalised_action import ActionUnits, units_of
 
 LONGEST_DELAY = 10_000  # steps, each of which is kept for every row
+CHOSEN = "action_for_advice"  # entry for the action that the agent chose, within a step
 
 
-class DegradedAdvice(Transform):
+class DegradedAdvice(Link):
     """Base class: applies `degrade` to the advice of all guides.
 
     Advice is degraded in normalised actions, see `ActionUnits`. The result is clamped to the bounds
@@ -37,7 +38,6 @@ class DegradedAdvice(Transform):
         slots: length of the memory; 0 for none.
     """
 
-    needs_past = False  # whether stored data of a single step are not enough
     numbers_only: str | None = None  # its name in conf/degrade if it is not for choices
 
     def __init__(
@@ -56,8 +56,10 @@ class DegradedAdvice(Transform):
         """Return the degraded advice, [*batch, n_guides, A]."""
         raise NotImplementedError(f"{type(self).__name__} must define degrade")
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._write(next_tensordict, self.degrade(self._normalised(next_tensordict)))
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write the degraded advice."""
+        self._write(data, self.degrade(self._normalised(data)))
+        return state
 
     def _normalised(self, tensordict: TensorDictBase) -> Tensor:
         """Return the advice in normalised numbers."""
@@ -65,22 +67,13 @@ class DegradedAdvice(Transform):
         advice = tensordict[self.key]
         return advice if self._units is None else self._units.normalise(advice)
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return self._call(tensordict_reset)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Degrade the advice in stored data.
-
-        Raises:
-            RuntimeError: if the advice depends on previous steps, which stored data lacks.
-        """
-        if self.needs_past:
-            raise RuntimeError(
-                f"{type(self).__name__} needs the previous steps: use it in a TransformedEnv"
-            )
-        return DegradedAdvice._call(self, tensordict)
+    def _missing(self, data: TensorDictBase) -> Tensor:
+        """Return NaN for all numbers of the advice, which the data need not have yet."""
+        if self.key in data.keys(True, True):
+            return torch.full_like(data[self.key], torch.nan)
+        spec = self.parent.full_observation_spec[self.key]
+        shape = (*data.batch_size, *spec.shape[len(self.parent.batch_size) :])
+        return torch.full(shape, torch.nan, dtype=spec.dtype, device=data.device)
 
     def _know_bounds(self) -> None:
         """Find the bounds and the unit of the advice, once: `self.parent` is as slow as a step."""
@@ -109,10 +102,15 @@ class DegradedAdvice(Transform):
             advice = advice.clamp(*self._bounds)
         return tensordict.set(self.key, advice)
 
-    def _memory_spec(self, advice: TensorSpec) -> dict[NestedKey, TensorSpec]:
+    @property
+    def state(self) -> Mapping[NestedKey, TensorSpec]:
+        """The advice of the past, if it has a memory."""
+        if not self.slots:
+            return {}
+        advice = self.parent.full_observation_spec[self.key]
         *batch, guides, size = advice.shape
         memory = advice.unsqueeze(-3).expand(*batch, self.slots, guides, size)
-        return {self.memory_key: memory.clone()} if self.slots else {}
+        return {self.memory_key: memory.clone()}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the memory; raises a `KeyError` without advice."""
@@ -121,17 +119,7 @@ class DegradedAdvice(Transform):
                 f"{type(self).__name__} changes {self.key!r}, but the env writes "
                 f"{sorted(map(str, observation_spec))}; put it behind GuideActions"
             )
-        return observation_spec.update(self._memory_spec(observation_spec[self.key]))
-
-    def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Add the memory, which is an input of resets."""
-        if self.slots:
-            state = input_spec["full_state_spec"] or Composite(
-                shape=input_spec.shape, device=input_spec.device
-            )
-            memory = self._memory_spec(self.parent.full_observation_spec[self.key])
-            input_spec["full_state_spec"] = state.update(memory)
-        return input_spec
+        return super().transform_observation_spec(observation_spec)
 
 
 class BiasedAdvice(DegradedAdvice):
@@ -208,25 +196,35 @@ class _DrawnAdvice(DegradedAdvice):
         key: entry of the advice, [*batch, n_guides, A].
     """
 
+    sample: Callable[..., Tensor]  # draws numbers of a shape with a generator
+
     def __init__(self, seed: int, key: NestedKey) -> None:
         super().__init__(key)
         self.rng = SeededGenerator(seed)
 
-    def _draw(self, sample: Callable[..., Tensor], advice: Tensor, after_reset: bool) -> Tensor:
-        """Draw one random number for each number of the advice, see `SeededGenerator.draw`."""
-        (draws,) = self.rng.draw(sample, [advice.shape], after_reset=after_reset)
-        return draws.to(advice)
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Draw the numbers of the first step, see `SeededGenerator.draw`."""
+        return self._drawn(data, after_reset=reset is not None and "_reset" in reset)
 
-    def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
-        """Return the degraded advice, [*batch, n_guides, A], in a step or after a partial reset."""
+    def sent(self, data: TensorDictBase, state: State) -> State:
+        """Draw the numbers of the next step."""
+        return self._drawn(data)
+
+    def _drawn(self, data: TensorDictBase, *, after_reset: bool = False) -> State:
+        """Draw one number for each number of the advice."""
+        shape = self._missing(data).shape
+        (draws,) = self.rng.draw(self.sample, [shape], after_reset=after_reset)
+        return {"draws": draws}
+
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write the degraded advice; the state is what was drawn for it."""
+        advice = self._normalised(data)
+        self._write(data, self.changed(advice, state["draws"].to(advice)))
+        return {}
+
+    def changed(self, advice: Tensor, draws: Tensor) -> Tensor:
+        """Return the degraded advice, [*batch, n_guides, A], by the numbers that were drawn."""
         raise NotImplementedError
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        after_reset = tensordict.get("_reset", None) is not None
-        advice = self._normalised(tensordict_reset)
-        return self._write(tensordict_reset, self.degrade(advice, after_reset))
 
 
 class NoisyAdvice(_DrawnAdvice):
@@ -238,15 +236,17 @@ class NoisyAdvice(_DrawnAdvice):
         key: entry of the advice, [*batch, n_guides, A].
     """
 
+    sample = staticmethod(torch.randn)
+
     def __init__(self, sigma: float = 0.3, seed: int = 0, key: NestedKey = "guide_action") -> None:
         super().__init__(seed, key)
         if not 0 <= sigma < math.inf:
             raise ValueError(f"sigma={sigma} must be a finite number of at least 0")
         self.sigma = sigma
 
-    def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
+    def changed(self, advice: Tensor, draws: Tensor) -> Tensor:
         """Return advice + noise."""
-        return torch.add(advice, self._draw(torch.randn, advice, after_reset), alpha=self.sigma)
+        return torch.add(advice, draws, alpha=self.sigma)
 
 
 class RandomAdvice(_DrawnAdvice):
@@ -259,6 +259,8 @@ class RandomAdvice(_DrawnAdvice):
         key: entry of the advice, [*batch, n_guides, A].
     """
 
+    sample = staticmethod(torch.rand)
+
     def __init__(
         self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action"
     ) -> None:
@@ -267,9 +269,8 @@ class RandomAdvice(_DrawnAdvice):
             raise ValueError(f"low={low} must be less than high={high}, and both finite")
         self.low, self.range = low, high - low
 
-    def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
+    def changed(self, advice: Tensor, draws: Tensor) -> Tensor:
         """Return random numbers."""
-        draws = self._draw(torch.rand, advice, after_reset)
         if self._choices is not None:
             return self._choices.random(draws).to(advice)
         return self.low + self.range * draws
@@ -314,19 +315,25 @@ class ShuffledAdvice(DegradedAdvice):
                 "use more"
             )
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        next_tensordict.set(self.memory_key, next_tensordict[self.key].unsqueeze(-3))
-        return super()._call(next_tensordict)
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Return the advice of all rows in the step before, in a partial reset."""
+        mask = None if reset is None else reset.get("_reset", None)
+        if reset is None or mask is None or mask.all() or self.memory_key not in reset.keys(True):
+            return {}
+        return {"previous": reset[self.memory_key].squeeze(-3)}
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        mask, previous = tensordict.get("_reset", None), tensordict.get(self.memory_key, None)
-        if mask is None or previous is None or mask.all():
-            return self._call(tensordict_reset)
-        tensordict_reset.set(self.memory_key, tensordict_reset[self.key].unsqueeze(-3))
-        shuffled = self.degrade(previous.squeeze(-3))
-        return tensordict_reset.set(self.key, shuffled)
+    def sent(self, data: TensorDictBase, state: State) -> State:
+        """Forget the advice: what is shuffled is that of the step."""
+        return {}
+
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write the advice for other rows, and return the original one."""
+        advice = data[self.key]
+        if "previous" in state:
+            data.set(self.key, self.degrade(state["previous"]))
+        else:
+            self._write(data, self.degrade(self._normalised(data)))
+        return {self.memory_key: advice.unsqueeze(-3)}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the memory."""
@@ -356,23 +363,24 @@ class DelayedAdvice(DegradedAdvice):
             raise ValueError(f"steps={steps} must be at least 0 and at most {LONGEST_DELAY}")
         super().__init__(key, memory_key, steps)
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        if self.slots:
-            first = tensordict_reset[self.key].unsqueeze(-3)
-            tensordict_reset.set(self.memory_key, first.repeat_interleave(self.slots, -3))
-        return tensordict_reset
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Return that nothing was advised before, as NaN; the first advice takes its place."""
         if not self.slots:
-            return next_tensordict
-        memory, newest = tensordict[self.memory_key], next_tensordict[self.key].unsqueeze(-3)
-        next_tensordict.set(self.memory_key, torch.cat([memory[..., 1:, :, :], newest], -3))
-        return next_tensordict.set(self.key, memory[..., 0, :, :])
+            return {}
+        missing = self._missing(data).unsqueeze(-3)
+        return {self.memory_key: missing.repeat_interleave(self.slots, -3)}
+
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write the oldest advice, and keep the new one."""
+        if not self.slots:
+            return state
+        newest, memory = data[self.key].unsqueeze(-3), state[self.memory_key]
+        memory = torch.where(memory.isnan(), newest, memory)
+        data.set(self.key, memory[..., 0, :, :])
+        return {self.memory_key: torch.cat([memory[..., 1:, :, :], newest], -3)}
 
 
-class RemovedAdvice(DegradedAdvice, ChosenActionTransform):
+class RemovedAdvice(DegradedAdvice, ActionTransform):
     """Placebo: the agent's previous action in place of the advice; zeros in the first step.
 
     It is the action that the agent chose, also where actions take effect later.
@@ -382,21 +390,29 @@ class RemovedAdvice(DegradedAdvice, ChosenActionTransform):
         action_key: entry of the action; a discrete action becomes one-hot.
     """
 
-    chosen_key = "action_for_advice"
+    passed = (CHOSEN,)
     needs_past = True
 
     def __init__(self, key: NestedKey = "guide_action", action_key: NestedKey = "action") -> None:
         super().__init__(key)
         self.action_key = nested_key(action_key)
 
-    def degrade(self, advice: Tensor) -> Tensor:
-        """Return zeros, for the first step."""
-        return torch.zeros_like(advice)
+    def act(self, data: TensorDictBase, state: State) -> State:
+        """Keep the action that was chosen, in normalised numbers."""
+        vectors = self.action_space.vectors(data[self.action_key])
+        return {CHOSEN: self.action_space.normalise(vectors)}
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        action = self.action_space.normalise(self.chosen_vectors(tensordict))
-        advice = next_tensordict[self.key]
-        return self._write(next_tensordict, action.to(advice.dtype).unsqueeze(-2).expand_as(advice))
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Return zeros."""
+        space = self.action_space
+        shape = (*data.batch_size, *space.agents, space.size)
+        return {CHOSEN: torch.zeros(shape, dtype=space.dtype, device=data.device)}
+
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write the action of the step before as advice."""
+        advice = data[self.key]
+        self._write(data, state[CHOSEN].to(advice.dtype).unsqueeze(-2).expand_as(advice))
+        return {}
 
 
 @cache

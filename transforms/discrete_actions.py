@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from torchrl.data import Bounded, Categorical, Composite
 
 from coil_rl.transforms.action_space import ActionSpace, ActionTransform
+from coil_rl.transforms.link import State
 
 
 class DiscreteActions(ActionTransform):
@@ -103,29 +104,22 @@ class DiscreteActions(ActionTransform):
         values = torch.tensor(self.choices, dtype=spec.dtype, device=spec.device)
         return values if self.given_units is None else self.given_units.normalise(values)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Discretise the advice in stored data of any batch size."""
-        return self._call(tensordict)
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        numbers = next_tensordict.get(self.advice_key, None)
-        if numbers is None:
-            return next_tensordict
-        nearest = (numbers - self.values).abs().argmin(-1)  # of two the lower one
-        choices = F.one_hot(nearest, len(self.values)).to(numbers.dtype)
-        return next_tensordict.set(self.number_key, numbers).set(self.advice_key, choices)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return self._call(tensordict_reset)
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        numbers = tensordict.get(self.number_key, None)
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write the advice as the nearest choices, one-hot, and as numbers, where there is any."""
+        numbers = data.get(self.advice_key, None)
         if numbers is not None:
-            tensordict.set(self.advice_key, numbers)
-        chosen = self.values[tensordict[self.action_key]]
-        return tensordict.set(self.action_key, chosen.unsqueeze(-1))
+            nearest = (numbers - self.values).abs().argmin(-1)  # of two the lower one
+            choices = F.one_hot(nearest, len(self.values)).to(numbers.dtype)
+            data.set(self.number_key, numbers).set(self.advice_key, choices)
+        return state
+
+    def act(self, data: TensorDictBase, state: State) -> State:
+        """Write the number of the choice, and the advice as numbers again."""
+        numbers = data.get(self.number_key, None)
+        if numbers is not None:
+            data.set(self.advice_key, numbers)
+        data.set(self.action_key, self.values[data[self.action_key]].unsqueeze(-1))
+        return state
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Replace the action spec."""

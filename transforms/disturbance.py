@@ -13,15 +13,16 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import EnvBase
 
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
+from coil_rl.transforms.link import Link
 
 LONGEST_LAG = 10_000  # steps, each of which is kept for every row
 
 
-class Disturbance(Transform):
+class Disturbance(Link):
     """Base class of transforms that disturb observations or actions.
 
     Attributes:
@@ -58,6 +59,8 @@ class Delay(Disturbance):
         TypeError: for a delay that is not a whole number.
         ValueError: for a negative or too long delay, and for `min_lag` above `max_lag`.
     """
+
+    needs_past = True
 
     def __init__(self, min_lag: int, max_lag: int, seed: int, memory_key: NestedKey) -> None:
         for name, lag in (("min_lag", min_lag), ("max_lag", max_lag)):
@@ -101,11 +104,14 @@ class Delay(Disturbance):
         index = (self.max_lag - lag).reshape(*lag.shape, *(1 for _ in rest))
         return values.gather(dim, index.expand(*lag.shape, *rest)).squeeze(dim)
 
-    def _memory_spec(self) -> dict[NestedKey, TensorSpec]:
-        """Return the specs of the memory by key."""
+    @property
+    def state(self) -> Mapping[NestedKey, TensorSpec]:
+        """The lag of each row and its past."""
+        if not self.max_lag:
+            return {}
         shape, device = (*self.parent.batch_size, 1), self.parent.device
         lag = Bounded(0, self.max_lag, shape, device=device, dtype=torch.int64)
-        specs = {self._of_memory("lag"): lag}
+        specs: dict[NestedKey, TensorSpec] = {self._of_memory("lag"): lag}
         dim = len(self.parent.batch_size)
         for key, spec in self._kept().items():
             size = (*spec.shape[:dim], self.max_lag, *spec.shape[dim:])
@@ -130,19 +136,4 @@ class Delay(Disturbance):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the memory; raises a `ValueError` if it cannot be kept."""
         self._check_env(observation_spec)
-        return observation_spec.update(self._memory_spec()) if self.max_lag else observation_spec
-
-    def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Add the memory, which is an input of steps."""
-        if self.max_lag:
-            state = input_spec["full_state_spec"] or Composite(
-                shape=input_spec.shape, device=input_spec.device
-            )
-            input_spec["full_state_spec"] = state.update(self._memory_spec())
-        return input_spec
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Raise a `RuntimeError`: stored data do not have the steps before."""
-        raise RuntimeError(
-            f"{type(self).__name__} needs the previous steps: use it in a TransformedEnv"
-        )
+        return super().transform_observation_spec(observation_spec)

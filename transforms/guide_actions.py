@@ -13,10 +13,10 @@ from functools import cached_property, partial
 from typing import ClassVar
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import Composite
+from torchrl.data import Composite, TensorSpec
 from torchrl.envs import EnvBase, Transform
 
 from coil_rl.transforms.action_space import (
@@ -28,6 +28,8 @@ from coil_rl.transforms.action_space import (
     space_of,
 )
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
+from coil_rl.transforms.hosted import HostedGuide, ToldGuide
+from coil_rl.transforms.link import State
 from coil_rl.transforms.normalised_action import ActionUnits
 
 
@@ -51,8 +53,7 @@ def unfit_action(
 ) -> Exception:
     """Return the error for the action of a guide that does not fit the env.
 
-    A guide with a method `unfit(action, batch, space, problem)` returns its own error, so that a
-    controller is told what it returned itself, which has no batch.
+    That of a controller tells what it returned itself, which has no batch.
 
     Args:
         name: of the guide.
@@ -62,10 +63,10 @@ def unfit_action(
         space: of its actions.
         problem: says why, as the end of a sentence.
     """
-    if hasattr(guide, "unfit"):
-        error: Exception = guide.unfit(action, batch, space, problem)  # type: ignore[operator]
-        return error
-    return UnfitActionError(name, problem)
+    own = None
+    if isinstance(guide, HostedGuide):
+        own = guide.unfit(action, batch, space, problem)
+    return own or UnfitActionError(name, problem)
 
 
 @dataclass(frozen=True)
@@ -83,9 +84,6 @@ class Ended:
 
 class Guides(TensorDictModuleBase):
     """Several guides as one module that writes their actions side by side.
-
-    A guide with the attribute `by_row = True` has one object for each row, and no memory in the
-    data. It is not asked after the end of an episode: rows that have ended keep their last advice.
 
     Args:
         guides: name to guide, in the order of the rows of the advice.
@@ -158,7 +156,7 @@ class Guides(TensorDictModuleBase):
         self,
         tensordict: TensorDictBase,
         convert: Callable[[str, Tensor, torch.Size], Tensor] | None = None,
-        memory: TensorDictBase | None = None,
+        memory: State | None = None,
         ended: Ended | None = None,
     ) -> Tensor:
         """Return the advice [*batch, n_guides, A].
@@ -166,20 +164,23 @@ class Guides(TensorDictModuleBase):
         Args:
             tensordict: observations; each guide gets a copy of its own entries.
             convert: applied to name, action and batch of each guide.
-            memory: by guide; replaced by what the guides remember for the next step.
+            memory: of the guides; replaced by what they remember for the next step.
             ended: rows for which guides with `by_row` are not asked.
         """
         rows = []
         for number, (name, guide) in enumerate(self.guides.items()):
-            by_row = getattr(guide, "by_row", False)
-            if ended is None or not by_row or not ended.rows.any():
+            if ended is None or not _is_by_row(guide) or not ended.rows.any():
                 rows.append(self._asked(name, tensordict, convert, memory))
                 continue
             advice = ended.advice.select(-2, number)
             if not ended.rows.all():
-                running = ~ended.rows
-                new = self._asked(name, tensordict[running], convert, memory)
-                advice = advice.index_put((running,), new)
+                running = (~ended.rows,)
+                own = {key: value[running] for key, value in (memory or {}).items()}
+                new = self._asked(name, tensordict[running], convert, own)
+                advice = advice.index_put(running, new)
+                if memory is not None:
+                    for key, value in own.items():
+                        memory[key] = memory[key].index_put(running, value)
             rows.append(advice)
         return torch.stack(rows, -2)
 
@@ -188,15 +189,15 @@ class Guides(TensorDictModuleBase):
         name: str,
         tensordict: TensorDictBase,
         convert: Callable[[str, Tensor, torch.Size], Tensor] | None,
-        memory: TensorDictBase | None,
+        memory: State | None,
     ) -> Tensor:
         """Return the advice of a guide [*batch, A]; the arguments are those of `advice`."""
         data = tensordict.select(*self._in_keys_of[name], strict=False)
         if name in self._input_dtype:
             data = data.apply(partial(_converted, dtype=self._input_dtype[name]))
         if memory is not None and name in self.memories:
-            data = self.guides[name](data.update(memory[name]))
-            memory.set(name, data["next"].select(*self.memories[name].specs))
+            data = self.guides[name](self.memories[name].given_to(data, memory))
+            self.memories[name].kept(data, memory)
         else:
             data = self.guides[name](data)
         action: Tensor = data[self.action_key]
@@ -205,18 +206,13 @@ class Guides(TensorDictModuleBase):
     def tell(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Tell the guides that ask for it about their env.
 
-        A guide asks by a method `in_space`, which actions there are, or `reads_choices`, how to
-        read choices as the env gives them.
-
         Args:
             space: of the actions of the guides.
             choices: what converts one-hot entries to the numbering of the env, by entry.
         """
         for guide in self.guides.values():
-            if hasattr(guide, "in_space"):
-                guide.in_space(space)  # type: ignore[operator]
-            if hasattr(guide, "reads_choices"):
-                guide.reads_choices(choices)  # type: ignore[operator]
+            if isinstance(guide, ToldGuide):
+                guide.meet(space, choices)
 
     def match_dtypes(self, tensordict: TensorDictBase) -> None:
         """Convert from here on what a guide reads to the dtype of its parameters.
@@ -230,6 +226,10 @@ class Guides(TensorDictModuleBase):
             of_entries = {each.dtype for each in read if each.is_floating_point()}
             if len(of_guide) == 1 and of_entries - of_guide:
                 self._input_dtype[name] = of_guide.pop()
+
+
+def _is_by_row(guide: nn.Module) -> bool:
+    return isinstance(guide, HostedGuide) and guide.by_row
 
 
 def _check_guide(name: str, guide: TensorDictModuleBase, action_key: NestedKey) -> None:
@@ -336,8 +336,11 @@ class GuideActions(ActionTransform):
         self.supplied = [key for key in SUPPLIED if key in module.in_keys]
         super().__init__(in_keys=module.in_keys, out_keys=module.out_keys)
         self.guides, self.action_key = module.eval(), module.action_key
+        self.needs_past = bool(self.supplied or module.memories)
         pure = all(getattr(guide, "pure", False) for guide in guides.values())
         self._cache = GuideCache() if pure and not self.needs_past else None
+        if any(map(_is_by_row, guides.values())):
+            self.passed = (self.out_keys[0],)
         self._checked: set[str] = set()
         self.calls = 0  # number of actions that guides were asked for
 
@@ -366,11 +369,6 @@ class GuideActions(ActionTransform):
         """Names of the guides, one per row of the advice."""
         return self.guides.names
 
-    @property
-    def needs_past(self) -> bool:
-        """Whether a guide depends on earlier steps."""
-        return bool(self.supplied or self.guides.memories)
-
     def set_container(self, container: Transform | EnvBase) -> None:
         """Set the env, which may have other rows than an earlier one."""
         super().set_container(container)
@@ -398,43 +396,63 @@ class GuideActions(ActionTransform):
                 f"{', '.join(self.names)}"
             )
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the advice for stored data; a `ValueError` if a guide depends on earlier steps."""
-        if self.needs_past:
-            raise ValueError(
-                f"the guides {', '.join(self.names)} need the previous steps, which stored data do "
-                "not have; use them in a TransformedEnv"
-            )
-        return self._call(tensordict)
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict.set(self.out_keys[0], self._advice(next_tensordict))
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Return the memory of the guides at the start of episodes."""
         if not self.needs_past:
-            return self._call(next_tensordict)
-        # The data of the step hold the action as the env got it, after the transforms.
-        action = self.given_space.clamp(self.given_space.vectors(tensordict[self.action_key]))
-        data = next_tensordict.select(*self.in_keys, strict=False)
-        memory = tensordict.select(*(("guide_state", name) for name in self.guides.memories))
-        ended = self._ended(tensordict, next_tensordict)
-        advice, memory = self._advice_with_past(data, memory, self.rows, action, ended)
-        return self._write(next_tensordict, advice, memory)
+            return {}
+        state: State = {}
+        for memory in self.guides.memories.values():
+            state |= memory.start(data.batch_size, data.device)
+        space, device = self.given_space, data.device or "cpu"
+        size = (*data.batch_size, *space.agents, space.size)
+        action = torch.zeros(size, dtype=space.dtype, device=device)
+        return state | self._supplied(data.batch_size, action, begins=True)
 
-    def _ended(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Ended | None:
+    def sent(self, data: TensorDictBase, state: State) -> State:
+        """Add the action that the env was given to what the guides remember."""
+        if not self.needs_past:
+            return state
+        action = self.given_space.clamp(self.given_space.vectors(data[self.action_key]))
+        return state | self._supplied(data.batch_size, action, begins=False)
+
+    def _supplied(self, batch: torch.Size, action: Tensor, *, begins: bool) -> State:
+        """Return what the guides may read besides the entries of the env and their memory.
+
+        Args:
+            batch: of the data.
+            action: the last one of the env.
+            begins: whether this is the first step of an episode.
+        """
+        is_init = torch.full((*batch, 1), begins, device=action.device)
+        supplied: State = {"is_init": is_init, "last_action": action}
+        return {key: supplied[key] for key in self.supplied if key in supplied}
+
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write the advice, and return the memory of the guides."""
+        if not self.needs_past:
+            data.set(self.out_keys[0], self._advice(data))
+            return {}
+        read = data.select(*self.in_keys, strict=False)
+        for key in self.supplied:
+            if key not in read:  # an entry of the env comes first
+                read.set(key, state.get(key, self.rows))
+        own = (memory.key(key) for memory in self.guides.memories.values() for key in memory.specs)
+        memory = {key: state[key] for key in own}
+        ended = self._ended(data, state.get(self.out_keys[0], None))
+        data.set(self.out_keys[0], self._advice(read, memory, ended))
+        return memory
+
+    def _ended(self, data: TensorDictBase, advice: Tensor | None) -> Ended | None:
         """Return the rows that need no advice after a step; None where that is not known.
 
         In training a critic may read the advice after the last step of a truncated episode.
 
         Args:
-            tensordict: before the step.
-            next_tensordict: after it.
+            data: after the step.
+            advice: before it.
         """
-        if not any(getattr(guide, "by_row", False) for guide in self.guides.guides.values()):
-            return None
-        rows = next_tensordict.get("terminated" if self.training else "done", None)
-        advice, batch = tensordict.get(self.out_keys[0], None), next_tensordict.batch_size
-        if rows is None or advice is None or rows.numel() != batch.numel():
+        rows, batch = data.get("terminated" if self.training else "done", None), data.batch_size
+        if advice is None or rows is None or rows.numel() != batch.numel():
             return None
         return Ended(rows.reshape(batch), advice)
 
@@ -443,46 +461,30 @@ class GuideActions(ActionTransform):
     ) -> TensorDictBase:
         mask = tensordict.get("_reset", None)
         if mask is None or mask.all():
-            if not self.needs_past:
-                return self._call(tensordict_reset)
-            data = tensordict_reset.select(*self.in_keys, strict=False)
-            advice, memory = self._advice_with_past(data, None, self.rows)
-            return self._write(tensordict_reset, advice, memory)
+            return super()._reset(tensordict, tensordict_reset)
         # TorchRL discards the other rows; in a large batch nearly every step resets a few rows.
         rows: tuple[Tensor, ...] = mask.reshape(tensordict.batch_size).nonzero(as_tuple=True)
-        data, memory = tensordict_reset.select(*self.in_keys, strict=False)[rows], None
-        if self.needs_past:
-            advice, memory = self._advice_with_past(data, None, self.rows[rows])
-        elif self._cache is not None:
+        data = tensordict_reset.select(*self.in_keys, strict=False)[rows]
+        written: State = {}
+        if self._cache is not None:
             before = self.calls
-            advice = self._cache(data, self._advice)
+            data.set(self.out_keys[0], self._cache(data, self._advice))
             # What is kept counts too: a process that resumes the run has kept nothing yet.
             self.calls = before + data.numel() * len(self.names)
         else:
-            advice = self._advice(data)
-
-        def full(part: Tensor) -> Tensor:
+            state = self.first(data)
+            written = self.observe(data, {**state, "row": self.rows[rows]})
+        written[self.out_keys[0]] = data[self.out_keys[0]]
+        for key, part in written.items():
             whole = part.new_zeros((*tensordict_reset.batch_size, *part.shape[1:]))
-            return whole.index_put(rows, part)
-
-        if memory is not None:
-            memory = memory.apply(full, batch_size=tensordict_reset.batch_size)
-        return self._write(tensordict_reset, full(advice), memory)
-
-    def _write(
-        self, tensordict: TensorDictBase, advice: Tensor, memory: TensorDictBase | None
-    ) -> TensorDictBase:
-        """Write the advice and, if there is one, the memory of the guides."""
-        if memory is not None:
-            for name in self.guides.memories:
-                tensordict.set(("guide_state", name), memory[name])
-        return tensordict.set(self.out_keys[0], advice)
+            tensordict_reset.set(key, whole.index_put(rows, part))
+        return tensordict_reset
 
     @torch.no_grad()
     def _advice(
         self,
         tensordict: TensorDictBase,
-        memory: TensorDictBase | None = None,
+        memory: State | None = None,
         ended: Ended | None = None,
     ) -> Tensor:
         """Return the advice within the bounds of the action; the memory is replaced by the next."""
@@ -491,58 +493,26 @@ class GuideActions(ActionTransform):
             self.guides.tell(self.guide_space, observed_choices(self.parent.base_env))
         return self.guides.advice(tensordict, self._fitted, memory, ended)
 
-    def _advice_with_past(
-        self,
-        data: TensorDictBase,
-        memory: TensorDictBase | None,
-        rows: Tensor,
-        action: Tensor | None = None,
-        ended: Ended | None = None,
-    ) -> tuple[Tensor, TensorDictBase]:
-        """Return the advice of guides that depend on earlier steps, and their memory.
-
-        Args:
-            data: what the guides read of the env, [*batch].
-            memory: what they wrote in the step before; None for the first step of episodes.
-            rows: numbers of the rows, [*batch, 1].
-            action: the last action that the env was given, as vectors [*batch, *agents, A]; None
-                for the first step.
-            ended: rows that need no advice.
-        """
-        batch = data.batch_size
-        state = TensorDict({}, batch, device=data.device)
-        for name, own in self.guides.memories.items():
-            if memory is None:
-                state.set(name, own.start(batch, data.device))
-            else:
-                state.set(name, memory["guide_state", name])
-        if action is None:
-            space = self.given_space
-            action = rows.new_zeros((*batch, *space.agents, space.size), dtype=space.dtype)
-        is_init = torch.full_like(rows, memory is None, dtype=torch.bool)
-        supplied = {"is_init": is_init, "row": rows, "last_action": action}
-        for key in self.supplied:
-            if key not in data:  # an entry of the env comes first
-                data.set(key, supplied[key])
-        return self._advice(data, state, ended), state
-
     def _fitted(self, name: str, action: Tensor, batch: torch.Size) -> Tensor:
         """Return the action of a guide within the bounds.
 
-        It is checked in the first step; that of a guide with the attribute `foreign`, the code of
-        somebody else, in every step.
+        It is checked in the first step; that of a `HostedGuide` in every step.
         """
-        self.calls += batch.numel()
         guide = self.guides.guides[name]
         try:
-            foreign = getattr(guide, "foreign", False)
-            # An exported function cannot raise.
-            if (name not in self._checked or foreign) and not torch.compiler.is_exporting():
-                self.guide_space.check_advice(action, batch)
-                self._checked.add(name)
+            # An exported function can neither count nor raise.
+            if not torch.compiler.is_exporting():
+                self.calls += batch.numel()
+                if name not in self._checked or isinstance(guide, HostedGuide):
+                    self.guide_space.check_advice(action, batch)
+                    self._checked.add(name)
             advice = self.guide_space.advice(action, batch)
         except ValueError as error:
             raise unfit_action(name, guide, action, batch, self.guide_space, str(error)) from None
+        return self.observed(advice)
+
+    def observed(self, advice: Tensor) -> Tensor:
+        """Return advice in the unit of the env as the agent sees it."""
         if self.given_units is None:
             return advice
         return self.action_space.clamp(self.given_units.normalise(advice))
@@ -555,25 +525,19 @@ class GuideActions(ActionTransform):
         """
         advice = self.action_space.advice_spec(self.parent.batch_size, len(self.names))
         observation_spec[self.out_keys[0]] = advice
-        return self._add_memory(observation_spec)
-
-    def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Add the memory, which is an input of steps."""
-        if self.guides.memories:
-            state = input_spec["full_state_spec"] or Composite(
-                shape=input_spec.shape, device=input_spec.device
-            )
-            input_spec["full_state_spec"] = self._add_memory(state)
-        return input_spec
-
-    def _add_memory(self, spec: Composite) -> Composite:
-        """Add the memory of the guides to a spec."""
-        for name, memory in self.guides.memories.items():
-            if ("guide_state", name) in spec.keys(True):
+        for name in self.guides.memories:
+            if ("guide_state", name) in observation_spec.keys(True):
                 raise ValueError(f"two guides {name!r} have a memory; give them different names")
             if "_reset" not in self.parent.reset_keys:
                 raise ValueError(
                     f"guide {name!r} has a memory, but the env resets its agents one by one"
                 )
-            spec["guide_state", name] = memory.spec(self.parent.batch_size, self.parent.device)
-        return spec
+        return super().transform_observation_spec(observation_spec)
+
+    @property
+    def state(self) -> Mapping[NestedKey, TensorSpec]:
+        """The memory of the guides."""
+        specs: dict[NestedKey, TensorSpec] = {}
+        for memory in self.guides.memories.values():
+            specs |= memory.spec(self.parent.batch_size, self.parent.device)
+        return specs

@@ -5,11 +5,13 @@ number of rows, and a restored env restores its guides.
 """
 
 import torch
-from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import Composite
+from torchrl.data import TensorSpec
 from torchrl.envs import Compose
 from torchrl.modules.utils import get_primers_from_module
+
+from coil_rl.transforms.link import State
 
 SUPPLIED = ("is_init", "row", "last_action")  # what a guide may read besides the entries of the env
 
@@ -37,6 +39,7 @@ class GuideMemory:
             parts = [primers] if primers else []
         nested = [key for key in guide.out_keys if isinstance(key, tuple)]
         written = {unravel_key(key[1:]) for key in nested if key[0] == "next"}
+        self.name = name
         self.specs, self.first = {}, {}
         for primer in parts:
             if primer.random or primer.single_default_value:
@@ -56,20 +59,34 @@ class GuideMemory:
                 "nothing says how they begin; give it make_tensordict_primer()"
             )
 
-    def spec(self, batch: torch.Size, device: torch.device | None) -> Composite:
-        """Return the spec of the memory of all rows of an env, by their batch size and device."""
-        rows = {key: row.to(device) if device else row for key, row in self.specs.items()}
-        specs = {key: row.expand(*batch, *row.shape) for key, row in rows.items()}
-        return Composite(specs, shape=batch, device=device)
+    def key(self, key: NestedKey) -> NestedKey:
+        """Return under which key an entry of the memory is in the data of an env."""
+        return ("guide_state", self.name, *((key,) if isinstance(key, str) else key))
 
-    def start(self, batch: torch.Size, device: torch.device | None) -> TensorDictBase:
+    def spec(self, batch: torch.Size, device: torch.device | None) -> dict[NestedKey, TensorSpec]:
+        """Return the specs of the memory of all rows of an env, by their batch size and device."""
+        rows = {key: row.to(device) if device else row for key, row in self.specs.items()}
+        return {self.key(key): row.expand(*batch, *row.shape) for key, row in rows.items()}
+
+    def start(self, batch: torch.Size, device: torch.device | None) -> State:
         """Return the memory at the start of episodes."""
-        memory = TensorDict({}, batch, device=device)
+        memory: State = {}
         for key, spec in self.specs.items():
             first = self.first[key]
             if callable(first):
-                value = first()
+                value = first().to(device or "cpu")
             else:
                 value = torch.full(spec.shape, first, dtype=spec.dtype, device=device)
-            memory.set(key, value.expand(*batch, *spec.shape).clone())
+            memory[self.key(key)] = value.expand(*batch, *spec.shape).clone()
         return memory
+
+    def given_to(self, data: TensorDictBase, memory: State) -> TensorDictBase:
+        """Write what the guide reads of its memory."""
+        for key in self.specs:
+            data.set(key, memory[self.key(key)])
+        return data
+
+    def kept(self, data: TensorDictBase, memory: State) -> None:
+        """Replace the memory by what the guide has written for its next step."""
+        for key in self.specs:
+            memory[self.key(key)] = data["next", key]

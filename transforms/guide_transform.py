@@ -41,12 +41,12 @@ class GuideTransform(ActionTransform):
     ) -> None:
         if guide < 0:
             raise ValueError(f"guide={guide} must be at least 0: it is a row of the advice")
-        super().__init__(in_keys=[], out_keys=list(self.written))
+        self.action_key, self.advice_key = nested_key(action_key), nested_key(advice_key)
+        super().__init__(in_keys=[self.advice_key], out_keys=list(self.written))
         self.guide = guide
         # Completed fraction of the run, for schedules; see `set_progress`.
         self.progress: float | None = None
         self._mode_is_set = False
-        self.action_key, self.advice_key = nested_key(action_key), nested_key(advice_key)
 
     def train(self, mode: bool = True) -> GuideTransform:
         """Set the mode: training, or evaluation."""
@@ -91,7 +91,7 @@ class GuideTransform(ActionTransform):
         return tensordict[self.advice_key][..., self.guide, :]
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Check that the env writes the advice; raises a `KeyError` without this row of advice."""
+        """Add what is written; raises a `KeyError` if the env does not write this advice."""
         spec = observation_spec.get(self.advice_key, None)
         if spec is None or self.guide >= spec.shape[-2]:
             found = "no advice" if spec is None else f"advice of {spec.shape[-2]} guides"
@@ -99,14 +99,11 @@ class GuideTransform(ActionTransform):
                 f"{type(self).__name__} reads row {self.guide} of {self.advice_key}, but there is "
                 f"{found}; put GuideActions with enough guides before it"
             )
-        return observation_spec
+        return super().transform_observation_spec(observation_spec)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return stored data unchanged."""
         return tensordict
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict
 
 
 def set_progress(env: EnvBase, progress: float) -> None:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Mapping
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import TensorSpec, Unbounded
 
-from coil_rl.transforms.action_space import ChosenActionTransform, nested_key
+from coil_rl.transforms.action_space import ActionTransform, nested_key
+from coil_rl.transforms.link import State
 
 
-class LastAction(ChosenActionTransform):
+class LastAction(ActionTransform):
     """Writes the actions that the agent chose in the steps before, newest first.
 
     TorchRL's transform of this name writes the action that the env was given, which may be another
@@ -37,8 +37,7 @@ class LastAction(ChosenActionTransform):
         torch.Size([8, 2])
     """
 
-    chosen_key = "chosen_action"
-    needs_past = True  # stored data of a single step are not enough
+    needs_past = True
 
     def __init__(
         self,
@@ -52,48 +51,21 @@ class LastAction(ChosenActionTransform):
         super().__init__(in_keys=[], out_keys=[out_key])
         self.steps, self.action_key, self.out_key = steps, nested_key(action_key), out_key
 
-    @cached_property
-    def observation_at_start(self) -> Tensor:
-        """The entry at the start of an episode, [*batch, ...]."""
-        return self._spec().zero()
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Return that there was no action yet."""
+        space = self.action_space
+        shape = (*data.batch_size, *space.agents, self.steps * space.size)
+        return {self.out_key: torch.zeros(shape, dtype=space.dtype, device=space.spec.device)}
 
-    def shifted(self, actions: Tensor, newest: Tensor) -> Tensor:
-        """Return the entry after a further action.
+    def act(self, data: TensorDictBase, state: State) -> State:
+        """Keep the action that was chosen."""
+        newest = self.action_space.vectors(data[self.action_key])
+        actions = state[self.out_key][..., : -newest.shape[-1]]
+        return {self.out_key: torch.cat([newest, actions], -1)}
 
-        Args:
-            actions: the entry before, [..., steps * A].
-            newest: the action as a vector, [..., A].
-        """
-        return torch.cat([newest, actions[..., : -newest.shape[-1]]], -1)
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        newest = self.chosen_vectors(tensordict)
-        return next_tensordict.set(self.out_key, self.shifted(tensordict[self.out_key], newest))
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset.set(self.out_key, self.observation_at_start)
-
-    def _spec(self) -> TensorSpec:
+    @property
+    def state(self) -> Mapping[NestedKey, TensorSpec]:
+        """The actions, which are observed."""
         space, env = self.action_space, self.parent
         shape = (*env.batch_size, *space.agents, self.steps * space.size)
-        return Unbounded(shape, device=env.device, dtype=space.dtype)
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the entry."""
-        observation_spec[self.out_key] = self._spec()
-        return observation_spec
-
-    def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Add the entry, which is an input of steps."""
-        state = input_spec["full_state_spec"] or Composite(
-            shape=input_spec.shape, device=input_spec.device
-        )
-        state[self.out_key] = self._spec()
-        input_spec["full_state_spec"] = state
-        return input_spec
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return stored data unchanged."""
-        return tensordict
+        return {self.out_key: Unbounded(shape, device=env.device, dtype=space.dtype)}

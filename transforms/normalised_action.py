@@ -19,6 +19,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import EnvBase, Transform
 
+from coil_rl.transforms.link import Link, State
+
 LARGEST_BOUND = 1e30  # beyond it a bound is none: the largest number of a type stands for infinity
 WIDTH = 2.0  # assumed from the only bound of a coordinate
 
@@ -104,7 +106,7 @@ def units_of(spec: TensorSpec, batch_dims: int) -> ActionUnits | None:
     return ActionUnits(spec.space.low[first], spec.space.high[first])
 
 
-class NormalisedAction(Transform):
+class NormalisedAction(Link):
     """Normalise the action of an env, see above. Place it first, next to the env.
 
     All transforms behind it, and the agent, then see actions and advice that are normalised; guides
@@ -133,23 +135,11 @@ class NormalisedAction(Transform):
             raise RuntimeError("NormalisedAction needs an env: use it in a TransformedEnv")
         return units_of(env.full_action_spec[self.action_key], env.batch_dims)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return stored data unchanged."""
-        return tensordict
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return tensordict_reset
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.units is None:
-            return tensordict
-        action = tensordict[self.action_key]
-        return tensordict.set(self.action_key, self.units.denormalise(action))
+    def act(self, data: TensorDictBase, state: State) -> State:
+        """Write the action in the unit of the env."""
+        if self.units is not None:
+            data.set(self.action_key, self.units.denormalise(data[self.action_key]))
+        return state
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Replace the spec of the action."""

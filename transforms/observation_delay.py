@@ -7,11 +7,11 @@ from functools import cached_property
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
 from torchrl.data import Composite, NonTensor, TensorSpec
 
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.disturbance import Delay
+from coil_rl.transforms.link import State
 
 EVALUATION_ONLY = "info"  # entries that nobody acts on
 
@@ -80,31 +80,28 @@ class ObservationDelay(Delay):
         specs = self.parent.full_observation_spec
         return {self._past_key(key): specs[key] for key in self.late_keys}
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Draw the lags; the past is the first observation."""
         if not self.max_lag:
-            return tensordict_reset
-        tensordict_reset.set(self._of_memory("lag"), self._drawn(tensordict_reset))
-        dim = tensordict_reset.ndim
+            return {}
+        state = {self._of_memory("lag"): self._drawn(data)}
         for key in self.late_keys:
-            first = tensordict_reset[key].unsqueeze(dim)
-            past = first.repeat_interleave(self.max_lag, dim)
-            tensordict_reset.set(self._past_key(key), past)
-        return tensordict_reset
+            first = data[key].unsqueeze(data.ndim)
+            state[self._past_key(key)] = first.repeat_interleave(self.max_lag, data.ndim)
+        return state
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write the late entries, and keep the new ones."""
         if not self.max_lag:
-            return next_tensordict
-        lag: Tensor = tensordict[self._of_memory("lag")]
-        next_tensordict.set(self._of_memory("lag"), lag)
-        dim = next_tensordict.ndim
+            return state
+        lag = self._of_memory("lag")
+        after = {lag: state[lag]}
         for key in self.late_keys:
-            newest = next_tensordict[key].unsqueeze(dim)
-            values = torch.cat([tensordict[self._past_key(key)], newest], dim)
-            next_tensordict.set(self._past_key(key), values.narrow(dim, 1, self.max_lag))
-            next_tensordict.set(key, self._late(values, lag))
-        return next_tensordict
+            past = self._past_key(key)
+            values = torch.cat([state[past], data[key].unsqueeze(data.ndim)], data.ndim)
+            after[past] = values.narrow(data.ndim, 1, self.max_lag)
+            data.set(key, self._late(values, state[lag]))
+        return after
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the memory; raises a `ValueError` if it cannot be kept."""

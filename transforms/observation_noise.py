@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase, Transform
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.disturbance import Disturbance
 from coil_rl.transforms.guide_transform import SeededGenerator
+from coil_rl.transforms.link import State
 
 
 class ObservationNoise(Disturbance):
@@ -76,32 +77,31 @@ class ObservationNoise(Disturbance):
                 changed += part.out_keys
         return {key: found[key] for key in self.in_keys if key in found and key not in changed}
 
-    def _noisy(self, tensordict: TensorDictBase, after_reset: bool = False) -> TensorDictBase:
-        shapes = [tensordict[key].shape for key in self.in_keys]
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Draw the noise of the first step."""
+        return self._drawn(data, after_reset=reset is not None and "_reset" in reset)
+
+    def sent(self, data: TensorDictBase, state: State) -> State:
+        """Draw the noise of the next step."""
+        return self._drawn(data)
+
+    def _drawn(self, data: TensorDictBase, *, after_reset: bool = False) -> State:
+        shapes = [data[key].shape for key in self.in_keys]
         draws = self.rng.draw(torch.randn, shapes, after_reset=after_reset)
+        return dict(zip(self.in_keys, draws, strict=True))
+
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write the noisy entries; the state is their noise."""
         if not self.active:
-            return tensordict
-        for key, draw in zip(self.in_keys, draws, strict=True):
-            values = tensordict[key]
+            return {}
+        for key, draw in state.items():
+            values = data[key]
             noisy = torch.add(values, draw.to(values), alpha=self.sigma)
             if key in self.bounds:
                 low, high = self.bounds[key]
                 noisy = noisy.clamp(values.minimum(low), values.maximum(high))
-            tensordict.set(key, noisy)
-        return tensordict
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._noisy(next_tensordict)
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        after_reset = tensordict.get("_reset", None) is not None
-        return self._noisy(tensordict_reset, after_reset)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Add noise to stored data."""
-        return self._noisy(tensordict)
+            data.set(key, noisy)
+        return {}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Check the entries; raises a `ValueError` for one that cannot be noisy."""

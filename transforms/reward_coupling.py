@@ -4,12 +4,13 @@ It is equation 93 of the paper. The agent is not told the advice; it finds out b
 pays to act like the guide.
 """
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torchrl.data import Composite, Unbounded
+from torchrl.data import TensorSpec, Unbounded
 
 from coil_rl.transforms.guide_transform import GuideTransform, Schedule
 
@@ -77,19 +78,9 @@ class RewardCoupling(GuideTransform):
             next_tensordict.set(self.reward_key, reward - self.current(self.beta) * distance)
         return next_tensordict
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        for key in self.out_keys:
-            tensordict_reset.set(key, self.parent.full_reward_spec[self.reward_key].zero())
-        return tensordict_reset
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add `task_reward` and `guide_distance`."""
-        observation_spec = super().transform_observation_spec(observation_spec)
+    @property
+    def records(self) -> Mapping[NestedKey, TensorSpec]:
+        """`task_reward` and `guide_distance`."""
         reward = self.parent.full_reward_spec[self.reward_key]
-        for key in self.out_keys:
-            observation_spec[key] = Unbounded(
-                reward.shape, device=reward.device, dtype=reward.dtype
-            )
-        return observation_spec
+        spec = Unbounded(reward.shape, device=reward.device, dtype=reward.dtype)
+        return {key: spec.clone() for key in self.written}

@@ -25,11 +25,11 @@ from tqdm import tqdm
 from benchmarks.guide_benchmark import picture
 from benchmarks.guide_benchmark.rows import read_rows
 from benchmarks.promise import ALONE, PPO
+from coil_rl.comparison.arms import ANCHORED, GUIDE, OPPOSITE, TUNE
+from coil_rl.comparison.compare import FOUND, TABLE
+from coil_rl.comparison.verdict import NOTHING
 from coil_rl.files import write_text
 from coil_rl.report import markdown_table, write_csv
-from coil_rl.worth.arms import ANCHORED, GUIDE, OPPOSITE, TUNE
-from coil_rl.worth.comparison import FOUND, TABLE
-from coil_rl.worth.verdict import NOTHING
 
 Row = Mapping[str, str]
 DETUNED = "detuned"
@@ -140,7 +140,7 @@ def run(place: Path, arguments: Sequence[str]) -> None:
         return
     place.parent.mkdir(parents=True, exist_ok=True)
     log = place.parent / "log.txt"
-    command = [sys.executable, "-m", "coil_rl.programs.compare", *arguments]
+    command = [sys.executable, "-m", "coil_rl.comparison.program", *arguments]
     with log.open("a") as output:
         done = subprocess.run(command, stdout=output, stderr=output, check=False)
     if done.returncode:

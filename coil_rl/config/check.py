@@ -3,6 +3,7 @@
 A mistake is found in seconds. Nothing is written except the folder of the run, as the last step.
 """
 
+import errno
 import math
 import os
 import warnings
@@ -18,26 +19,26 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Composite
 from torchrl.envs import EnvBase, TransformedEnv
 
-from coil_rl.config import build
+from coil_rl.config import parts
 from coil_rl.config.choices import about_choices, needs_numbers
-from coil_rl.config.distillation import (
+from coil_rl.config.folder import run_folder
+from coil_rl.config.messages import sentence
+from coil_rl.config.nodes import build, build_all, check_node
+from coil_rl.config.own_run import own_run
+from coil_rl.config.passive import check_passive, passive
+from coil_rl.config.proxies import (
     frames_of_proxies,
     guides_with_untrained_proxies,
     guides_without_parameters,
     proxy_config,
 )
-from coil_rl.config.logger import check_logger
-from coil_rl.config.nodes import build as build_node
-from coil_rl.config.nodes import build_all, check_node
-from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
-from coil_rl.config.pretrained import run_folder
-from coil_rl.config.replay import check_recordings_to_leave_out, check_replay
 from coil_rl.config.schema import TrainConfig
+from coil_rl.config.trust import check_logger
 from coil_rl.config.values import check_values
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.batch import SeededRows, optional_entries
 from coil_rl.foreign.faults import ForeignError
-from coil_rl.foreign.trial import Tried, tried
+from coil_rl.foreign.trial import Tried, tried, unrepeated
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.off_policy import OffPolicy
@@ -49,7 +50,6 @@ from coil_rl.run.fallback import check_cases_of_guide, critic_beside_guide, no_e
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
 from coil_rl.run.training import INIT
-from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.guide_actions import UnfitActionError
@@ -84,14 +84,14 @@ def check_parts(config: DictConfig) -> None:
     if has_agent:
         _check_kind(config)
     if trains:
-        _check_tuning(config)
+        _check_own_run(config)
         _check_delivery(config, has_agent=has_agent)
-    make_env = build.env_maker(config)
+    make_env = parts.env_maker(config)
     cases = _count_cases(config)
     if trains:
-        check_replay(config, make_env)
+        check_passive(config, make_env)
     if not _is_of_run(config):
-        recorded = build.recorded(build.build_pictures(config))
+        recorded = parts.recorded(parts.build_pictures(config))
         _check_env(config, make_env, cases, recorded.values())
     build_all(config.evaluation.advice, "evaluation.advice")
     if has_agent:
@@ -119,12 +119,12 @@ def _count_cases(config: DictConfig) -> int:
     """Return the number of cases of an evaluation; 0 if they are the tracks of a run."""
     if _is_of_run(config) and OmegaConf.is_dict(config.evaluation.cases):
         return 0
-    return len(build.build_evaluation(config).cases)
+    return len(parts.build_evaluation(config).cases)
 
 
 def _check_kind(config: DictConfig) -> None:
     """Raise a `UserError` if the learner is of another kind than the method needs."""
-    kind, needed = build.learner_kind(config), config.method.learner
+    kind, needed = parts.learner_kind(config), config.method.learner
     if kind != needed:
         purpose, example = KINDS[needed]
         learner = config.learner["_target_"].rpartition(".")[2]
@@ -134,28 +134,16 @@ def _check_kind(config: DictConfig) -> None:
         )
 
 
-def _check_tuning(config: DictConfig) -> None:
-    """Raise a `UserError` for numbers that cannot be tuned, or that nothing tunes."""
-    if not config.method.search:
-        if config.tune:
-            raise UserError(
-                f"tune has no effect: method={config.method.name} does not tune its guide; give "
-                "method=tune, or leave tune out"
-            )
-        return
-    if config.delivery != "tested":
+def _check_own_run(config: DictConfig) -> None:
+    """Raise a `UserError` for what the own run of a method cannot do, or for `tune` without one."""
+    own = own_run(config)
+    if own is not None:
+        own.check(config)
+    elif config.tune:
         raise UserError(
-            f"delivery={config.delivery}: method={config.method.name} always tests what it hands "
-            "over; leave it out"
+            f"tune has no effect: method={config.method.name} does not tune its guide; give "
+            "method=tune, or leave tune out"
         )
-    build_node(config.method.search, "method.search", Search)
-    numbers = numbers_to_tune(config)
-    make_guide = GuideWithNumbers(config)
-    for end in (0.0, 1.0):
-        try:
-            make_guide({number.name: number.value(end) for number in numbers})
-        except UserError as error:
-            raise UserError(f"tune: a bound is no value of the guide: {error}") from error
 
 
 def _check_delivery(config: DictConfig, *, has_agent: bool) -> None:
@@ -163,7 +151,7 @@ def _check_delivery(config: DictConfig, *, has_agent: bool) -> None:
 
     So it is for values that need a policy, where none is trained.
     """
-    trains_policy = has_agent and not config.method.search
+    trains_policy = has_agent and not config.method.run
     if config.evaluation.fallback and not trains_policy:
         raise UserError(no_effect(Path(config.run_dir), "there is no agent"))
     if config.init and not trains_policy:
@@ -198,8 +186,7 @@ def _check_env(
     if "num_envs" not in config.env:
         raise UserError(
             f"env: {config.env.get('_target_', 'it')} has no key num_envs, so no policy can act in "
-            "it; choose another env (for the actions of policies on a recording: "
-            "coil-replay recording=FILE)"
+            "it; choose another env"
         )
     check_node(config.env, "env")
     env = make_env.bare(1, TEST, None)
@@ -215,8 +202,8 @@ def _check_env(
                 "no guide whose advice could be degraded; leave it out, or give guide=NAME"
             )
         return
-    guides = build.build_guides(config)
-    demonstrations = build.demonstrations(config)
+    guides = parts.build_guides(config)
+    demonstrations = parts.demonstrations(config)
     for name, guide in guides.items():
         its_env = make_env.bare(1, TRAIN, None) if name in demonstrations else env
         check_guide_in_env(guide, its_env, f"guide.{name}")
@@ -225,7 +212,7 @@ def _check_env(
         if OmegaConf.get_type(config) is TrainConfig:
             _say_cost_of_curve(config, found)
     build_all(config.degrade, "degrade")
-    if build.build_disturbances(config, TEST):
+    if parts.build_disturbances(config, TEST):
         transformed(env, make_env.disturb(TEST), "disturb")
     if config.degrade:
         _check_cases(cases, partial(make_env.guided, cases, TEST, guides))
@@ -238,7 +225,7 @@ def _check_repeats(env: EnvBase) -> None:
     """
     if not isinstance(env, SeededRows):
         return
-    key = env.unrepeated()
+    key = unrepeated(env)
     if key is not None:
         warnings.warn(
             f"the env does not obey its seed: {_dotted(key)} differs when an episode is repeated, "
@@ -267,9 +254,7 @@ def _say_cost_of_curve(config: DictConfig, found: Tried) -> None:
     command would make another run on a busier machine.
     """
     curve = config.evaluation.curve
-    asks = config.method.observes is not None and (
-        config.method.search or "advice" in config.method.transforms
-    )
+    asks = config.method.observes is not None and "advice" in config.method.transforms
     sets = 1 if config.delivery == "tested" else len(curve.cases)
     episodes = (curve.points + 1) * curve.num_envs * sets
     minutes = STEPS_SAID * episodes * found.seconds / 60
@@ -372,11 +357,10 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
         for key in guide.in_keys:
             if key not in known:
                 has = ", ".join(map(_dotted, env.observation_spec.keys()))
-                remedy = ""
-                if getattr(guide, "demonstrates", False):
-                    remedy = "; give env=mcap_replay recording=[FILE,...], see also guide=recorded"
+                remedy = getattr(guide, "remedy", "")  # what gives the entry that it reads
                 raise UserError(
-                    f"{name}: it reads {_dotted(key)}, but the env has only {has}{remedy}"
+                    f"{name}: it reads {_dotted(key)}, but the env has only {has}"
+                    f"{remedy and '; '}{remedy}"
                 )
         advised = TransformedEnv(env, transform)
         advised.step(FollowAdvice(advised)(advised.reset()))
@@ -405,27 +389,27 @@ def _check_cases(cases: int, make: Callable[[], Any]) -> None:
 
 
 def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
-    if config.method.search:
+    if config.method.run:
         _check_curve(config, make_env)
         make_env()
         return
-    if not build.observed_keys(config):
+    if not parts.observed_keys(config):
         raise UserError(
             "observes=[]: the agent has no observations; give the entries of the env that it "
             "observes"
         )
     env = make_env()
-    trains = build.trains_guides(config)
+    trains = parts.trains_guides(config)
     if trains and config.degrade:
         raise UserError(
             f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out"
         )
-    guides = build.build_guides(config) if trains else {}
+    guides = parts.build_guides(config) if trains else {}
     replaced = guides_without_parameters(guides)
     check_proxies(config, replaced)
     _check_frames_of_proxies(config, replaced)
     untrained = guides_with_untrained_proxies(config) if guides else None
-    learner = build.build_learner(config, env, untrained)
+    learner = parts.build_learner(config, env, untrained)
     if config.evaluation.fallback:
         check_cases_of_guide(make_env, Path(config.run_dir))
         critic_beside_guide(env, learner, Path(config.run_dir))
@@ -474,9 +458,15 @@ def _check_validation(config: DictConfig, learner: Learner) -> None:
     """Raise a `UserError` if tracks are to be left out to validate, and there is only one."""
     if not config.track or not learner.validates_groups:
         return
-    if check_recordings_to_leave_out(config):
+    kind = passive(config)
+    if kind is not None:
+        if kind.whole_pass(config.env)[0] == 1:
+            raise UserError(
+                "there is one episode, which cannot be left out to validate; give several, or set "
+                "learner.group_key=null"
+            )
         return
-    if len(build_node(config.track.train, "track.train")) == 1:
+    if len(build(config.track.train, "track.train")) == 1:
         raise UserError(
             "track.train gives one track, which cannot be left out to validate; set "
             "learner.group_key=null, or learner.validate=false"
@@ -538,9 +528,6 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
-            raise PermissionError(None, "Permission denied")
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
     except OSError as error:
-        raise UserError(
-            f"the run's folder {folder} cannot be used ({error.strerror}); choose another with "
-            "hydra.run.dir=FOLDER"
-        ) from error
+        raise UserError(sentence(error)) from error

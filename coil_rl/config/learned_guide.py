@@ -2,43 +2,35 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
-from numpy.typing import NDArray
-from omegaconf import DictConfig
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import (
-    Compose,
-    EnvBase,
-    ExplorationType,
-    TransformedEnv,
-    set_exploration_type,
-)
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torchrl.data import Unbounded
+from torchrl.envs import ExplorationType, TensorDictPrimer, set_exploration_type
 
-from coil_rl.config.build import assemble
-from coil_rl.config.pretrained import run_folder
-from coil_rl.config.saved import read_config
+from coil_rl.config.assemble import assemble
+from coil_rl.config.folder import read_config, run_folder
 from coil_rl.errors import UserError
-from coil_rl.guides import PerRow
 from coil_rl.run.parts import TRAIN
-from coil_rl.run.policy_batch import memory_keys
-from coil_rl.run.run import Run
-from coil_rl.transforms.action_space import ActionSpace, first_choices, space_of
-from coil_rl.transforms.normalised_action import normalising
+from coil_rl.transforms import GuideActions
+from coil_rl.transforms.action_space import ActionSpace, OwnChoices, space_of
+from coil_rl.transforms.chain import Chain, links_of
+from coil_rl.transforms.hosted import HostedGuide
 
 LONGEST_CHAIN = 4  # learned guides of learned guides
-_loading: list[Path] = []  # runs that are being loaded, each of which is a guide of the one before
+# Runs that are being loaded, each of which is a guide of the one before.
+_LOADING: ContextVar[tuple[Path, ...]] = ContextVar("loading", default=())
 
 
-class LearnedGuide(TensorDictModuleBase):
+class LearnedGuide(HostedGuide):
     """Deterministic action of a trained policy, with the guides and action transforms of its run.
 
-    All rows act at once. Where the policy, a guide of it or a transform depends on earlier steps,
-    they act one after the other, each with a `Controller` of its own.
+    All rows act at once. What the policy, its guides and its transforms remember is the memory of
+    the guide, as entries of the data.
 
     Args:
         run: folder of a run of `coil-train`, or `pretrained:NAME`.
@@ -57,35 +49,34 @@ class LearnedGuide(TensorDictModuleBase):
         device: str = "cpu",
     ) -> None:
         super().__init__()
-        folder = run_folder(run)
-        config = read_config(folder, "run", {"device": device})
+        self.folder = run_folder(run)
+        config = read_config(self.folder, "run", {"device": device})
         if config.method.observes is None:
             raise ValueError(
-                f"{folder} trained no agent: its method is {config.method.name}; name its guide "
-                "instead"
+                f"{self.folder} trained no agent: its method is {config.method.name}; name its "
+                "guide instead"
             )
-        with _guarded(folder):
-            opened = assemble(config, folder)
-            all_rows = _AllRows(config, opened, which)
-            guide: TensorDictModuleBase = all_rows
-            if all_rows.needs_past:
-                guide = PerRow(partial(_OneRow, opened, which), all_rows.plant_keys)
-        self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
-        self.guide, self.first = guide, all_rows.first
-        self.folder, self.space = folder, all_rows.space
+        with _guarded(self.folder):
+            opened = assemble(config, self.folder)
+            # The transforms need the specs of an env; some need at least two rows.
+            env = opened.make_env.around(opened.make_env.bare(2, TRAIN, None)).eval()
+            policy = opened.load_policy(env, which)
+        self.chain = Chain(env, policy, links_of(env.transform, tensors=True))
+        self.space = space_of(env.base_env, env.base_env.action_key)
+        guides = [each for each in self.chain.links if isinstance(each, GuideActions)]
+        inner = [guide for each in guides for guide in each.guides.guides.values()]
+        self.by_row = any(isinstance(guide, HostedGuide) and guide.by_row for guide in inner)
+        first = self.chain.first(TensorDict({}, [1], device=env.device))
+        self.memory = {f"learned_{n}": at for n, at in enumerate(self.chain.remembered(first))}
+        self.start = {name: first[n][key][0] for name, (n, key) in self.memory.items()}
+        supplied = {key for each in guides for key in each.supplied}
+        self.in_keys = [*self.chain.reads, *supplied.intersection(["row"]), *self.memory]
+        self.out_keys: list[NestedKey] = ["action", *(("next", name) for name in self.memory)]
         self.requires_grad_(False)
         self.eval()
 
-    @property
-    def by_row(self) -> bool:
-        """Whether there is one object for each row, see `Guides`."""
-        return isinstance(self.guide, PerRow)
-
-    def in_space(self, space: ActionSpace) -> None:
+    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Check the action of an env.
-
-        Args:
-            space: of the actions of the env.
 
         Raises:
             UserError: if the policy has another number of choices or other bounds, which may be in
@@ -99,99 +90,37 @@ class LearnedGuide(TensorDictModuleBase):
             )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` as executed by the env, and the next state of a policy with a memory."""
-        tensordict = self.guide(tensordict)
-        if self.first is not None:
-            tensordict["action"] = tensordict["action"] + self.first
-        return tensordict
-
-
-class _AllRows(TensorDictModuleBase):
-    """The policy of a run on all rows at once, without a past behind its transforms.
-
-    Attributes:
-        needs_past: whether it has such a past, so that it must not be used.
-        plant_keys: entries of the env of the run.
-        first: lowest numbers of the choices of the env, [n] or one; None: 0.
-        space: of the actions of the env of the run.
-    """
-
-    def __init__(self, config: DictConfig, run: Run, which: str) -> None:
-        super().__init__()
-        # The transforms need the specs of an env; some need at least two rows.
-        env = run.make_env.bare(2, TRAIN, None)
-        first = normalising(env)
-        env = TransformedEnv(env, Compose(*first, *run.make_env.transforms("")))
-        self.policy = run.load_policy(env, which)
-        memory = memory_keys(self.policy)
-        self.in_keys, self.out_keys = list(self.policy.in_keys), ["action", *memory]
-        specs = env.base_env.observation_spec
-        self.plant_keys = observed(env.base_env)
-        self.space = space_of(env.base_env, env.base_env.action_key)
-        lowest = first_choices(env.base_env)
-        self.first = None if lowest is None else lowest.squeeze()
-        self.transforms, self.needs_past = None, False
-        if first or config.method.transforms or config.action:
-            self.transforms = env.transform
-            parts = env.transform.modules()
-            self.needs_past = bool(memory) or any(getattr(p, "needs_past", False) for p in parts)
-            self.in_keys = [key for key in specs if key != "info"]
-        # Transforms hold a weak reference to their env; the tuple keeps it from becoming a
-        # submodule.
-        self._env = (env,)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` as executed by the env, and the next state of a policy with a memory."""
+        """Write `action` as the env takes it, and what is remembered for the next step."""
         data = tensordict.select(*self.in_keys)
-        if self.transforms is not None:
-            data = self.transforms(data)
+        past = self.chain.first(data)
+        for name, (number, key) in self.memory.items():
+            past[number][key] = data.pop(name)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            data = self.policy(data)
-        if self.transforms is not None:
-            data = self.transforms.inv(data)
-        for key in self.out_keys:
-            tensordict.set(key, data[key])
-        return tensordict
+            data, past = self.chain(data, past)
+        for name, (number, key) in self.memory.items():
+            tensordict.set(("next", name), past[number][key])
+        return tensordict.set("action", self.space.executed(data[self.chain.action_key]))
 
-
-def observed(env: EnvBase) -> list[NestedKey]:
-    """Return the entries of an env without those under `info`."""
-    keys = env.observation_spec.keys(True, True)
-    return [key for key in keys if isinstance(key, str) or key[0] != "info"]
-
-
-class _OneRow:
-    """The policy of a run on one row, with its past; the object of a row for `PerRow`."""
-
-    def __init__(self, run: Run, which: str) -> None:
-        self.controller = run.controller(which)
-        self.keys = observed(self.controller.plant)
-        self.reset = self.controller.reset
-        self.state_dict = self.controller.state_dict
-        self.load_state_dict = self.controller.load_state_dict
-
-    def act(self, *values: NDArray[Any]) -> NDArray[Any]:
-        """Return the action for the entries of the row."""
-        plant = self.controller.plant
-        entries = plant.full_observation_spec.zero()
-        for key, value in zip(self.keys, values, strict=True):
-            entries.set(key, torch.as_tensor(value, device=plant.device)[None])
-        return self.controller.act_on(entries)[0].cpu().numpy()
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """Declare what is remembered."""
+        specs = {name: Unbounded(row.shape, dtype=row.dtype) for name, row in self.start.items()}
+        first = {name: partial(torch.clone, row) for name, row in self.start.items()}
+        return TensorDictPrimer(specs, default_value=first, expand_specs=True)
 
 
 @contextmanager
 def _guarded(folder: Path) -> Iterator[None]:
     """Refuse a run that is already being loaded as a guide, and too long a chain of them."""
-    place = folder.resolve()
-    if place in _loading:
+    place, loading = folder.resolve(), _LOADING.get()
+    if place in loading:
         raise UserError(f"run={folder} is its own guide; give a run that does not depend on itself")
-    if len(_loading) == LONGEST_CHAIN:
+    if len(loading) == LONGEST_CHAIN:
         raise UserError(
             f"run={folder} ends a chain of more than {LONGEST_CHAIN} learned guides; give a "
             "shorter one"
         )
-    _loading.append(place)
+    token = _LOADING.set((*loading, place))
     try:
         yield
     finally:
-        _loading.pop()
+        _LOADING.reset(token)

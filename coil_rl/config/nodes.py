@@ -3,17 +3,24 @@
 This is the only caller of Hydra's `instantiate`.
 """
 
+import inspect
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from numbers import Number
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin
 
 import hydra.utils
+import numpy as np
 from omegaconf import DictConfig, ListConfig, OmegaConf
+from pydantic import ValidationError
+from pydantic.errors import PydanticUserError
+from pydantic_core import SchemaError
 from torchrl.envs import Transform
 
-from coil_rl.config.arguments import check_arguments, converted
+from coil_rl.config.messages import similar
 from coil_rl.errors import UserError
-from coil_rl.ranges import yaml_text
+from coil_rl.ranges import adapter, settings_of, validation_message, yaml_text
 
 # Largest numbers of arguments of other libraries, by class: memory grows with them, and the
 # libraries do not check them.
@@ -123,6 +130,8 @@ def find_target(path: Any, name: str) -> Callable[..., Any]:
     """
     try:
         target: Callable[..., Any] = hydra.utils.get_object(path)
+    except UserError as error:  # an extra is missing
+        raise UserError(f"{name}: {error}") from error
     except Exception as error:
         raise UserError(
             f"{name}: there is no {path!r}; check the spelling, and that its package is installed"
@@ -137,3 +146,185 @@ def find_target(path: Any, name: str) -> Callable[..., Any]:
 def build_all(nodes: Mapping[str, Any], name: str) -> list[Transform]:
     """Return transforms in the order of the configuration."""
     return [build(node, f"{name}.{key}", Transform) for key, node in nodes.items()]
+
+
+PLAIN = (bool, int, float, str, NoneType)
+HOLDERS = (np.ndarray, tuple, list, Sequence)  # of numbers, in annotations
+
+
+def check_arguments(
+    target: Callable[..., Any], node: Mapping[str, Any], name: str, program: Iterable[str] = ()
+) -> None:
+    """Check the arguments of a node.
+
+    An unknown or missing argument, or one that does not fit its annotation, is a `UserError`.
+
+    Annotations of other people are often stricter than their code, and YAML has neither tuples nor
+    arrays. So their callables are given any numbers where the annotation is of numbers, arrays or
+    sequences; `converted` makes the tuples and arrays.
+
+    Args:
+        target: class or function.
+        node: arguments; `_target_` and `_partial_` are ignored.
+        name: key of the node, for the message.
+        program: names of the arguments that the program adds.
+    """
+    title = getattr(target, "__name__", str(target))
+    given = {key: value for key, value in node.items() if key not in ("_target_", "_partial_")}
+    for key in sorted(given.keys() & set(program)):
+        raise UserError(f"{name}: {key} of {title} is set by the program; leave it out")
+    parameters = _parameters(target)
+    if parameters is None:
+        return
+    known = {p.name: p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+    accepts_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    for key in sorted(given.keys() - known):
+        if not accepts_any or key.startswith("_"):
+            takes = ", ".join(known) or "nothing"
+            raise UserError(
+                f"{name}: {title} takes no {key}; it takes {takes}{similar(key, known)}"
+            )
+    missing = [
+        key for key, p in known.items() if p.default is p.empty and key not in {*given, *program}
+    ]
+    if missing and "_partial_" not in node:
+        raise UserError(
+            f"{name}: {title} needs {', '.join(missing)}; give {name}.{missing[0]}=VALUE"
+        )
+    for key in given.keys() & known:
+        annotation = known[key].annotation
+        if not is_foreign(target) or not _may_take(given[key], annotation):
+            _check_type(given[key], annotation, f"{name}.{key}")
+
+
+def is_foreign(target: Callable[..., Any]) -> bool:
+    """Return whether a class or function is not of this project."""
+    return not (getattr(target, "__module__", None) or "").startswith("coil_rl.")
+
+
+def converted(target: Callable[..., Any], node: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the node of a callable of other people with nodes for the tuples and arrays it wants.
+
+    Args:
+        target: class or function.
+        node: its checked arguments.
+    """
+    if not is_foreign(target):
+        return dict(node)
+    annotations = {each.name: each.annotation for each in _parameters(target) or ()}
+    arguments = dict(node)
+    for key, value in node.items():
+        if not isinstance(value, list) or not _holds_numbers(value):
+            continue
+        kinds = _kinds(annotations.get(key))
+        if kinds & {list, Sequence}:
+            continue
+        if tuple in kinds:
+            arguments[key] = {"_target_": "builtins.tuple", "_args_": [value]}
+        elif np.ndarray in kinds:
+            arguments[key] = {"_target_": "numpy.array", "_args_": [value]}
+    return arguments
+
+
+def _holds_numbers(value: Any) -> bool:
+    """Return whether a value is a finite number, or a nested list of such."""
+    if isinstance(value, list):
+        return all(map(_holds_numbers, value))
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) < 2**63
+
+
+def _may_take(value: Any, annotation: Any) -> bool:
+    """Return whether the code behind an annotation of numbers may take a value from YAML."""
+    kinds = _kinds(annotation) - {bool, int, str, bytes}
+    wanted = HOLDERS if isinstance(value, list) else (Number, np.generic, *HOLDERS)
+    return _holds_numbers(value) and any(issubclass(kind, wanted) for kind in kinds)
+
+
+def _kinds(annotation: Any) -> set[type]:
+    """Return the classes of an annotation, those of a union one by one."""
+    if get_origin(annotation) in (Union, UnionType):
+        return {kind for part in get_args(annotation) for kind in _kinds(part)}
+    kind = get_origin(annotation) or annotation
+    return {kind} if isinstance(kind, type) else set()
+
+
+def _check_type(value: Any, annotation: Any, name: str) -> None:
+    if annotation is inspect.Parameter.empty or isinstance(annotation, str):
+        return
+    try:
+        allowed = adapter(annotation)
+    except (PydanticUserError, SchemaError):  # an annotation that cannot be checked
+        return
+    if (known := _known(value, list)) is _TARGET:
+        if all(part in PLAIN for part in get_args(annotation) or [annotation]):
+            raise UserError(f"{name} must be a plain value, not a node with _target_")
+        return
+    try:
+        allowed.validate_python(known)
+    except ValidationError as error:
+        try:  # strict pydantic accepts no list for a tuple, and YAML has no tuples
+            allowed.validate_python(_known(value, tuple))
+        except ValidationError:
+            raise UserError(validation_message(error, known, name)) from None
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise UserError(f"{name}={value} must be an integer of 64 bits")
+
+
+_TARGET = object()
+
+
+def _known(value: Any, sequence: type[list[Any]] | type[tuple[Any, ...]]) -> Any:
+    """Return a value without the nodes inside it that have a `_target_`.
+
+    Their results are not known yet.
+    """
+    if isinstance(value, Mapping):
+        entries = {key: _known(entry, sequence) for key, entry in value.items()}
+        return (
+            _TARGET
+            if "_target_" in value
+            else {k: entry for k, entry in entries.items() if entry is not _TARGET}
+        )
+    if isinstance(value, list):
+        return sequence(
+            entry for entry in (_known(entry, sequence) for entry in value) if entry is not _TARGET
+        )
+    return value
+
+
+def _parameters(target: Callable[..., Any]) -> list[inspect.Parameter] | None:
+    """Return the parameters of a target.
+
+    They include those that a class of this project passes on to its base class.
+    """
+    has_init = inspect.isclass(target) and target.__init__ is not object.__init__
+    try:
+        # The signature of a class with a metaclass, such as an env of TorchRL, is that of the
+        # metaclass.
+        own = list(_signature(target.__init__ if has_init else target).parameters.values())[
+            has_init:
+        ]
+    except ValueError:  # builtins without a signature
+        return None
+    passes_on = has_init and (
+        "__init__" not in vars(target) or any(p.kind is p.VAR_KEYWORD for p in own)
+    )
+    if not inspect.isclass(target) or not passes_on or not target.__module__.startswith("coil_rl."):
+        return own
+    base = _parameters(target.__bases__[0])
+    if base is None:
+        return own
+    names = {parameter.name for parameter in own}
+    settings = [known for p in own if (known := settings_of(p)) is not None]
+    return [p for p in own if p.kind is not p.VAR_KEYWORD] + [
+        p for p in base if p.name not in names and all(p.name in known for known in settings)
+    ]
+
+
+def _signature(function: Callable[..., Any]) -> inspect.Signature:
+    try:
+        return inspect.signature(function, eval_str=True)
+    except (NameError, TypeError):  # annotations that only a type checker can resolve
+        return inspect.signature(function)

@@ -9,7 +9,15 @@ from coil_rl.errors import UserError
 OLD_NAMES = {
     "coil_rl.envs.EnvBatch": "coil_rl.foreign.torchrl_env.EnvBatch",
     "coil_rl.envs.gymnasium_env.GymnasiumEnv": "coil_rl.foreign.gymnasium_env.GymnasiumEnv",
+    "coil_rl.guides.RecordingGuide": "coil_robot.RecordingGuide",
+    "coil_rl.guides.cone_planner.ConePlannerGuide": "coil_rl.cones.ConePlannerGuide",
     "coil_rl.guides.learned.LearnedGuide": "coil_rl.LearnedGuide",
+    "coil_rl.learners.Advisor": "coil_studies.Advisor",
+    "coil_rl.learners.IBRL": "coil_studies.IBRL",
+    "coil_rl.listening.TrackSections": "coil_studies.listening.TrackSections",
+    "coil_rl.listening.WholeEpisode": "coil_studies.listening.WholeEpisode",
+    "coil_rl.robot.classifier.load_classifier": "coil_robot.load_classifier",
+    "coil_rl.run.tuning.Search": "coil_rl.tune.Tuning",
 }
 GONE = {
     "coil_rl.imitation.SklearnRegressor": "regressors of scikit-learn are saved in another way",
@@ -33,3 +41,16 @@ def renamed(node: Any, path: Path) -> Any:
     if isinstance(node, str) and node in GONE:
         raise UserError(f"{path} is of an earlier version: {GONE[node]} today; train again")
     return OLD_NAMES.get(node, node) if isinstance(node, str) else node
+
+
+def with_todays_keys(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a configuration with today's keys: `method.run` was called `method.search`.
+
+    Args:
+        values: as read from a folder.
+    """
+    method = values.get("method")
+    if not isinstance(method, Mapping):
+        return dict(values)
+    keys = {key: "run" if key == "search" else key for key in method}
+    return {**values, "method": {keys[key]: value for key, value in method.items()}}

@@ -4,8 +4,8 @@ Where a name is not enough, an object may be given.
 """
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from importlib import resources
@@ -13,22 +13,17 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-from hydra import compose, initialize_config_module
-from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
-from omegaconf.errors import OmegaConfBaseException
 from torchrl.envs import EnvBase
 
-from coil_rl.config.build import assemble
+from coil_rl.config.assemble import assemble
 from coil_rl.config.check import check_parts, make_folder
-from coil_rl.config.default_method import method_for
-from coil_rl.config.given import import_path, keep
-from coil_rl.config.guest_files import packages
-from coil_rl.config.sentences import sentence
-from coil_rl.config.trust import trust_own
+from coil_rl.config.compose import compose_train, packages, quoted
+from coil_rl.config.folder import PREFIX, read_config, run_folder
+from coil_rl.config.given import give, import_path, keep
+from coil_rl.config.schema import method_for
+from coil_rl.config.trust import trust_own, trust_packages
 from coil_rl.config.unread import check_read
-from coil_rl.config.written import keep_written, quoted
 from coil_rl.errors import UserError
 from coil_rl.foreign.faults import foreign
 from coil_rl.run.controller import Controller
@@ -217,43 +212,6 @@ def _new_folder() -> Path:
     return Path("outputs", "train", f"{now}_{os.getpid()}")
 
 
-def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConfig:
-    """Return the configuration that `coil-train` composes from the words of its command line.
-
-    Args:
-        words: such as "method=coil" and "+experiment=placebo". YAML files of another package are
-            found with "hydra.searchpath=[pkg://PACKAGE.conf]".
-        with_hydra: whether the configuration has Hydra's own part, such as the folders of a sweep.
-
-    Raises:
-        UserError: for words that do not fit the configuration, with one sentence.
-    """
-    try:
-        with _own_hydra():
-            config = compose("train", list(words), return_hydra_config=with_hydra)
-            task = [word for word in words if not word.startswith("hydra.")]
-            keep_written(config, "train", task, [w for w in words if w not in task])
-            return config
-    except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(sentence(error)) from error
-
-
-@contextmanager
-def _own_hydra() -> Iterator[None]:
-    """Compose files of this package in the block.
-
-    This works inside a program of Hydra with its own files, too.
-    """
-    program = GlobalHydra.instance()
-    outer = program.hydra
-    program.clear()
-    try:
-        with initialize_config_module("coil_rl.conf", version_base="1.3"):
-            yield
-    finally:
-        GlobalHydra.instance().hydra = outer
-
-
 def _shipped(group: str) -> set[str]:
     """Return the names of the files of coil-rl and of its guests in a group."""
     folders = [resources.files(package) / group for package in packages()]
@@ -309,3 +267,58 @@ def _guide(guide: Any, name: str) -> Words:
     path = guide if isinstance(guide, str) else import_path(guide)
     words = ["guide=controller", f"guide.controller.of={quoted(path or 'given')}"]
     return words, {} if path is not None else {"guide.controller.of": keep(name, guide)}
+
+
+def open_run(
+    folder: str | Path,
+    *,
+    guide: Any = None,
+    env: Any = None,
+    trust: Sequence[str] = (),
+    device: str = "cpu",
+) -> Run:
+    """Return the run in a folder, finished or not.
+
+    Args:
+        folder: that `coil-train` or `coil_rl.train` has written; it may come from anybody. Or
+            "pretrained:NAME" for a shipped policy.
+        guide: the object that was the guide, for a run that was made in Python with one that no
+            import path names.
+        env: the same for its env.
+        trust: packages whose parts the folder may use, see docs/trust.md.
+        device: of everything, "cpu" or "cuda".
+
+    Raises:
+        UserError: for a folder without a run, or one whose configuration cannot be read or could
+            run code.
+
+    Example:
+        >>> import coil_rl
+        >>> controller = coil_rl.open_run("outputs/tank").controller()  # doctest: +SKIP
+    """
+    folder = run_folder(folder)
+    if trust:
+        trust_packages(trust)
+    config = read_config(folder, "folder", {"device": device}, goes_on=bool(trust))
+    give(config, {"guide": guide, "env": env})
+    return assemble(config, folder)
+
+
+def pretrained(name: str, *, device: str = "cpu") -> Run:
+    """Return a shipped policy as the finished run that it is.
+
+    Args:
+        name: such as "cone_track/coil"; `pretrained_names()` has all.
+        device: of everything, "cpu" or "cuda".
+
+    Raises:
+        UserError: for a name that does not exist, and for files that are not those that were
+            shipped.
+
+    Example:
+        >>> import coil_rl
+        >>> run = coil_rl.pretrained("cone_track/coil")
+        >>> run.label, run.seed
+        ('coil', 0)
+    """
+    return open_run(f"{PREFIX}{name}", device=device)

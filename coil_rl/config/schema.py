@@ -9,6 +9,7 @@ import json
 import os
 import re
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import Annotated, Any
 
 from hydra.core.config_store import ConfigStore
@@ -161,8 +162,8 @@ class EvaluationConfig(NodeConfig):
 class MethodConfig(NodeConfig):
     """A method: transforms of the agent, the kind of its learner, and what it observes.
 
-    `observes` are entries besides those of the env. `search` is for a method that tunes its guide
-    instead of training a learner; its learner is "none".
+    `observes` are entries besides those of the env. `run` makes the run of a method that
+    trains no policy, see `coil_rl.config.own_run`; its learner is "none".
     """
 
     name: str = MISSING
@@ -170,7 +171,7 @@ class MethodConfig(NodeConfig):
     transforms: dict[str, Any] = field(default_factory=dict)
     needs_guide: bool = MISSING
     learner: Annotated[str, one_of("agent", "imitation", "guides", "none")] = "agent"
-    search: dict[str, Any] = field(default_factory=dict)  # of the numbers of a guide
+    run: dict[str, Any] = field(default_factory=dict)  # instead of a training
 
 
 @dataclass
@@ -324,16 +325,16 @@ def agent_label(config: DictConfig) -> str:
     return learner if name == "ppo" else f"{name}_{learner}"
 
 
-def of_replay(what: str, otherwise: int, *, _root_: DictConfig) -> int:
-    """Return what a training on all scans of recordings takes, see `coil_rl.config.replay`.
+def whole_pass(what: str, otherwise: int, *, _root_: DictConfig) -> int:
+    """Return what `coil_rl.config.passive.whole_pass` does, which imports torch.
 
     Args:
         what: "num_envs", "steps" or "frames".
-        otherwise: the value in other envs.
+        otherwise: the value in an env that reacts.
     """
-    from coil_rl.config import replay
+    from coil_rl.config import passive
 
-    return replay.of_replay(_root_, what) if replay.replays(_root_) else otherwise
+    return passive.whole_pass(what, otherwise, _root_=_root_)
 
 
 def minibatches(count: int, *, _root_: DictConfig) -> int:
@@ -359,8 +360,8 @@ OmegaConf.register_new_resolver(
 # ${label}_seed${seed}_${fingerprint:}
 OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)
 OmegaConf.register_new_resolver("agent_label", lambda *, _root_: agent_label(_root_), replace=True)
-# ${of_replay:steps,2700}
-OmegaConf.register_new_resolver("of_replay", of_replay, replace=True)
+# ${whole_pass:steps,2700}
+OmegaConf.register_new_resolver("whole_pass", whole_pass, replace=True)
 
 _store = ConfigStore.instance().store
 
@@ -377,3 +378,41 @@ _store(name="evaluate_schema", node=_open_to_measures(EvaluateConfig))
 _store(name="report_schema", node=ReportConfig)
 _store(name="listen_schema", node=_open_to_measures(ListenConfig))
 _store(name="export_schema", node=ExportConfig)
+
+
+# The paper's method is the default in the worlds of this project. Elsewhere nobody knows how good
+# the guide is, and the default is the method that holds it.
+OWN_WORLDS = ("cone_track", "driving_tasks", "simulated_robot", "mcap_replay")
+
+
+def method_for(guide: Any) -> str:
+    """Return the method for an env of somebody else.
+
+    Args:
+        guide: what was given as the guide; None, or the file "none", for no guide.
+    """
+    return "ppo" if guide is None or guide == "none" else "coil_anchored"
+
+
+def default_method(env: str, guide: Any) -> str:
+    """Return the method of a run whose command names none.
+
+    Args:
+        env: name of the file in conf/env.
+        guide: name of the file in conf/guide, or several of them.
+    """
+    own = any(env == world or env.startswith(f"{world}_") for world in OWN_WORLDS)
+    return "coil" if own else method_for(guide)
+
+
+# In the defaults list of train.yaml: ${default_method:${env},${oc.select:guide,several}}
+OmegaConf.register_new_resolver("default_method", default_method, replace=True)
+
+
+def default_logger() -> str:
+    """Return the logger of a run whose command names none: metrics.csv is always written."""
+    return "none" if find_spec("tensorboard") is None else "tensorboard"
+
+
+# In the defaults list of train.yaml: ${default_logger:}
+OmegaConf.register_new_resolver("default_logger", default_logger, replace=True)

@@ -3,8 +3,8 @@
 Somebody else may have written it.
 
 Instantiating a configuration calls whatever its `_target_` keys name, and imports what `of` of a
-controller, the `controllers` of an env and the `id` of a Gymnasium env name as `MODULE:NAME`. So
-each of them must be on a list of full names before anything is imported:
+controller and the `id` of a Gymnasium env name as `MODULE:NAME`. So each of them must be on a list
+of full names before anything is imported:
 
 - what the shipped configuration names in the groups of a run, also as an alternative in a comment:
   a part that has its YAML file is on the list;
@@ -12,7 +12,7 @@ each of them must be on a list of full names before anything is imported:
 - what the configuration of the command itself names, because the command uses it anyway;
 - anything that is defined in a package that the user trusts.
 
-The logger of a run is not among them: `coil_rl.config.logger` takes it by its name. A constructor
+The logger of a run is not among them: `shipped_logger` takes it by its name. A constructor
 on the list may read a file that its arguments name, but must not write one.
 `docs/trust.md` has the trust model.
 """
@@ -26,10 +26,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import hydra.utils
+import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from coil_rl.config.guest_files import packages
+from coil_rl.config.compose import packages
+from coil_rl.config.nodes import build
 from coil_rl.errors import UserError, did_you_mean
+from coil_rl.extras import require
 from coil_rl.run.stopping import remember_trust
 
 ENTRY_POINTS = (
@@ -178,10 +181,7 @@ def _import_path(name: str, key: Any, value: Any) -> Any:
     """Return what an entry names to be imported, written with points only, else None."""
     if key == "_target_":
         return value
-    # The text under `controllers` may be at any depth, because keys may contain points.
-    names_code = (
-        key == "of" or re.search(r"\bcontrollers[.\[]", name) or (key == "id" and ":" in str(value))
-    )
+    names_code = key == "of" or (key == "id" and ":" in str(value))
     return value.replace(":", ".", 1) if names_code and isinstance(value, str) else None
 
 
@@ -214,7 +214,7 @@ def _check_target(target: Any, name: str, path: Path) -> None:
     entry_points = metadata.entry_points(group=ENTRY_POINTS).names
     if package not in NEVER_TRUSTED and package in _packages | entry_points:
         # A Gymnasium env is registered by its module, and has no name of its own there.
-        if not name.endswith(".id") or "controllers" in name:
+        if not name.endswith(".id"):
             _check_origin(entry, package)
     elif package in NEVER_TRUSTED:
         similar = did_you_mean(target, allowed) if package == "coil_rl" else ""
@@ -256,3 +256,78 @@ def _shipped_targets() -> frozenset[str]:
                     text = file.read_text(encoding="utf-8")
                     found |= set(re.findall(r"_target_: ([\w.]+)", text))
     return frozenset(found)
+
+
+# The packages of TorchRL's loggers, which are extras of this one.
+PACKAGES = {
+    "MLFlowLogger": "mlflow",
+    "TensorboardLogger": "tensorboard",
+    "TrackioLogger": "trackio",
+    "WandbLogger": "wandb",
+}
+PLAIN = r"[\w-]+"  # a name that is no path, no address and no reference
+
+
+def shipped_logger(node: Any) -> dict[str, Any] | None:
+    """Return the shipped logger that a configuration names; None if it is none of them.
+
+    Args:
+        node: what a folder has as its `logger`.
+    """
+    target = node.get("_target_") if isinstance(node, Mapping) else None
+    for shipped in _shipped_loggers():
+        if shipped["_target_"] == target:
+            plain = {key: node[key] for key in shipped if _fits(shipped[key], node.get(key))}
+            return shipped | plain
+    return None
+
+
+def _fits(shipped: Any, given: Any) -> bool:
+    """Return whether a value may take the place of a shipped one: both are names, or both flags."""
+    if isinstance(shipped, bool):
+        return isinstance(given, bool)
+    names = isinstance(shipped, str) and isinstance(given, str)
+    return names and all(re.fullmatch(PLAIN, text) for text in (shipped, given))
+
+
+def check_logger(node: Mapping[str, Any]) -> None:
+    """Check that the package of a logger is installed, before a run is begun.
+
+    Args:
+        node: of the logger.
+
+    Raises:
+        UserError: if it is missing.
+    """
+    package = PACKAGES.get(str(node["_target_"]).rpartition(".")[2])
+    if package is not None:
+        require("this logger (logger=none needs no package)", package, package)
+
+
+def make_logger(node: Any) -> Any:
+    """Return the logger of a run.
+
+    Args:
+        node: of the logger.
+
+    Raises:
+        UserError: for whatever the logger raises, such as without a log-in or a server.
+    """
+    try:
+        return build(node, "logger")
+    except UserError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error.__cause__ or error).split())[:300]
+        raise UserError(
+            f"logger: {node['_target_']} could not be started ({reason}); correct the cause, or "
+            "take logger=none"
+        ) from error
+
+
+@cache
+def _shipped_loggers() -> list[dict[str, Any]]:
+    """Return the loggers in `conf/logger`."""
+    files = (resources.files("coil_rl.conf") / "logger").iterdir()
+    texts = [file.read_text("utf-8") for file in files if file.name.endswith(".yaml")]
+    return [node for node in map(yaml.safe_load, texts) if node]

@@ -1,18 +1,21 @@
-"""Words of the command line that nothing reads: they would have no effect, and are refused."""
+"""Words of the command line that nothing reads: they would have no effect, and are refused.
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from functools import cached_property
+Some nodes are read by some runs only, or only where another value refers to them. This is known
+without building anything, so that a sweep of many runs can be asked before its first one.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.build import advises, env_maker, learner_kind, trains_guides
-from coil_rl.config.written import REFERENCE, Job, covers, key_of, leaves
+from coil_rl.config.compose import REFERENCE, Job, covers, key_of, leaves
+from coil_rl.config.parts import advises, env_maker, learner_kind, trains_guides
 from coil_rl.errors import UserError
 from coil_rl.report.configurations import is_part
 
-# Keys that other values refer to, and that nothing else reads.
+# Nodes that other values refer to, and that nothing else reads.
 REFERRED = (
     "preset",
     "track",
@@ -21,25 +24,13 @@ REFERRED = (
     "training.imitation_env",
     "budget.minibatches",
 )
-# Keys that no run reads that tunes its guide.
 OF_A_LEARNER = (
-    "learner",
-    "network",
-    "training.learning_rate",
-    "training.normalise",
-    "training.scale_rewards",
-    "training.noise_correlation",
-    "budget.num_envs",
-    "budget.steps",
-    "budget.minibatches",
-    "checkpoint_every",
-    "evaluation.repeats",
+    *("learner", "network", "checkpoint_every", "evaluation.repeats"),
+    *("budget.num_envs", "budget.steps", "training.normalise", "training.scale_rewards"),
 )
-# Keys that no run reads whose guide acts alone.
 OF_A_TRAINING = (
-    *("learner", "network", "training", "budget", "checkpoint_every", "logger", "watch"),
-    *("observes", "action", "compile", "evaluation.curve", "evaluation.guides"),
-    *("evaluation.repeats", "evaluation.policy"),
+    *("training", "budget", "logger", "watch", "observes", "action", "compile"),
+    *("evaluation.curve", "evaluation.guides", "evaluation.policy"),
 )
 
 
@@ -64,10 +55,55 @@ def unread(config: DictConfig, task: Iterable[str]) -> Iterator[str]:
         config: of the run, composed and checked.
         task: words for the program.
     """
-    reasons = Reasons(config)
+    closed = [*_unread_nodes(config)]
+    references = set(_references(config, closed))
     for text in task:
-        if reason := reasons.of(key_of(text)):
-            yield f"{text} has no effect: {reason}"
+        key = key_of(text)
+        noise = key == "training.noise_correlation" and not _adds_noise(config)
+        if (noise or is_part(key, (*closed, *REFERRED))) and not any(
+            covers(key, other) for other in references
+        ):
+            yield (
+                f"{text} has no effect: nothing in this run reads {key} "
+                f"(method={config.method.name}); leave it out"
+            )
+
+
+def _unread_nodes(config: DictConfig) -> Iterator[str]:
+    """Yield the nodes that a run does not read, whatever they hold."""
+    has_agent = config.method.observes is not None
+    learns = has_agent and not config.method.run
+    anchored = OmegaConf.select(config, "learner.anchor") is not None
+    if not has_agent:
+        yield from OF_A_TRAINING
+    if not learns:
+        yield from (*OF_A_LEARNER, "training.noise_correlation")
+    if not (anchored or config.delivery == "tested"):
+        yield "training.tests"
+    if not trains_guides(config):
+        yield "proxy"
+    if not advises(config):
+        yield "evaluation.advice"
+
+
+def _references(config: DictConfig, closed: Sequence[str]) -> Iterator[str]:
+    """Yield the keys that values refer to, but those in nodes that are not read.
+
+    A run without a learner has one row for each case, whatever the number of rows in its env.
+    """
+    left_out = (*closed, "env.num_envs") if "learner" in closed else closed
+    values: Any = OmegaConf.to_container(config, resolve=False)
+    for key, value in leaves(values, ""):
+        if isinstance(value, (str, list)) and not is_part(key, left_out):
+            yield from (name for name in REFERENCE.findall(str(value)) if name != key)
+
+
+def _adds_noise(config: DictConfig) -> bool:
+    """Return whether noise is added to the actions of a training, which are numbers then."""
+    if learner_kind(config) == "imitation":
+        return False
+    env = env_maker(config)()
+    return bool(env.full_action_spec[env.action_key].dtype.is_floating_point)
 
 
 def check_sweep(task: Iterable[str], jobs: Sequence[Job]) -> list[str]:
@@ -83,20 +119,28 @@ def check_sweep(task: Iterable[str], jobs: Sequence[Job]) -> list[str]:
     Raises:
         UserError: for the first word that none of them reads.
     """
-    rules = [Reasons(job.config) for job in jobs]
     sentences = []
     for text in task:
-        reasons = [rule.of_unchecked(key_of(text)) for rule in rules]
-        unread = [job for job, reason in zip(jobs, reasons, strict=True) if reason]
-        if unread and len(unread) == len(jobs):
-            raise UserError(f"{text} has no effect in any run of this sweep: {reasons[0]}")
-        if unread:
-            read = [job for job, reason in zip(jobs, reasons, strict=True) if not reason]
+        ignored = [_ignores(job.config, text) for job in jobs]
+        if jobs and all(ignored):
+            [sentence] = unread(jobs[0].config, [text])
+            raise UserError(sentence.replace("no effect", "no effect in any run of this sweep"))
+        if any(ignored):
+            ignoring = [job for job, each in zip(jobs, ignored, strict=True) if each]
+            others = [job for job, each in zip(jobs, ignored, strict=True) if not each]
             sentences.append(
-                f"{text} has no effect in the runs with {_told_apart(unread, read)}; the others "
-                "read it"
+                f"{text} has no effect in the runs with {_told_apart(ignoring, others)}; the "
+                "others read it"
             )
     return sentences
+
+
+def _ignores(config: DictConfig, text: str) -> bool:
+    """Return whether a run does not read a word; not if it is wrong, as its own check says."""
+    try:
+        return any(True for _ in unread(config, [text]))
+    except (UserError, OmegaConfBaseException):
+        return False
 
 
 def _told_apart(some: Sequence[Job], others: Sequence[Job]) -> str:
@@ -112,114 +156,3 @@ def _told_apart(some: Sequence[Job], others: Sequence[Job]) -> str:
     common = {*some[0].words}.intersection(*(job.words for job in (*some, *others)))
     each = [" ".join(word for word in job.words if word not in common) for job in some]
     return "; ".join(each)
-
-
-class Reasons:
-    """Why a run does not read a key.
-
-    Args:
-        config: of the run, composed and checked.
-    """
-
-    def __init__(self, config: DictConfig) -> None:
-        self.config, self.method = config, f"method={config.method.name}"
-        self.rules = (
-            self._of_proxies,
-            self._of_tests,
-            self._of_references,
-            self._of_method,
-            self._of_advice,
-            self._of_noise,
-        )
-
-    def of(self, key: str) -> str:
-        """Return why the run does not read a key, and what to do; empty if it may read it.
-
-        Args:
-            key: full key of a word.
-        """
-        return next(filter(None, (rule(key) for rule in self.rules)), "")
-
-    def of_unchecked(self, key: str) -> str:
-        """Return why nothing reads a key, as `of` does, for a configuration that was not checked.
-
-        The result is empty if the configuration is wrong: the check of its run says so.
-
-        Args:
-            key: full key of a word.
-        """
-        try:
-            return self.of(key)
-        except (UserError, OmegaConfBaseException):
-            return ""
-
-    def _of_proxies(self, key: str) -> str:
-        if not key.startswith("proxy.") or trains_guides(self.config):
-            return ""
-        return (
-            f"{self.method} trains no guides, for which a proxy would stand; leave it out, or take "
-            "method=dynamic_coil_sequential"
-        )
-
-    def _of_tests(self, key: str) -> str:
-        anchored = OmegaConf.select(self.config, "learner.anchor") is not None
-        tests = anchored or self.config.method.search or self.config.delivery == "tested"
-        if tests or not is_part(key, ["training.tests"]):
-            return ""
-        return (
-            "this run compares no policies while it trains; leave it out, or give delivery=tested"
-        )
-
-    def _of_references(self, key: str) -> str:
-        if not is_part(key, REFERRED) or _touches(key, self.references):
-            return ""
-        return f"nothing in this run reads {key}; leave it out"
-
-    def _of_method(self, key: str) -> str:
-        has_agent = self.config.method.observes is not None
-        if has_agent and not self.config.method.search:
-            return ""
-        unread = OF_A_LEARNER if has_agent else OF_A_TRAINING
-        if not is_part(key, unread) or _touches(key, self._references_beside(unread)):
-            return ""
-        what = "tunes its guide and has no learner" if has_agent else "trains nothing"
-        return f"{self.method} {what}; leave it out"
-
-    def _of_advice(self, key: str) -> str:
-        if not is_part(key, ["evaluation.advice"]) or advises(self.config):
-            return ""
-        return f"{self.method} gives the agent no advice that could be degraded; leave it out"
-
-    def _of_noise(self, key: str) -> str:
-        if key != "training.noise_correlation":
-            return ""
-        if learner_kind(self.config) == "imitation":
-            return f"{self.method} imitates, and explores without noise; leave it out"
-        env = env_maker(self.config)()
-        if env.full_action_spec[env.action_key].dtype.is_floating_point:
-            return ""
-        return "the actions of this env are choices, to which no noise is added; leave it out"
-
-    @cached_property
-    def references(self) -> set[str]:
-        """The keys that values of the configuration refer to."""
-        return self._references_beside(())
-
-    def _references_beside(self, unread: Collection[str]) -> set[str]:
-        """Return the keys that values refer to, but those that are not read.
-
-        Of an evaluation that is the number of rows, too: it has one for each case.
-        """
-        values: Any = OmegaConf.to_container(self.config, resolve=False)
-        found: set[str] = set()
-        for key, value in leaves(values, ""):
-            if unread and (is_part(key, unread) or key == "env.num_envs"):
-                continue
-            if isinstance(value, (str, list)):
-                found |= {name for name in REFERENCE.findall(str(value)) if name != key}
-        return found
-
-
-def _touches(key: str, others: Iterable[str]) -> bool:
-    """Return whether a key is one of some others, inside one, or around one."""
-    return any(covers(key, other) for other in others)

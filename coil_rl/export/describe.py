@@ -100,7 +100,7 @@ def title_of(plant: Any) -> str:
         plant: without transforms.
     """
     if isinstance(plant, GymnasiumEnv):
-        return plant.rows[0].gate.name
+        return plant.codec.name
     return type(plant).__name__
 
 
@@ -122,6 +122,7 @@ def guide_itself(controller: Controller, step: PolicyStep) -> str | None:
 def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
     tested = which == HANDED_OVER and run.delivery == "tested"  # so a test may have chosen it
     delivery = record.DELIVERY.read(run.folder) if tested else None
+    said = handed_over(run.folder) if tested else []
     method = run.settings.get("method") or {}
     acts = LEARNED
     if guide is not None:
@@ -134,7 +135,7 @@ def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
         "seed": run.seed,
         "frames": run.budget.frames,
         "which": which,
-        "chosen": (tested and handed_over(run.folder)) or "the last policy of the training",
+        "chosen": " ".join(said) or "the last policy of the training",
         "acts": acts,
         "actions": "deterministic",
     }
@@ -186,7 +187,7 @@ def _input(
 
 def _source(plant: GymnasiumEnv, key: list[str]) -> dict[str, Any]:
     """Return where an input is in the observation of a Gymnasium env."""
-    for entry in plant.entries:
+    for entry in plant.codec.entries:
         if list(entry.key) == key:
             start = torch.as_tensor(entry.start).reshape(-1)
             start = start.expand(len(entry.choices)) if entry.choices else start[:0]
@@ -217,7 +218,10 @@ def _action(plant: Any, step: PolicyStep, known: Mapping[str, Mapping[str, str]]
         meant["unit"] = "number of a choice"
     space = {"shape": shape, "dtype": dtype}
     if isinstance(plant, GymnasiumEnv):
-        space = {"shape": list(plant.space.shape or ()), "dtype": str(plant.space.dtype)}
+        space = {
+            "shape": list(plant.codec.actions.space.shape or ()),
+            "dtype": str(plant.codec.actions.space.dtype),
+        }
     numbers = (
         _numbering(step) if step.space.choices else {"bounds": _bounds(spec, plant.batch_dims)}
     )

@@ -74,7 +74,7 @@ def expected(step: PolicyStep, recording: Recording, limit: float) -> Rows:
             inputs = [recording.value(number, entry.key) for entry in step.inputs]
             rows.append([*inputs, *state])
             action, *state = step(*rows[-1])
-            own = step.executed(recording.actions[number])
+            own = step.space.executed(recording.actions[number])
             difference = float(_difference(step, action, own))
             if not difference <= limit:
                 raise NotExportableError(
@@ -106,7 +106,7 @@ def compare(
         NotExportableError: if it differs by too much.
     """
     session = Session(content, names_of(step)[1])
-    own = step.executed(torch.cat(recording.actions))
+    own = step.space.executed(torch.cat(recording.actions))
     before = time.process_time()
     one_by_one = _called(step, session, recording, tick)
     seconds = time.process_time() - before

@@ -80,7 +80,7 @@ def record(
     env = transformed(bare(1, TRAIN, None), [], "env").eval()
     env.set_seed(seed)
     keys = [*env.base_env.observation_spec.keys()]
-    recording, heard = Recording(), _Heard(controller)
+    recording, heard = Recording(), Heard(controller)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         episode, steps = -1, 0
@@ -110,7 +110,7 @@ def record(
     return recording
 
 
-class _Heard:
+class Heard:
     """Listens to the guides of a controller.
 
     Args:

@@ -3,28 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.errors import UserError
+from coil_rl.extras import require
 
 Arrays = Mapping[str, NDArray[Any]]
-
-
-def require(*modules: str) -> None:
-    """Raise a `UserError` if a module of the extra `export` is missing.
-
-    Args:
-        modules: their names.
-    """
-    missing = [name for name in modules if find_spec(name) is None]
-    if missing:
-        raise UserError(
-            f"exported policies need {', '.join(missing)}: python -m pip install 'coil-rl[export]'"
-        )
 
 
 class Session:
@@ -40,7 +27,7 @@ class Session:
     """
 
     def __init__(self, content: bytes, outputs: Sequence[str], threads: int = 1) -> None:
-        require("onnxruntime")
+        require("an exported policy", "export", "onnxruntime")
         import onnxruntime
 
         options = onnxruntime.SessionOptions()

@@ -1,14 +1,12 @@
 """One step of a controller as a function of tensors, which can be written to a file.
 
-`Controller` applies the chain of an evaluation to observations: guides, transforms, normaliser,
-policy, and what the transforms make of its action. Here the same modules are called in the same
-order, but what they remember between two steps is an input and an output: nothing but the entries
-of the env and this state decides the action.
+It is the chain of the controller, with a plain tensor for each entry that it reads, and for each
+number that it remembers between two steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,32 +14,20 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.envs import (
-    Compose,
-    InitTracker,
-    RewardSum,
-    StepCounter,
-    TensorDictPrimer,
-    Transform,
-)
 from torchrl.modules import GRUModule
 
 from coil_rl.export.gru import WrittenGru
 from coil_rl.learners.critics import Critics
 from coil_rl.run.controller import Controller
 from coil_rl.transforms import GuideActions
-from coil_rl.transforms.action_space import ActionSpace, space_of
-from coil_rl.transforms.advice_dropout import AdviceDropout
-from coil_rl.transforms.combined_actions import AdaptiveMixedAction, CombinedAction
+from coil_rl.transforms.action_space import space_of
+from coil_rl.transforms.chain import Chain, Other, links_of
 from coil_rl.transforms.degraded_advice import DegradedAdvice
-from coil_rl.transforms.disturbance import Disturbance
-from coil_rl.transforms.guide_transform import GuideTransform, SeededGenerator
+from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.last_action import LastAction
+from coil_rl.transforms.link import Link, State
 
 ADVICE = "guide_action"  # input for the actions of guides that are outside
-# Transforms that neither change what the policy sees nor what it does. A controller takes off what
-# disturbs its env.
-WITHOUT_EFFECT = (Disturbance, InitTracker, RewardSum, StepCounter, TensorDictPrimer)
 
 
 class NotExportableError(Exception):
@@ -80,178 +66,46 @@ class Entry:
         return first.expand(count, *self.shape).clone()
 
 
-class _Part:
-    """What a transform does before the policy acts, and after."""
-
-    state: Sequence[Entry] = ()  # what it remembers
-    reads: Sequence[NestedKey] = ()  # entries that it reads
-
-    def observe(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
-        """Write what the policy sees, and what is remembered for the next step."""
-
-    def act(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
-        """Replace the action."""
-
-
-class _Advice(_Part):
-    """The guides of a run.
+class GivenAdvice(Link):
+    """The actions of guides that are outside, which are an input in the unit of the env.
 
     Args:
-        transform: has the guides.
-        inside: whether they are a part of the function; otherwise their actions are an input, in
-            the unit and numbering of the env.
+        guides: the transform of the run that has these guides.
     """
 
-    def __init__(self, transform: GuideActions, inside: bool) -> None:
-        self.transform, self.inside = transform, inside
-        self.space: ActionSpace = transform.guide_space
-        self.given: ActionSpace = transform.given_space
-        self.normalise = transform.given_units
-        self.clamp = transform.action_space.clamp
-        self.state, self.reads = [], [ADVICE]
-        if inside:
-            self.state, self.reads = self._state(), list(transform.guides.in_keys)
-
-    def _state(self) -> list[Entry]:
-        entries = []
-        for name, memory in self.transform.guides.memories.items():
-            start = memory.start(torch.Size([1]), None)
-            for key in memory.specs:
-                first = start[key][0]
-                own = ("guide_state", name, *([key] if isinstance(key, str) else key))
-                entries.append(Entry(own, tuple(first.shape), first.dtype, first))
-        supplied = self.transform.supplied
-        if "row" in supplied:
-            raise NotExportableError("a guide asks for the number of its row")
-        if "is_init" in supplied:
-            entries.append(Entry("is_init", (1,), torch.bool, torch.ones(1, dtype=torch.bool)))
-        if "last_action" in supplied:
-            shape = (*self.given.agents, self.given.size)
-            first = torch.zeros(shape, dtype=self.given.dtype)
-            entries.append(Entry("last_action", shape, first.dtype, first))
-        return entries
+    def __init__(self, guides: GuideActions) -> None:
+        super().__init__(in_keys=[], out_keys=[])
+        self.guides = guides
 
     @property
-    def outside(self) -> Entry:
-        """The input for the actions of guides that are outside."""
-        names = len(self.transform.names)
-        if self.given.choices:
-            shape = (*self.given.agents, names, len(self.given.choices))
-            return Entry(ADVICE, shape, torch.int64)
-        return Entry(ADVICE, (*self.given.agents, names, self.given.size), self.given.dtype)
+    def entry(self) -> Entry:
+        """The input."""
+        space, names = self.guides.given_space, len(self.guides.names)
+        size, dtype = (
+            (len(space.choices), torch.int64) if space.choices else (space.size, space.dtype)
+        )
+        return Entry(ADVICE, (*space.agents, names, size), dtype)
 
-    def observe(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
-        if not self.inside:
-            actions = data[ADVICE].unbind(-2)
-            data.set(ADVICE, torch.stack([self._fitted("", each, ()) for each in actions], -2))
-            return
-        guides = self.transform.guides
-        memory = TensorDict({}, data.batch_size)
-        for name in guides.memories:
-            memory.set(name, data["guide_state", name])
-        advice = guides.advice(data, self._fitted, memory)
-        for entry in self.state:
-            if entry.key == "is_init":
-                after["is_init"] = torch.zeros_like(data["is_init"])
-            elif entry.key != "last_action":
-                after[entry.key] = memory[entry.key[1:]]
-        data.set(self.transform.out_keys[0], advice)
-
-    def _fitted(self, name: str, action: Tensor, batch: Any) -> Tensor:
-        """Return the action of a guide as the policy sees it; see `GuideActions`."""
-        advice = self.space.advice(action, action.shape[:1])
-        return advice if self.normalise is None else self.clamp(self.normalise.normalise(advice))
+    def observe(self, data: TensorDictBase, state: State) -> State:
+        """Write the advice as the policy sees it."""
+        space, actions = self.guides.guide_space, data[ADVICE].unbind(-2)
+        rows = [self.guides.observed(space.advice(each, data.batch_size)) for each in actions]
+        data.set(self.guides.out_keys[0], torch.stack(rows, -2))
+        return state
 
 
-class _Combined(_Part):
-    """An action that is combined of those of agent and guide."""
+class WrittenPolicy(nn.Sequential):
+    """The modules of a policy, with memories written out.
 
-    def __init__(self, transform: CombinedAction) -> None:
-        self.transform = transform
-        self.reads = [transform.advice_key]
-        if isinstance(transform, AdaptiveMixedAction):
-            first = torch.full((1,), transform.low, dtype=transform.action_space.dtype)
-            self.state = [Entry("agent_weight", (1,), first.dtype, first)]
+    Args:
+        policy: the policy.
+    """
 
-    def act(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
-        data.set(self.transform.action_key, self.transform._executed(data))
-        if isinstance(self.transform, AdaptiveMixedAction):
-            doubt = data.get(("next", "uncertainty"), None)
-            after["agent_weight"] = self.transform.weight_after(data["agent_weight"], doubt)
-
-
-class _Dropout(_Part):
-    """Advice that is missing in some episodes of a training; outside of one it is there, or not."""
-
-    def __init__(self, transform: AdviceDropout) -> None:
-        self.transform = transform
-        self.reads = [transform.advice_key]
-
-    def observe(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
-        shape, device = (*data.batch_size, 1), data[self.transform.advice_key].device
-        given = torch.full(shape, self.transform.in_evaluation, device=device)
-        self.transform._write(data, given)
-
-
-class _LastAction(_Part):
-    """The actions that the agent chose in the steps before."""
-
-    def __init__(self, transform: LastAction) -> None:
-        self.transform, self.key = transform, transform.out_key
-        first = transform.observation_at_start[0]
-        # Not the entry itself: a guide may read the executed action by the same key.
-        own = ("past", *([self.key] if isinstance(self.key, str) else self.key))
-        self.past = Entry(own, tuple(first.shape), first.dtype, first)
-        self.state = [self.past]
-
-    def observe(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
-        data.set(self.key, data[self.past.key])
-
-    def act(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
-        newest = self.transform.action_space.vectors(data[self.transform.action_key])
-        after[self.past.key] = self.transform.shifted(data[self.past.key], newest)
-
-
-class _Other(_Part):
-    """Any other transform, which must not remember anything."""
-
-    def __init__(self, transform: Transform) -> None:
-        name = type(transform).__name__
-        if isinstance(transform, DegradedAdvice):
-            draws = any(isinstance(part, SeededGenerator) for part in transform.modules())
-            if draws or transform.slots or transform.needs_past:
-                raise NotExportableError(
-                    f"{name} degrades the advice at random or by that of earlier steps, which is "
-                    "for experiments only; train without degrade"
-                )
-        elif getattr(transform, "needs_past", False):
-            raise NotExportableError(f"{name} remembers earlier steps in a way of its own")
-        self.transform = transform
-        self.reads = list(transform.in_keys or ())
-
-    def observe(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
-        self.transform._call(data)
-
-    def act(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
-        if not isinstance(self.transform, (DegradedAdvice, GuideTransform)):
-            data.update(self.transform._inv_call(data))
-
-
-class _Memory(_Part):
-    """What the policy itself remembers."""
-
-    def __init__(self, policy: TensorDictModuleBase, env: Any) -> None:
-        keys = [key[1:] for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
-        self.state = []
-        for (key,) in keys:
-            spec = env.observation_spec.get(key, None)
-            if spec is not None:
-                first = spec.zero()[0]
-                self.state.append(Entry(key, tuple(first.shape), first.dtype, first))
-
-    def act(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
-        for entry in self.state:
-            after[entry.key] = data["next", entry.key]
+    def __init__(self, policy: TensorDictModuleBase) -> None:
+        modules = list(_flat(policy))
+        whole = TensorDictSequential(*modules)
+        super().__init__(*modules)
+        self.in_keys, self.out_keys = list(whole.in_keys), list(whole.out_keys)
 
 
 class PolicyStep(nn.Module):
@@ -274,24 +128,35 @@ class PolicyStep(nn.Module):
 
     def __init__(self, controller: Controller, *, inside: bool = True) -> None:
         super().__init__()
-        env, plant = controller.env, controller.plant
-        self.policy = nn.ModuleList(_flat(controller.policy))
-        self.transforms = nn.ModuleList(_transforms(env.transform))
-        self.parts = [_part(each, inside) for each in self.transforms]
-        self.parts.append(_Memory(controller.policy, env))
-        advice = next((part for part in self.parts if isinstance(part, _Advice)), None)
-        if advice is not None and not inside:
-            others = [part for part in self.parts if part is not advice]
-            if ADVICE not in {*controller.policy.in_keys, *(k for p in others for k in p.reads)}:
-                self.parts, advice = others, None
-        self.state = [entry for part in self.parts for entry in part.state]
-        self.inputs = _inputs(plant, self.parts, controller.policy)
-        self.guides = [] if advice is None else advice.transform.names
-        if advice is not None and not inside:
-            self.inputs.append(advice.outside)
-        self.action_key = env.action_key
+        plant, policy = controller.plant, WrittenPolicy(controller.policy)
+        links = exportable(controller)
+        guides = next((each for each in links if isinstance(each, GuideActions)), None)
+        given = None if inside or guides is None else GivenAdvice(guides)
+        if inside and guides is not None and "row" in guides.supplied:
+            raise NotExportableError("a guide asks for the number of its row")
+        if given is not None:
+            others: list[Any] = [each for each in links if each is not guides]
+            if not any(ADVICE in part.in_keys for part in (*others, policy)):
+                links, guides, given = others, None, None
+            else:
+                links = [given if each is guides else each for each in links]
+        self.guides = [] if guides is None else guides.names
+        self.chain = Chain(controller.env, policy, links)
+        self.inputs = [_input(plant, key) for key in self.chain.reads]
+        if given is not None:
+            self.inputs.append(given.entry)
         self.space = space_of(plant, plant.action_key)
         self.eval().requires_grad_(False)
+        first = self.chain.remembered(self.chain.first(TensorDict({}, [1])))
+        self.places = list(first)
+        self.state = [self._entry(*place, value[0]) for place, value in first.items()]
+
+    def _entry(self, number: int, key: NestedKey, first: Tensor) -> Entry:
+        """Return an entry of the state."""
+        # A guide may remember the executed action by the key of the agent's own ones.
+        if isinstance(self.chain.links[number], LastAction):
+            key = ("past", *((key,) if isinstance(key, str) else key))
+        return Entry(key, tuple(first.shape), first.dtype, first)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
         """Return the action and the state for the next step.
@@ -300,29 +165,14 @@ class PolicyStep(nn.Module):
             tensors: `inputs`, then `state`, [B, ...] each.
         """
         data = TensorDict({}, tensors[0].shape[:1])
-        for entry, tensor in zip((*self.inputs, *self.state), tensors, strict=True):
+        past = self.chain.first(data)
+        for (number, key), tensor in zip(self.places, tensors[len(self.inputs) :], strict=True):
+            past[number][key] = tensor
+        for entry, tensor in zip(self.inputs, tensors, strict=False):
             data.set(entry.key, tensor)
-        after: dict[NestedKey, Tensor] = {}
-        for part in self.parts:
-            part.observe(data, after)
-        for module in self.policy:
-            data = module(data)
-        for part in reversed(self.parts):
-            part.act(data, after)
-        action = data[self.action_key]
-        after["last_action"] = self.space.clamp(self.space.vectors(action))
-        return (self.executed(action), *(after[entry.key] for entry in self.state))
-
-    def executed(self, action: Tensor) -> Tensor:
-        """Return an action in the numbering of the env, and within its bounds.
-
-        Args:
-            action: as an entry of the env, [B, *A].
-        """
-        if self.space.continuous:
-            return self.space.clamp(action)
-        first = self.space.first
-        return action if first is None else action + first.to(action).reshape(action.shape[1:])
+        data, past = self.chain(data, past)
+        action = self.space.executed(data[self.chain.action_key])
+        return (action, *(past[number][key] for number, key in self.places))
 
 
 def _flat(policy: TensorDictModuleBase) -> Iterable[TensorDictModuleBase]:
@@ -340,38 +190,23 @@ def _flat(policy: TensorDictModuleBase) -> Iterable[TensorDictModuleBase]:
         yield policy
 
 
-def _transforms(transform: Transform) -> Iterable[Transform]:
-    """Yield the transforms that have an effect on what a policy sees or does."""
-    if isinstance(transform, Compose):
-        for each in transform.transforms:
-            yield from _transforms(each)
-    elif not isinstance(transform, WITHOUT_EFFECT):
-        yield transform
+def exportable(controller: Controller) -> list[Link]:
+    """Return the links of a controller; a `NotExportableError` for one that no function can be."""
+    links = list(links_of(controller.env.transform, tensors=True))
+    for link in links:
+        if isinstance(link, DegradedAdvice):
+            draws = any(isinstance(part, SeededGenerator) for part in link.modules())
+            if draws or link.slots or link.needs_past:
+                raise NotExportableError(
+                    f"{type(link).__name__} degrades the advice at random or by that of earlier "
+                    "steps, which is for experiments only; train without degrade"
+                )
+        elif isinstance(link, Other) and getattr(link.transform, "needs_past", False):
+            name = type(link.transform).__name__
+            raise NotExportableError(f"{name} remembers earlier steps in a way of its own")
+    return links
 
 
-def check_transforms(controller: Controller) -> None:
-    """Raise a `NotExportableError` for a transform of a controller that no function can be."""
-    for each in _transforms(controller.env.transform):
-        _part(each, inside=False)
-
-
-def _part(transform: Transform, inside: bool) -> _Part:
-    if isinstance(transform, GuideActions):
-        return _Advice(transform, inside)
-    if isinstance(transform, CombinedAction):
-        return _Combined(transform)
-    if isinstance(transform, AdviceDropout):
-        return _Dropout(transform)
-    if isinstance(transform, LastAction):
-        return _LastAction(transform)
-    return _Other(transform)
-
-
-def _inputs(plant: Any, parts: Iterable[_Part], policy: TensorDictModuleBase) -> list[Entry]:
-    """Return the entries of an env that are read."""
-    read = {key for part in parts for key in part.reads} | set(policy.in_keys)
-    entries = []
-    for key, spec in plant.observation_spec.items(True, True):
-        if key in read:
-            entries.append(Entry(key, tuple(spec.shape[plant.batch_dims :]), spec.dtype))
-    return entries
+def _input(plant: Any, key: NestedKey) -> Entry:
+    spec = plant.observation_spec[key]
+    return Entry(key, tuple(spec.shape[plant.batch_dims :]), spec.dtype)

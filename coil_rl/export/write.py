@@ -18,11 +18,12 @@ from coil_rl.export.files import as_onnx, as_torch, traced
 from coil_rl.export.parity import LIMIT, WITH_GUIDE, Parity, compare, expected
 from coil_rl.export.policy import ExportedPolicy
 from coil_rl.export.recording import Recording, record
-from coil_rl.export.session import require
-from coil_rl.export.step import NotExportableError, PolicyStep, check_transforms
+from coil_rl.export.step import NotExportableError, PolicyStep, exportable
+from coil_rl.extras import require
 from coil_rl.files import temporary
-from coil_rl.foreign.controllers import EntryGuide, PerRow
-from coil_rl.foreign.functions import FunctionGuide
+from coil_rl.foreign.controllers import PerRow
+from coil_rl.foreign.shared import FunctionGuide
+from coil_rl.guides.simple import EntryGuide
 from coil_rl.output import progress, say
 from coil_rl.run.controller import Controller
 from coil_rl.run.folder import HANDED_OVER
@@ -59,11 +60,11 @@ def export_policy(
         UserError: without the extra `export`, for a policy that cannot be exported, and for one
             that acts differently.
     """
-    require("onnx", "onnxscript", "onnxruntime")
+    require("an exported policy", "export", "onnx", "onnxscript", "onnxruntime")
     check_range(1, 1_000_000, observations=observations)
     controller = run.controller(which)
     try:
-        check_transforms(controller)
+        exportable(controller)
     except NotExportableError as error:
         raise UserError(_impossible(run, str(error))) from error
     recording = _recorded(run, controller, observations, seed)

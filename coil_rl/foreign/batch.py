@@ -14,51 +14,18 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.data import Bounded, TensorSpec
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.envs.seeded_env import SeededEnv
+from coil_rl.foreign.rows import Entries, Shard
 
 SEEDS = 2**31  # seeds of drawn episodes are below
 REMEMBERED = 20_000  # steps; a longer episode is not repeated when a state is restored
 
 
-class RowsInTurn:
-    """Single envs that are stepped one after the other.
-
-    Attributes:
-        rows: `begin(seed)` begins an episode, `step(action)` takes one step, or none if the episode
-            is over; then the row stays as it is, with reward 0.
-    """
-
-    rows: Sequence[Any]
-
-    def begin_rows(self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]) -> None:
-        """Begin episodes, and take some actions in each.
-
-        Args:
-            seeds: by row.
-            actions: by row, as the rows take them; a row that is missing takes none.
-        """
-        for row, seed in seeds.items():
-            self.rows[row].begin(seed)
-            for action in actions.get(row, ()):
-                self.rows[row].step(action)
-
-    def step_rows(self, actions: Any) -> None:
-        """Take a step in all rows.
-
-        Args:
-            actions: of all rows, as they take them.
-        """
-        for row, action in zip(self.rows, actions, strict=True):
-            row.step(action)
-
-
-class SeededRows(RowsInTurn, SeededEnv):
+class SeededRows(SeededEnv):
     """Base of batched envs made of single ones; every episode begins with a seed of its own.
 
     `state_dict` holds the generator and, for each running episode, its seed and actions.
@@ -67,8 +34,7 @@ class SeededRows(RowsInTurn, SeededEnv):
     20,000 steps, a warning is given, and the env must be reset.
 
     Args:
-        rows: the single envs, see `RowsInTurn`. A subclass may have some of them elsewhere; then it
-            has its own `begin_rows` and `step_rows`.
+        shard: the single envs.
         count: B, number of rows.
         seed: of the draw of the episodes' seeds, at least 0.
         first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
@@ -85,7 +51,7 @@ class SeededRows(RowsInTurn, SeededEnv):
 
     def __init__(
         self,
-        rows: Sequence[Any],
+        shard: Shard,
         count: int,
         seed: int,
         first_seed: int | None,
@@ -97,7 +63,8 @@ class SeededRows(RowsInTurn, SeededEnv):
         if cases is not None and first_seed is None:
             raise ValueError(f"cases={cases} needs first_seed, the seed of the first case")
         super().__init__(device=torch.device(device), batch_size=torch.Size([count]))
-        self.rows, self.first_seed, self.cases = rows, first_seed, cases or count
+        self.shard, self.first_seed, self.cases = shard, first_seed, cases or count
+        self.parts: list[Entries] = []  # of all rows, as the processes returned them
         self.generator = torch.Generator()
         self.seeds: list[int] = []  # of the running episodes; none before the first reset
         self.ages = np.zeros(count, dtype=np.int64)  # steps since the reset
@@ -113,6 +80,12 @@ class SeededRows(RowsInTurn, SeededEnv):
     def _output(self, *, stepped: bool) -> TensorDict:
         """Return the entries of all rows after a reset, or after a step."""
 
+    def begin(
+        self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]] | None = None
+    ) -> None:
+        """Begin episodes, see `Shard`."""
+        self.parts[:] = self.shard.begin(seeds, actions or {})
+
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None or not self.seeds else tensordict.get("_reset", None)
         count = self.batch_size[0]
@@ -124,7 +97,7 @@ class SeededRows(RowsInTurn, SeededEnv):
         ended = list(range(count))
         if mask is not None:
             ended = mask.view(-1).nonzero().view(-1).tolist()
-        self.begin_rows({row: seeds[row] for row in ended}, {})
+        self.begin({row: seeds[row] for row in ended})
         for row in ended:
             self.seeds[row], self.ages[row] = seeds[row], 0
         while len(self.actions) > self.ages.max():
@@ -135,36 +108,8 @@ class SeededRows(RowsInTurn, SeededEnv):
         actions = tensordict[self.action_key].detach().cpu().numpy().copy()
         self.actions.append(actions)
         np.add(self.ages, 1, out=self.ages)  # PyTorch's checks of a new attribute take longer
-        self.step_rows(self._decode(actions))
+        self.parts[:] = self.shard.step(self._decode(actions))
         return self._output(stepped=True)
-
-    def unrepeated(self, steps: int = 10) -> NestedKey | None:
-        """Return an entry that differs when an episode of one seed is repeated; None if none does.
-
-        Another episode lies between the two. The running episodes of the env are lost.
-
-        Args:
-            steps: of random actions, the same ones in both episodes.
-        """
-        with torch.random.fork_rng():
-            torch.manual_seed(0)
-            actions = [_probe(self.action_spec).cpu().numpy() for _ in range(steps)]
-        episodes = [self._driven(seed, actions) for seed in (0, 1, 0)]
-        self.seeds, self.ages[:] = [], 0
-        for first, again in zip(episodes[0], episodes[-1], strict=True):
-            for key, value in first.items(True, True):
-                if not _same(value, again[key]):
-                    return key
-        return None
-
-    def _driven(self, seed: int, actions: Sequence[NDArray[Any]]) -> list[TensorDict]:
-        """Return the entries of an episode that begins with a seed in every row."""
-        self.begin_rows(dict.fromkeys(range(self.batch_size[0]), seed), {})
-        data = [self._output(stepped=False).clone()]
-        for action in actions:
-            self.step_rows(self._decode(action))
-            data.append(self._output(stepped=True).clone())
-        return data
 
     def _observed(self) -> TensorDictBase:
         return self._output(stepped=False).select(*self.observation_spec.keys(True, True))
@@ -196,7 +141,7 @@ class SeededRows(RowsInTurn, SeededEnv):
         taken = {}
         if self.continues:
             taken = {row: steps[longest - age :, row] for row, age in enumerate(self.ages)}
-        self.begin_rows(dict(enumerate(self.seeds)), taken)
+        self.begin(dict(enumerate(self.seeds)), taken)
         self.continues = self.continues and _same(self._observed().to_dict(), state["observed"])
         if not self.continues:
             warnings.warn(
@@ -204,17 +149,6 @@ class SeededRows(RowsInTurn, SeededEnv):
                 f"{self.remedy}",
                 stacklevel=2,
             )
-
-
-def _probe(spec: TensorSpec) -> Tensor:
-    """Return a random action; a number without a lower or upper bound is near 0, or its bound."""
-    action: Tensor = spec.rand()
-    if not isinstance(spec, Bounded) or action.isfinite().all():
-        return action
-    near = torch.rand(spec.shape, dtype=spec.dtype, device=spec.device).clamp(
-        spec.space.low, spec.space.high
-    )
-    return torch.where(action.isfinite(), action, near)
 
 
 def _same(one: Any, other: Any) -> bool:

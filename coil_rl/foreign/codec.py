@@ -1,4 +1,4 @@
-"""Gymnasium's spaces as specs and entries of TorchRL.
+"""A space of Gymnasium as entries, specs and actions of TorchRL, and back.
 
 A guide or policy of this project reads tensors of numbers. So a choice becomes a one-hot vector,
 and nested Dict and Tuple spaces become nested keys.
@@ -7,7 +7,7 @@ and nested Dict and Tuple spaces become nested keys.
 import math
 import warnings
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from torchrl.data import (
 )
 
 from coil_rl.foreign.faults import ForeignError, plain_array, shown
+from coil_rl.foreign.makers import Env
 
 MOST_CHOICES = 32  # of a whole number that is an action
 WATCHED = 256  # first observations, in which the range of each number is found
@@ -80,7 +81,7 @@ class Choices:
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         self.sizes, self.shape = _choices(space), tuple(space.shape or ())
-        self.first = torch.as_tensor(np.ravel(start(space)).astype(np.int64))
+        self.first = torch.as_tensor(np.ravel(_start(space)).astype(np.int64))
 
     def __call__(self, vectors: torch.Tensor) -> torch.Tensor:
         """Return the choices, [*batch, *shape] with the shape of the space, as whole numbers.
@@ -107,7 +108,7 @@ class Entry:
     def __init__(
         self, id: str, path: tuple[str | int, ...], space: spaces.Space[Any], floats: np.dtype[Any]
     ) -> None:
-        self.path, self.dtype, self.start = path, floats, start(space)
+        self.path, self.dtype, self.start = path, floats, _start(space)
         self.space, self.shape = space, tuple(space.shape or ())
         self.binary = isinstance(space, spaces.MultiBinary)
         # Not the entry of a Dict space: the observation itself, or within a Tuple.
@@ -254,7 +255,7 @@ def _are_finite(numbers: NDArray[Any]) -> bool:
     return bool(np.isfinite(numbers).all())
 
 
-def leaves(
+def _leaves(
     space: spaces.Space[Any], path: tuple[str | int, ...] = ()
 ) -> Iterator[tuple[Any, spaces.Space[Any]]]:
     """Yield the path and the space of all entries but texts.
@@ -265,10 +266,10 @@ def leaves(
     """
     if isinstance(space, spaces.Dict):
         for name, part in space.spaces.items():
-            yield from leaves(part, (*path, name))
+            yield from _leaves(part, (*path, name))
     elif isinstance(space, spaces.Tuple):
         for index, part in enumerate(space.spaces):
-            yield from leaves(part, (*path, index))
+            yield from _leaves(part, (*path, index))
     elif space.dtype is None or space.dtype.kind != "U":
         yield path, space
 
@@ -286,115 +287,223 @@ def _choices(space: spaces.Space[Any]) -> list[int]:
     return [int(size) for size in np.ravel(sizes)]
 
 
-def start(space: spaces.Space[Any]) -> Any:
+def _start(space: spaces.Space[Any]) -> Any:
     """Return the lowest value of a Discrete or MultiDiscrete space; 0 for another."""
     return getattr(space, "start", 0)
 
 
-def lowest_choices(space: spaces.Space[Any]) -> Any:
-    """Return the lowest number of each choice of an action; 0 for real numbers."""
-    if has_whole_numbers(space):
-        return space.low.astype(np.int64)
-    return start(space)
-
-
-def has_whole_numbers(space: spaces.Space[Any]) -> TypeGuard[spaces.Box]:
-    """Return whether a space is a Box of whole numbers, each of which is a choice as an action."""
-    return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.integer)
-
-
-def _whole_numbers(id: str, space: spaces.Box) -> TensorSpec:
-    """Return the spec of an action of whole numbers: a few are choices, more a `ValueError`."""
-    sizes = space.high.astype(np.float64) - space.low.astype(np.float64) + 1
-    if len(space.shape) != 1 or sizes.max() > MOST_CHOICES:
-        raise ValueError(
-            f"the action of {id} is a {space} of whole numbers, which are choices, but only up to "
-            f"{MOST_CHOICES} of each and in one dimension: replace it with a wrapper"
-        )
-    return MultiCategorical([int(size) for size in sizes], dtype=torch.int64)
-
-
-def _fine_enough(space: spaces.Box, dtype: torch.dtype) -> torch.dtype:
-    """Return the dtype of an action: float64 where its range has too few steps of the given one.
+class Actions:
+    """The actions of an env as numbers of TorchRL, and back.
 
     Args:
-        space: of the action; one that is as coarse itself needs no finer dtype.
-        dtype: of other actions.
-    """
-    if space.dtype.kind != "f" or space.dtype.itemsize <= dtype.itemsize:
-        return dtype
-    # From a single bound on, actions count in units of 1.
-    low, high = (
-        np.where(np.isfinite(bound), bound, other + side)
-        for bound, other, side in ((space.low, space.high, -1), (space.high, space.low, 1))
-    )
-    floats = torch.empty(0, dtype=dtype).numpy().dtype
-    with np.errstate(all="ignore"):  # of coordinates without bounds, and of very large ones
-        count = (high - low) / np.spacing(np.maximum(abs(low), abs(high)).astype(floats))
-    return torch.float64 if (count < COARSE).any() else dtype
-
-
-def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> TensorSpec:
-    """Return the spec of an action of one env; a matrix of real numbers is a vector.
-
-    Args:
-        id: of the env, for the `ValueError` about a space that is not supported.
+        name: of the env, for messages.
         space: of the action.
         dtype: of actions that are real numbers, unless it is too coarse for their range.
+
+    Attributes:
+        spec: of an action of one env; a matrix of real numbers is a vector.
+        first: lowest number of each choice, if not 0.
+        own_shape: shape of an action as controllers give it, where it is a matrix.
+
+    Raises:
+        ValueError: for a space that is not supported, or leaves nothing to choose: for what is no
+            space of Gymnasium, for one without a number, and for bounds that are NaN, equal or in
+            the wrong order.
     """
-    if has_whole_numbers(space):
-        return _whole_numbers(id, space)
-    if isinstance(space, spaces.Box):
-        shape = (math.prod(space.shape),)
+
+    def __init__(self, name: str, space: Any, dtype: torch.dtype) -> None:
+        self.name, self.space, self.dtype = name, space, dtype
+        is_box = isinstance(space, spaces.Box)
+        self.whole = is_box and np.issubdtype(space.dtype, np.integer)
+        self.real = is_box and not self.whole
+        self._check()
+        self.spec = self._spec()
+        self.own_shape = space.shape if self.real and len(space.shape) > 1 else None
+        self.lowest = space.low.astype(np.int64) if self.whole else _start(space)
+        lowest = torch.as_tensor(self.lowest).reshape(-1)
+        self.first = lowest if lowest.any() else None
+
+    def _check(self) -> None:
+        space = self.space
+        if not isinstance(space, spaces.Space):
+            raise ValueError(
+                f"the action_space of {self.name} is {shown(space)}, not a space of Gymnasium: set "
+                "it in its __init__"
+            )
+        if not isinstance(space, spaces.Box):
+            return
+        if 0 in space.shape:
+            raise ValueError(
+                f"the action of {self.name} has the shape {list(space.shape)}: it has no number"
+            )
+        low, high = np.ravel(space.low), np.ravel(space.high)
+        for index in np.flatnonzero(~(low < high))[:1]:
+            raise ValueError(
+                f"number {index} of the action of {self.name} has the bounds {low[index]} and "
+                f"{high[index]}: the lower one must be smaller; leave a number without a choice "
+                "out by a wrapper"
+            )
+
+    def _spec(self) -> TensorSpec:
+        space = self.space
+        if self.whole:
+            return self._of_whole_numbers()
+        if self.real:
+            return self._of_real_numbers()
+        if isinstance(space, spaces.Discrete):
+            return Categorical(int(space.n), dtype=torch.int64)
+        if isinstance(space, spaces.MultiDiscrete) and len(space.shape) == 1:
+            return MultiCategorical(_choices(space), dtype=torch.int64)
+        if isinstance(space, spaces.MultiBinary):
+            return Binary(shape=space.shape, dtype=torch.int8)
+        raise ValueError(
+            f"the action of {self.name} is a {type(space).__name__} space: replace it with a "
+            "wrapper"
+        )
+
+    def _of_whole_numbers(self) -> TensorSpec:
+        """Return the spec of whole numbers: a few are choices, more a `ValueError`."""
+        space = self.space
+        sizes = space.high.astype(np.float64) - space.low.astype(np.float64) + 1
+        if len(space.shape) != 1 or sizes.max() > MOST_CHOICES:
+            raise ValueError(
+                f"the action of {self.name} is a {space} of whole numbers, which are choices, but "
+                f"only up to {MOST_CHOICES} of each and in one dimension: replace it with a wrapper"
+            )
+        return MultiCategorical([int(size) for size in sizes], dtype=torch.int64)
+
+    def _of_real_numbers(self) -> TensorSpec:
+        space, shape = self.space, (math.prod(self.space.shape),)
         if not (np.isfinite(space.low).any() or np.isfinite(space.high).any()):
-            return Unbounded(shape, dtype=dtype)
-        dtype = _fine_enough(space, dtype)
+            return Unbounded(shape, dtype=self.dtype)
+        dtype = self._fine_enough()
         low, high = (
             torch.as_tensor(bound, dtype=dtype).reshape(shape) for bound in (space.low, space.high)
         )
         for index in (low >= high).nonzero().flatten().tolist()[:1]:
             raise ValueError(
-                f"number {index} of the action of {id} has the bounds {space.low.flat[index]} and "
-                f"{space.high.flat[index]}, which are equal in {dtype}: subtract the offset in a "
-                "wrapper"
+                f"number {index} of the action of {self.name} has the bounds "
+                f"{space.low.flat[index]} and {space.high.flat[index]}, which are equal in "
+                f"{dtype}: subtract the offset in a wrapper"
             )
         return Bounded(low, high, shape, dtype=dtype)
-    if isinstance(space, spaces.Discrete):
-        return Categorical(int(space.n), dtype=torch.int64)
-    if isinstance(space, spaces.MultiDiscrete) and len(space.shape) == 1:
-        return MultiCategorical(_choices(space), dtype=torch.int64)
-    if isinstance(space, spaces.MultiBinary):
-        return Binary(shape=space.shape, dtype=torch.int8)
-    raise ValueError(
-        f"the action of {id} is a {type(space).__name__} space: replace it with a wrapper"
-    )
+
+    def _fine_enough(self) -> torch.dtype:
+        """Return the dtype of real numbers: float64 where their range has too few steps.
+
+        A space that is as coarse itself needs no finer dtype.
+        """
+        space = self.space
+        if space.dtype.kind != "f" or space.dtype.itemsize <= self.dtype.itemsize:
+            return self.dtype
+        # From a single bound on, actions count in units of 1.
+        low, high = (
+            np.where(np.isfinite(bound), bound, other + side)
+            for bound, other, side in ((space.low, space.high, -1), (space.high, space.low, 1))
+        )
+        floats = torch.empty(0, dtype=self.dtype).numpy().dtype
+        with np.errstate(all="ignore"):  # of coordinates without bounds, and of very large ones
+            count = (high - low) / np.spacing(np.maximum(abs(low), abs(high)).astype(floats))
+        return torch.float64 if (count < COARSE).any() else self.dtype
+
+    def decode(self, actions: NDArray[Any]) -> NDArray[Any]:
+        """Return actions as the env takes them, real numbers within its bounds.
+
+        Args:
+            actions: [..., *A] with A as in `spec`.
+
+        Raises:
+            ForeignError: for a number that is not finite.
+        """
+        if not self.real:
+            numbered: NDArray[Any] = actions + self.lowest
+            return numbered.astype(self.space.dtype) if self.whole else numbered
+        if not np.isfinite(actions).all():
+            raise ForeignError(
+                f"the action for the env {self.name} holds a number that is not finite: the policy "
+                "or its guide gave none"
+            )
+        typed = actions.astype(self.space.dtype)
+        typed = typed.reshape(*actions.shape[:-1], *self.space.shape)
+        return np.clip(typed, self.space.low, self.space.high)
+
+    def fitted(self, action: NDArray[Any], place: str) -> NDArray[Any]:
+        """Return the action of a controller in the shape and numbering of the env.
+
+        Args:
+            action: what the controller gave; the bounds of real numbers are not checked.
+            place: of the controller, for the message.
+
+        Raises:
+            ForeignError: for what is no action of the env.
+        """
+        if action.size == 1 and math.prod(self.space.shape or ()) == 1:
+            action = action.reshape(self.space.shape)
+        if self.whole:
+            typed = action.astype(self.space.dtype)
+            fits = bool((typed == action).all()) and self.space.contains(typed)
+        elif self.real:
+            fits = action.shape == self.space.shape
+        else:
+            fits = bool(self.space.contains(action))
+        if not fits:
+            raise ForeignError(f"{place}: act returned {shown(action)}, no action of {self.space}")
+        return np.array(action)
 
 
-def check_action_space(id: str, space: Any) -> None:
-    """Check that an action space leaves something to choose.
+class Codec:
+    """The spaces of a Gymnasium env: its observation as entries, and its actions.
 
     Args:
-        id: of the env, for the message.
-        space: of the action.
+        name: of the env, for messages.
+        env: the env.
+        dtype: of entries that are no pixels, of actions and of rewards.
+
+    Attributes:
+        entries: of the observation, at least one of which has a number.
+        actions: of the env.
+        fineness: watch on the rewards of all rows.
 
     Raises:
-        ValueError: for what is no space of Gymnasium, for one without a number, and for bounds that
-            are NaN, equal or in the wrong order.
+        ValueError: for spaces that are not supported.
     """
-    if not isinstance(space, spaces.Space):
-        raise ValueError(
-            f"the action_space of {id} is {shown(space)}, not a space of Gymnasium: set it in its "
-            "__init__"
-        )
-    if not isinstance(space, spaces.Box):
-        return
-    if 0 in space.shape:
-        raise ValueError(f"the action of {id} has the shape {list(space.shape)}: it has no number")
-    low, high = np.ravel(space.low), np.ravel(space.high)
-    wrong = np.flatnonzero(~(low < high))
-    if len(wrong):
-        index = int(wrong[0])
-        raise ValueError(
-            f"number {index} of the action of {id} has the bounds {low[index]} and {high[index]}: "
-            "the lower one must be smaller; leave a number without a choice out by a wrapper"
-        )
+
+    def __init__(self, name: str, env: Env, dtype: torch.dtype) -> None:
+        self.name, self.env = name, env
+        self.floats = torch.empty(0, dtype=dtype).numpy().dtype
+        space = env.observation_space
+        if not isinstance(space, spaces.Space):
+            raise ValueError(
+                f"the observation_space of {name} is {shown(space)}, not a space of Gymnasium: set "
+                "it in its __init__"
+            )
+        self.entries = [Entry(name, path, leaf, self.floats) for path, leaf in _leaves(space)]
+        if all(0 in entry.given for entry in self.entries):
+            raise ValueError(
+                f"the observation_space of {name} is {space}, which has no numbers; observe at "
+                "least one, such as a constant"
+            )
+        self.actions = Actions(name, env.action_space, dtype)
+        self.fineness = Fineness(f"the env {name}", "the reward", self.floats)
+
+    def read(self, observation: Any) -> list[NDArray[Any]]:
+        """Return copies of the entries of an observation.
+
+        Args:
+            observation: as an env returned it; a `ForeignError` if it does not fit its space.
+        """
+        return [entry(observation) for entry in self.entries]
+
+    def check_same(self, env: Env, row: int) -> None:
+        """Raise a `ValueError` for an env whose spaces are others.
+
+        Args:
+            env: of another row.
+            row: its number.
+        """
+        for which in ("action_space", "observation_space"):
+            if env is not self.env and getattr(env, which) != getattr(self.env, which):
+                raise ValueError(
+                    f"the {which} of {self.name} is {getattr(env, which)} in row {row}, but "
+                    f"{getattr(self.env, which)} in row 0: all envs of a run need the same spaces"
+                )

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
@@ -22,10 +21,7 @@ from coil_rl.envs.limits import check_range
 from coil_rl.foreign.batch import SeededRows
 from coil_rl.foreign.codec import (
     Choices,
-    action_spec,
-    check_action_space,
-    has_whole_numbers,
-    lowest_choices,
+    Codec,
 )
 from coil_rl.foreign.faults import ForeignError, shortened
 from coil_rl.foreign.makers import (
@@ -36,8 +32,9 @@ from coil_rl.foreign.makers import (
     metadata_of,
     name_of,
 )
-from coil_rl.foreign.plant import Row, Rows, resolved_controller
-from coil_rl.foreign.workers import AUTO, Entries, Workers, choose, timed
+from coil_rl.foreign.plant import GymnasiumPlant
+from coil_rl.foreign.rows import GymnasiumRows
+from coil_rl.foreign.workers import AUTO, Workers, choose, timed
 
 MOST_WORKERS = 256
 RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "controller", "next")
@@ -76,13 +73,13 @@ class GymnasiumEnv(SeededRows):
         cases: number of different episodes, by default `num_envs`; needs `first_seed`.
         info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], NaN where
             missing.
-        controllers: by name, a controller or its import path "PACKAGE.MODULE:THING". A class gets
-            one object an env, `THING(env)`, with a method `act(observation)` and, if it wants,
-            `reset()`, called at the start of an episode; a function is called as `THING(env,
-            observation)`. Either may be a `functools.partial`. Its action for the present
+        controllers: by name. A class gets one object an env, `THING(env)`, with a method
+            `act(observation)` and, if it wants, `reset()`, called at the start of an episode;
+            without it each episode gets a new object. A function is called as
+            `THING(env, observation)`. Either may be a `functools.partial`. An object with `act`,
+            or a trained model with `predict`, is used as it is. Its action for the present
             observation is written as ("controller", NAME), not clamped, in the env's own
-            numbering; after a termination it is the last one. An object with `act`, or a trained
-            model with `predict`, is used as it is.
+            numbering; after a termination it is the last one.
         fresh: whether every episode has a new env, for those whose reset leaves something of the
             past. BipedalWalker is one: without `fresh`, its episodes depend on the seed and, a
             little, on those before.
@@ -102,7 +99,7 @@ class GymnasiumEnv(SeededRows):
 
     Raises:
         ValueError: if the env cannot be made, has a space that is not supported or an entry with a
-            reserved name or bounds that leave no choice, or if a controller cannot be imported.
+            reserved name or bounds that leave no choice, or if a controller cannot act.
         ForeignError: at a reset or a step, for what the env or a controller raises or returns that
             does not fit; see `coil_rl.foreign.faults`.
 
@@ -128,7 +125,7 @@ class GymnasiumEnv(SeededRows):
         first_seed: int | None = None,
         cases: int | None = None,
         info: Sequence[str] = (),
-        controllers: Mapping[str, str | Callable[..., Any]] | None = None,
+        controllers: Mapping[str, Any] | None = None,
         fresh: bool = False,
         render: bool = False,
         workers: int | str = 0,
@@ -137,9 +134,7 @@ class GymnasiumEnv(SeededRows):
     ) -> None:
         check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
         _check_workers(workers)
-        makers = {
-            name: resolved_controller(name, thing) for name, thing in (controllers or {}).items()
-        }
+        makers = dict(controllers or {})
         settings = dict(options or {})
         if max_steps is not None:
             settings["max_episode_steps"] = max_steps
@@ -153,35 +148,32 @@ class GymnasiumEnv(SeededRows):
             drawn = partial(make_env, maker, wrappers, settings | {"render_mode": "rgb_array"})
         name, self.floats = name_of(maker), torch.empty(0, dtype=dtype).numpy().dtype
 
-        def make_row(number: int) -> Row:
-            return Row(make if number % every else drawn, makers, fresh, name, number, self.floats)
+        def make_plant(row: int) -> GymnasiumPlant:
+            made = make if row % every else drawn
+            return GymnasiumPlant(made, makers, fresh, name, row, self.floats)
 
-        self.make_row, self.asked = make_row, workers
+        self.make_plant, self.asked = make_plant, workers
         self.kind = f"{settings} {wrappers} {makers}"
         self.workers: Workers | None = None
         self.info, self.optional = tuple(info), [("info", name) for name in info]
+        first = make_plant(0)
+        self.codec = Codec(name, first.env, dtype)
         # With processes, row 0 of this one only says what the spaces are.
-        self.held = Rows(make_row, range(1 if workers else num_envs), self.info)
-        self.parts: list[Entries] = []  # of all rows, as the processes returned them
-        super().__init__(self.held.rows, num_envs, seed, first_seed, cases, device)
-        env = self.held.rows[0].gate.env
-        self.rate = _rate(env)
-        self.space, self.entries = env.action_space, self.held.entries
-        check_action_space(name, self.space)
-        self.whole = has_whole_numbers(self.space)  # of the action: whole or real numbers
-        self.real = isinstance(self.space, spaces.Box) and not self.whole
-        # The shape of an action as controllers give it, where it is a matrix.
-        self.own_shape = self.space.shape if self.real and len(self.space.shape) > 1 else None
-        lowest = torch.as_tensor(lowest_choices(self.space)).reshape(-1)
-        self.first_choices = lowest if lowest.any() else None  # the lowest numbers, if not 0
+        self.held = GymnasiumRows(self.codec, self.info).extend([first])
+        if not workers:
+            self.held.extend(map(make_plant, range(1, num_envs)))
+        super().__init__(self.held, num_envs, seed, first_seed, cases, device)
+        self.rate = _rate(first.env)
+        actions = self.codec.actions
+        self.first_choices, self.own_shape = actions.first, actions.own_shape
         self._declare_specs(name, makers, dtype)
 
     def _declare_specs(self, id: str, controllers: Iterable[str], dtype: torch.dtype) -> None:
-        action, number = action_spec(id, self.space, dtype), Unbounded(1, dtype=dtype)
+        action, number = self.codec.actions.spec, Unbounded(1, dtype=dtype)
         observation = Composite()
         self.observation_bounds: dict[Any, tuple[torch.Tensor, torch.Tensor]] = {}
         self.observed_choices: dict[Any, Choices] = {}
-        for entry in self.entries:
+        for entry in self.codec.entries:
             name = entry.key[0]
             if name in RESERVED:
                 raise ValueError(
@@ -216,7 +208,7 @@ class GymnasiumEnv(SeededRows):
     @property
     def meanings(self) -> Any:
         """What the env says about its entries, see `coil_rl.envs.meanings`."""
-        return getattr(self.rows[0].gate.env.unwrapped, "meanings", None)
+        return getattr(self.held.plants[0].env.unwrapped, "meanings", None)
 
     def render(self, row: int = 0) -> NDArray[np.uint8] | None:
         """Return a picture, [height, width, 3]; None if there are none.
@@ -241,37 +233,30 @@ class GymnasiumEnv(SeededRows):
             self.workers.close()
         super().close(raise_if_closed=raise_if_closed)
 
-    def begin_rows(self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]) -> None:
-        """Begin episodes, see `RowsInTurn`; the rows are made before the first one."""
+    def begin(
+        self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]] | None = None
+    ) -> None:
+        """Begin episodes, see `Shard`; the rows are made before the first one."""
         if not self.parts:
             self._place_rows()
-        if self.workers is None:
-            self.held.begin_rows(seeds, actions)
-            self.parts[:] = [self.held.entries_of_rows()]
-        else:
-            self.parts[:] = self.workers.begin(seeds, actions)
-
-    def step_rows(self, actions: Any) -> None:
-        """Take a step in all rows, see `RowsInTurn`."""
-        if self.workers is None:
-            self.held.step_rows(actions)
-            self.parts[:] = [self.held.entries_of_rows()]
-        else:
-            self.parts[:] = self.workers.step(actions)
+        super().begin(seeds, actions)
 
     def _place_rows(self) -> None:
         """Decide in which processes the rows are, and make them there."""
         count = self.batch_size[0]
-        if count == len(self.held.rows):
+        if count == len(self.held.plants):
             return
-        like = self.held.rows[0]
-        make = partial(Rows, self.make_row, info=self.info, like=like.gate.env)
-        seconds = partial(timed, make, self.space.sample)
-        number = choose(self.asked, count, seconds, like.name, self.kind)
+        codec, make_plant = self.codec, self.make_plant
+
+        def make(rows: range) -> GymnasiumRows:
+            return GymnasiumRows(codec, self.info).extend(map(make_plant, rows))
+
+        seconds = partial(timed, make, codec.actions.space.sample)
+        number = choose(self.asked, count, seconds, codec.name, self.kind)
         if number:
-            self.workers = Workers(make, count, number, like.name)
+            self.shard = self.workers = Workers(make, count, number, codec.name)
         else:
-            self.held.extend(self.make_row, count)
+            self.held.extend(map(make_plant, range(1, count)))
 
     def encode(self, observation: Any, *, first: bool) -> TensorDict:
         """Return the entries of an env of one row for an observation that comes from elsewhere.
@@ -282,9 +267,9 @@ class GymnasiumEnv(SeededRows):
             observation: as a Gymnasium env of this kind gives it.
             first: whether it is the first one of an episode.
         """
-        (row,) = self.rows
-        row.observe(observation, first=first)
-        self.parts[:] = [self.held.entries_of_rows()]
+        (plant,) = self.held.plants
+        plant.observe(observation, first=first)
+        self.parts[:] = [self.held.entries()]
         return self._output(stepped=not first)
 
     def decode(self, actions: torch.Tensor) -> Any:
@@ -293,17 +278,7 @@ class GymnasiumEnv(SeededRows):
         return action
 
     def _decode(self, actions: NDArray[Any]) -> NDArray[Any]:
-        if self.real:
-            if not np.isfinite(actions).all():
-                raise ForeignError(
-                    f"the action for the env {self.rows[0].gate.name} holds a number that is not "
-                    "finite: the policy or its guide gave none"
-                )
-            typed = actions.astype(self.space.dtype)
-            typed = typed.reshape(*actions.shape[:-1], *self.space.shape)
-            return np.clip(typed, self.space.low, self.space.high)
-        numbered = actions + lowest_choices(self.space)
-        return numbered.astype(self.space.dtype) if self.whole else numbered
+        return self.codec.actions.decode(actions)
 
     def _output(self, *, stepped: bool) -> TensorDict:
         tensors: dict[Any, torch.Tensor] = {}

@@ -1,31 +1,106 @@
-"""Truncation of the episodes of TorchRL envs that nothing else ends.
+"""Truncation of episodes that nothing else ends, of envs of Gymnasium and TorchRL.
 
 Without one, an env that never ends is evaluated for ever before the first update.
 """
 
+import math
+import warnings
+from collections.abc import Iterator
 from numbers import Real
 from typing import Any
 
+import gymnasium
+from gymnasium.wrappers import TimeLimit
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
 from coil_rl.envs.seeded_env import SeededEnv
-from coil_rl.foreign.faults import LIMIT, OWN_LIMITS, limit_by_attributes, warn_of_limit
 
-NAMES = (*OWN_LIMITS, "episode_length")  # of the largest number of steps of an episode
+LIMIT = 1_000  # steps
+# Attributes in which envs keep the largest number of steps of an episode themselves.
+NAMES = ("max_steps", "max_episode_steps", "_max_episode_steps", "horizon", "episode_length")
+SECONDS = "time_limit"  # name of the longest time of an episode of a TorchRL env
 COUNTER = StepCounter.__name__
-SECONDS = "time_limit"  # name of the longest time of an episode
+
+
+def limit_of(env: Any) -> int | None:
+    """Return the number of steps after which an episode is truncated; None: something else ends it.
+
+    A StepCounter, a TimeLimit, a registered number and a `time_limit` of a TorchRL env in seconds
+    are believed. Another attribute may be another thing than it seems, such as the horizon of a
+    predictive controller. So it only makes the limit longer.
+
+    Args:
+        env: of Gymnasium or TorchRL, with its wrappers or transforms.
+    """
+    of_torchrl = isinstance(env, EnvBase)
+    if of_torchrl and any(
+        isinstance(part, StepCounter) and part.max_steps for part in env.modules()
+    ):
+        return None
+    limit = LIMIT
+    for layer in _layers(env):
+        registered = getattr(getattr(layer, "spec", None), "max_episode_steps", None)
+        if isinstance(layer, TimeLimit) or _is_number(registered):
+            return None
+        if of_torchrl and _is_number(getattr(layer, SECONDS, None)):
+            return None
+        for value in (getattr(layer, name, None) for name in NAMES):
+            if isinstance(value, Real) and math.isfinite(value):
+                limit = max(limit, math.ceil(float(value)))
+    return limit
+
+
+def _layers(env: Any) -> Iterator[Any]:
+    """Yield an env without its transforms, and what is in its wrappers."""
+    layer, of_torchrl = _base(env), isinstance(env, EnvBase)
+    for _ in range(100):
+        yield layer
+        inside = getattr(layer, "_env", getattr(layer, "env", None))
+        # A Gymnasium env without a wrapper may hold an env that does not end its own episodes.
+        if inside is None or not (of_torchrl or isinstance(layer, gymnasium.Wrapper)):
+            return
+        layer = inside
+
+
+def _base(env: Any) -> Any:
+    """Return an env without its transforms."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def warn_of_limit(
+    name: str, limit: int, wrapper: str, remedy: str = "env.max_steps=NUMBER sets another limit"
+) -> None:
+    """Warn that the episodes of an env are truncated.
+
+    Args:
+        name: of the env.
+        limit: the number of steps.
+        wrapper: what could have ended the episode.
+        remedy: how to set another limit.
+    """
+    warnings.warn(
+        f"an episode of the env {name} did not end within {limit:,} steps, and no {wrapper} ends "
+        f"it: episodes are truncated there ({remedy})",
+        stacklevel=3,
+    )
 
 
 class StepLimit(StepCounter):
-    """Truncates episodes after a number of steps, and says so the first time.
+    """Truncates the episodes of a batched env after a number of steps, and says so the first time.
 
     Args:
         name: of the env, for the warning.
         limit: the number of steps.
     """
 
-    def __init__(self, name: str, limit: int = LIMIT) -> None:
+    def __init__(self, name: str, limit: int) -> None:
         super().__init__(limit, step_count_key="limit_count")
         self.name, self.said = name, False
 
@@ -35,12 +110,8 @@ class StepLimit(StepCounter):
             counts = [after[key] for key in self.step_count_keys]
             if any(bool((count >= self.max_steps).any()) for count in counts):
                 self.said = True
-                warn_of_limit(
-                    self.name,
-                    self.max_steps,
-                    COUNTER,
-                    f"put TorchRL's {COUNTER}(NUMBER) around it for another limit",
-                )
+                remedy = f"put TorchRL's {COUNTER}(NUMBER) around it for another limit"
+                warn_of_limit(self.name, self.max_steps, COUNTER, remedy)
         return after
 
 
@@ -52,39 +123,3 @@ def limits_of(env: EnvBase) -> list[StepLimit]:
     """
     limit = None if isinstance(_base(env), SeededEnv) else limit_of(env)
     return [] if limit is None else [StepLimit(type(_base(env)).__name__, limit)]
-
-
-def limit_of(env: EnvBase) -> int | None:
-    """Return the number of steps after which an episode is truncated; None: something else ends it.
-
-    A StepCounter, a limit of Gymnasium and a `time_limit` in seconds are believed. Other attributes
-    make the limit longer, see `limit_by_attributes`.
-
-    Args:
-        env: it may have transforms, or be a wrapper of an env of another library.
-    """
-    if any(isinstance(part, StepCounter) and part.max_steps for part in env.modules()):
-        return None
-    limit = LIMIT
-    layer: Any = _base(env)
-    for _ in range(100):  # layers of wrappers
-        spec = getattr(getattr(layer, "spec", None), "max_episode_steps", None)
-        if _is_number(spec) or _is_number(getattr(layer, SECONDS, None)):
-            return None
-        limit = max(limit, limit_by_attributes(layer, NAMES))
-        inside = getattr(layer, "_env", getattr(layer, "env", None))
-        if inside is None:
-            break
-        layer = inside
-    return limit
-
-
-def _base(env: EnvBase) -> EnvBase:
-    """Return an env without its transforms."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)

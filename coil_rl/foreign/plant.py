@@ -1,57 +1,112 @@
-"""Rows of single Gymnasium envs, with controllers beside them."""
+"""One env of other people: begun, stepped, drawn and closed, with every answer checked.
+
+Arrays are copied, because many envs return one buffer at every step.
+"""
 
 import copy
-import inspect
 import math
-import pkgutil
 import warnings
-from collections.abc import Callable, Mapping, MutableMapping, Sequence
-from contextlib import suppress
-from functools import partial
-from typing import Any
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from contextlib import contextmanager, suppress
+from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
 import numpy as np
-from gymnasium import spaces
+import torch
 from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, TransformedEnv
 
-from coil_rl.foreign.batch import RowsInTurn
-from coil_rl.foreign.codec import Entry, Fineness, has_whole_numbers, leaves
+from coil_rl.foreign.codec import Codec
 from coil_rl.foreign.faults import (
-    EnvGate,
     ForeignError,
-    acting,
+    flag,
     foreign,
-    limit_by_attributes,
-    plain_array,
-    predicts,
+    largest,
+    number,
+    shortened,
     shown,
 )
-from coil_rl.foreign.makers import Env, time_limits_of
-from coil_rl.foreign.workers import Entries
+from coil_rl.foreign.host import Host, maker_beside
+from coil_rl.foreign.limit import limit_of, warn_of_limit
+from coil_rl.foreign.makers import Env
 
 MASKS = {"action_mask", "action_masks"}  # in info: which actions are possible
-# The envs of all rows of this process, to find one that two rows would share.
-_alive: MutableMapping[int, Any] = WeakValueDictionary()
 
 
-class Row:
-    """One Gymnasium env and the controllers beside it; see `rows` of `SeededRows`.
+class Plant(ABC):
+    """One env of somebody else.
+
+    Args:
+        name: of the env, for messages.
+        row: its number in a batch, for messages.
+
+    Attributes:
+        limit: steps after which an episode is truncated, with a warning; None for no limit.
+        seed: of the running episode.
+        steps: since its reset.
+    """
+
+    ended_by: ClassVar[str]  # what could end an episode, for the warning
+    limit: int | None = None
+
+    def __init__(self, name: str, row: int) -> None:
+        self.name, self.row, self.seed, self.steps = name, row, 0, 0
+
+    @abstractmethod
+    def begin(self, seed: int) -> None:
+        """Begin an episode."""
+
+    @abstractmethod
+    def step(self, action: Any) -> None:
+        """Take a step; one whose episode is over stays as it is, with reward 0."""
+
+    @property
+    def place(self) -> str:
+        """Where the env is: its name, the row, the seed of the episode and the step."""
+        return f"the env {self.name} (row {self.row}, seed {self.seed}, step {self.steps})"
+
+    @contextmanager
+    def placed(self) -> Iterator[None]:
+        """Add the place to a `ForeignError`."""
+        try:
+            yield
+        except ForeignError as error:
+            raise ForeignError(f"{self.place}: {error}") from error.__cause__
+
+    def is_too_long(self) -> bool:
+        """Return whether an episode has reached the limit, and say so."""
+        if self.limit is None or self.steps < self.limit:
+            return False
+        warn_of_limit(self.name, self.limit, self.ended_by)
+        return True
+
+
+class GymnasiumPlant(Plant):
+    """One Gymnasium env and the controllers beside it.
 
     Args:
         make: makes the env.
         makers: make the controllers, by name.
         fresh: whether every episode has a new env.
         name: of the env, for messages.
-        number: of the row.
-        dtype: of numbers.
+        row: its number in a batch.
+        dtype: of numbers; rewards must be finite in it.
 
     Attributes:
-        entries: of the observation.
-        fineness: watch on the rewards of all rows.
+        env: the present env.
+        codec: of its spaces, which all rows share.
         observation: the last one, as the env returned it.
         values: copies of its entries.
+        advice: of the controllers, by name.
     """
+
+    ended_by = "TimeLimit"
+    # The envs of all rows of this process, to find one that two rows would share.
+    alive: ClassVar[MutableMapping[int, Any]] = WeakValueDictionary()
+    codec: Codec
 
     def __init__(
         self,
@@ -59,45 +114,110 @@ class Row:
         makers: Mapping[str, Callable[..., Any]],
         fresh: bool,
         name: str,
-        number: int,
+        row: int,
         dtype: np.dtype[Any],
     ) -> None:
+        super().__init__(name, row)
         self.make, self.makers, self.fresh = make, makers, fresh
-        self.name, self.number, self.dtype = name, number, dtype
-        self.entries: Sequence[Entry] = ()
-        self.fineness: Fineness | None = None  # of the rewards
+        self.dtype, self.largest = dtype, largest(dtype)
+        self.size: tuple[int, ...] | None = None  # of the pictures
         self.values: list[NDArray[Any]] = []
         self.advice: dict[str, NDArray[Any]] = {}
         self._open()
 
     def _open(self) -> None:
-        env = self.make()
-        own = _alive.get(id(env.unwrapped))
-        if own is env.unwrapped:
+        self.env = env = self.make()
+        if self.alive.get(id(env.unwrapped)) is env.unwrapped:
             raise ValueError(
                 f"the maker of {self.name} returned one env twice: its rows would disturb each "
                 "other; make a new env at each call"
             )
         with suppress(TypeError):  # an object without weak references
-            _alive[id(env.unwrapped)] = env.unwrapped
-        limit = None if _has_limit(env) else limit_by_attributes(env.unwrapped)
-        self.gate = EnvGate(env, self.name, self.number, self.dtype, limit)
+            self.alive[id(env.unwrapped)] = env.unwrapped
+        self.limit = limit_of(env)
         self.controllers = {
-            name: controller_of(name, maker, env) for name, maker in self.makers.items()
+            name: Host(maker_beside(thing, name, env), name, beside=lambda: self.place)
+            for name, thing in self.makers.items()
         }
 
     def begin(self, seed: int) -> None:
-        """Begin an episode."""
+        """Begin an episode.
+
+        Raises:
+            ForeignError: for an exception of the env, for what is not two values, and for an
+                observation that does not fit its space.
+        """
         if self.fresh:
-            self.gate.close()
-            _alive.pop(id(self.gate.env.unwrapped), None)
+            self.close()
+            self.alive.pop(id(self.env.unwrapped), None)
             self._open()
-        self.observation, self.info = self.gate.reset(seed)
-        self._look_for_masks()
-        self.values = self.gate.read(self.observation, self.entries)
+        self.seed, self.steps = seed, 0
+        with foreign(self.place, "reset"):
+            answer: Any = self.env.reset(seed=seed)
+        with self.placed():
+            if not isinstance(answer, (tuple, list)) or len(answer) != 2:
+                raise ForeignError(
+                    f"reset returned {_counted(answer)}, not the two of Gymnasium (observation, "
+                    "info)"
+                )
+            self.observation, self.info = answer
+            if not isinstance(self.info, Mapping):
+                raise ForeignError(f"info of reset is {shown(self.info)}, not a dictionary")
+            self._look_for_masks()
+            self.values = self.codec.read(self.observation)
         self.reward, self.terminated, self.truncated = 0.0, False, False
-        self._reset_controllers()
+        self._begin_controllers()
         self._advise()
+
+    def step(self, action: Any) -> None:
+        """Take a step; one whose episode is over stays as it is, with reward 0.
+
+        Raises:
+            ForeignError: for an exception of the env, for what is not five values, and for an
+                observation, reward, flag or info that is none.
+        """
+        if self.terminated or self.truncated:
+            self.reward = 0.0
+            return
+        self.steps += 1
+        try:  # without `foreign` and `placed`, which cost as much as a step of a small env
+            answer: Any = self.env.step(action)
+        except (Exception, SystemExit) as error:
+            with foreign(self.place, "step"):
+                raise error
+        try:
+            self._take(answer)
+            self.values = self.codec.read(self.observation)
+        except ForeignError as error:
+            raise ForeignError(f"{self.place}: {error}") from error.__cause__
+        if self.codec.fineness.unseen:
+            self.codec.fineness.see(np.asarray(self.reward))
+        if self.limit is not None and not self.terminated and not self.truncated:
+            self.truncated = self.is_too_long()
+        if self.controllers and not self.terminated:
+            self._advise()
+
+    def _take(self, answer: Any) -> None:
+        """Keep the checked values of a step."""
+        if not isinstance(answer, (tuple, list)) or len(answer) != 5:
+            raise ForeignError(
+                f"step returned {_counted(answer)}, not the five of Gymnasium (observation, "
+                "reward, terminated, truncated, info)"
+            )
+        self.observation, reward, terminated, truncated, info = answer
+        # The usual types need no closer look, which would take as long as a step of a small env.
+        if not (
+            isinstance(reward, float)
+            and type(terminated) is type(truncated) is bool
+            and type(info) is dict
+            and -self.largest <= reward <= self.largest
+        ):
+            if not isinstance(info, Mapping):
+                raise ForeignError(f"info of step is {shown(info)}, not a dictionary")
+            reward = number(reward, "the reward", self.dtype)
+            terminated, truncated = flag(terminated, "terminated"), flag(truncated, "truncated")
+        self.reward, self.info = float(reward), info
+        self.terminated, self.truncated = terminated, truncated
 
     def observe(self, observation: Any, *, first: bool) -> None:
         """Take an observation that comes from elsewhere."""
@@ -105,26 +225,12 @@ class Row:
             self.begin(0)  # controllers may read what an env has after its reset only
         self.observation, self.reward, self.info = observation, 0.0, {}
         try:
-            self.values = [entry(observation) for entry in self.entries]
+            self.values = self.codec.read(observation)
         except ForeignError as error:
             raise ValueError(f"it does not fit the env {self.name}: {error}") from error
         if first:
-            self._reset_controllers()
+            self._begin_controllers()
         self._advise()
-
-    def step(self, action: Any) -> None:
-        """Take a step; a row whose episode is over stays as it is, with reward 0."""
-        if self.terminated or self.truncated:
-            self.reward = 0.0
-            return
-        self.observation, self.reward, self.terminated, self.truncated, self.info = self.gate.step(
-            action
-        )
-        if self.fineness is not None and self.fineness.unseen:
-            self.fineness.see(np.asarray(self.reward))
-        self.values = self.gate.read(self.observation, self.entries)
-        if self.controllers and not self.terminated:
-            self._advise()
 
     def _look_for_masks(self) -> None:
         """Warn if info has a mask of the possible actions, which policies do not read."""
@@ -140,227 +246,112 @@ class Row:
         value = self.info.get(name, math.nan)
         if np.ndim(value) == 1 and np.size(value) == 1:
             value = np.ravel(value)[0]
-        with self.gate.placed():
+        try:
             if isinstance(value, (str, bytes)) or np.ndim(value) > 0:
-                raise ForeignError(f"info entry {name!r} is {shown(value)}, which is not a number")
-            try:
-                return float(value)
-            except (TypeError, ValueError) as error:
-                raise ForeignError(
-                    f"info entry {name!r} is {shown(value)}, which is not a number"
-                ) from error
+                raise TypeError
+            return float(value)
+        except (TypeError, ValueError) as error:
+            raise ForeignError(
+                f"{self.place}: info entry {name!r} is {shown(value)}, which is not a number"
+            ) from error
 
-    def _reset_controllers(self) -> None:
-        for name, (_, reset) in self.controllers.items():
-            with foreign(f"the controller {name}", "reset"):
-                reset()
+    def _begin_controllers(self) -> None:
+        for host in self.controllers.values():
+            host.begin()
 
     def _advise(self) -> None:
-        for name, (act, _) in self.controllers.items():
+        for name, host in self.controllers.items():
             # A copy, as the env may go on with the arrays that it returned.
-            observation = copy.deepcopy(self.observation)
-            with foreign(f"the controller {name} beside {self.gate.place}", "it"):
-                advice = act(observation)
-            self.advice[name] = self._fitted(name, advice)
+            action = host.act(copy.deepcopy(self.observation))
+            self.advice[name] = self.codec.actions.fitted(action, host.place)
 
-    def _fitted(self, name: str, advice: Any) -> NDArray[Any]:
-        """Return the action of a controller as an array, in the env's own numbering."""
-        with self.gate.placed():
-            return fitted_action(name, advice, self.gate.env.action_space)
+    def render(self) -> NDArray[np.uint8]:
+        """Return a copy of a picture, [height, width] or [height, width, 3 or 4].
 
-
-class Rows(RowsInTurn):
-    """Rows that are stepped one after the other in one process, see `Shard` of the workers.
-
-    Args:
-        make_row: makes a row by its number.
-        numbers: of the rows.
-        info: names of numbers in Gymnasium's info.
-        like: an env whose spaces those of all rows must be; by default that of the first row.
-    """
-
-    def __init__(
-        self,
-        make_row: Callable[[int], "Row"],
-        numbers: range,
-        info: Sequence[str],
-        like: Env | None = None,
-    ) -> None:
-        self.info, self.unseen = tuple(info), set(info)
-        self.rows: list[Row] = [make_row(numbers[0])]
-        first = self.rows[0]
-        self.like = first.gate.env if like is None else like
-        self.entries = entries_of(first.name, self.like, first.dtype)
-        self.fineness = Fineness(f"the env {first.name}", "the reward", first.dtype)
-        self._fit(first)
-        self.extend(make_row, len(numbers), numbers[0])
-
-    def extend(self, make_row: Callable[[int], "Row"], count: int, start: int = 0) -> None:
-        """Make further rows.
-
-        Args:
-            make_row: makes a row by its number.
-            count: of all rows.
-            start: number of the first row.
+        Raises:
+            ForeignError: for an exception of the env, and for what is no picture, or one of another
+                size than before.
         """
-        for number in range(start + len(self.rows), start + count):
-            row = make_row(number)
-            self._fit(row)
-            self.rows.append(row)
-
-    def _fit(self, row: "Row") -> None:
-        row.entries, row.fineness = self.entries, self.fineness
-        if row.gate.env is not self.like:
-            _check_same_spaces(row.name, row.number, row.gate.env, self.like)
-
-    def entries_of_rows(self) -> Entries:
-        """Return the entries of all rows, [rows, ...], and their rewards."""
-        rows, count = self.rows, len(self.rows)
-        terminated = np.array([[row.terminated] for row in rows])
-        truncated = np.array([[row.truncated] for row in rows])
-        found: Entries = {
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated | truncated,
-            "reward": np.array([[row.reward] for row in rows], dtype=rows[0].dtype),
-        }
-        for index, entry in enumerate(self.entries):
-            joined = np.concatenate([row.values[index] for row in rows])
-            key = entry.key if len(entry.key) > 1 else entry.key[0]
-            found[key] = joined.reshape(count, *entry.given)
-        if self.unseen:
-            self._look_for_info()
-        for name in self.info:
-            numbers = np.array([row.number_of(name) for row in rows], dtype=rows[0].dtype)
-            found["info", name] = numbers.reshape(-1, 1)
-        for name in rows[0].controllers:
-            found["controller", name] = np.array([row.advice[name] for row in rows])
-        return found
-
-    def _look_for_info(self) -> None:
-        """Warn of a name that no info has had when the first episode is over."""
-        self.unseen.difference_update(*(row.info for row in self.rows))
-        if self.unseen and any(row.terminated or row.truncated for row in self.rows):
-            missing = ", ".join(sorted(self.unseen))
-            known = sorted({str(name) for row in self.rows for name in row.info})
-            warnings.warn(
-                f"the env {self.rows[0].name} had no {missing} in the info of an episode, so it is "
-                "NaN there, a number without a value; at its end info has "
-                f"{', '.join(known) or 'nothing'}",
-                stacklevel=2,
+        with foreign(f"the env {self.name}", "render"):
+            picture: Any = self.env.render()
+        found = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.size > 0
+        if not found or not (
+            picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] in (3, 4))
+        ):
+            raise ForeignError(
+                f"render returned {shown(picture)}, not a picture [height, width, 3] of uint8"
             )
-            self.unseen.clear()
-
-    def picture(self, row: int) -> NDArray[np.uint8]:
-        """Return a picture of a row."""
-        return self.rows[row].gate.render()
+        if self.size not in (None, picture.shape):
+            raise ForeignError(
+                f"render returned a picture of the shape {list(picture.shape)} after one of "
+                f"{list(self.size or ())}"
+            )
+        self.size = picture.shape
+        return picture.copy()
 
     def close(self) -> None:
-        """Close all envs."""
-        for row in self.rows:
-            row.gate.close()
-
-
-def fitted_action(name: str, advice: Any, space: spaces.Space[Any]) -> NDArray[Any]:
-    """Return the action of a controller as an array, in the env's own numbering.
-
-    Args:
-        name: of the controller, for the message.
-        advice: what the controller gave.
-        space: of the env's actions; the bounds of real numbers are not checked.
-
-    Raises:
-        ForeignError: for what is no action of the env.
-    """
-    try:
-        array = plain_array(advice, "it")
-        if has_whole_numbers(space):
-            whole = array.astype(space.dtype)
-            fits = bool((whole == array).all()) and space.contains(whole)
-        elif isinstance(space, spaces.Box):
-            fits = array.shape == space.shape and bool(np.isfinite(array).all())
-        else:
-            fits = bool(space.contains(array))
-    except ForeignError:
-        fits = False
-    if not fits:
-        raise ForeignError(f"controller {name} gave {shown(advice)}, not an action of {space}")
-    return np.array(array)
-
-
-def resolved_controller(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
-    """Return a controller by its import path PACKAGE.MODULE:THING."""
-    if not isinstance(thing, str):
-        return thing
-    try:
-        return pkgutil.resolve_name(thing)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(
-            f"controller {name}: {thing!r} cannot be imported ({error}); write PACKAGE.MODULE:THING"
-        ) from error
-
-
-def controller_of(
-    name: str, maker: Callable[..., Any], env: Env
-) -> tuple[Callable[[Any], Any], Callable[[], Any]]:
-    """Make a controller for an env.
-
-    Args:
-        name: of the controller, for messages.
-        maker: a class, a function or a `functools.partial` of either; or an object with `act` or
-            `predict`.
-        env: beside which the controller acts.
-
-    Returns:
-        What gives the action for an observation, and what to call at the start of an episode.
-    """
-    if not inspect.isclass(getattr(maker, "func", maker)):
-        if not predicts(maker) and not callable(getattr(maker, "act", None)):
-            return partial(maker, env), lambda: None
-        controller = acting(maker)
-        return controller.act, getattr(controller, "reset", lambda: None)
-    try:
-        controller = maker(env)
-    except TypeError as error:
-        raise ValueError(f"controller {name} cannot be made with its env: {error}") from error
-    if predicts(controller):
-        controller = acting(controller)
-    if not callable(getattr(controller, "act", None)):
-        raise ValueError(
-            f"controller {name}: {type(controller).__name__} needs a method act(observation)"
-        )
-    return controller.act, getattr(controller, "reset", lambda: None)
-
-
-def _has_limit(env: Env) -> bool:
-    """Return whether something around an env ends an episode after a number of steps."""
-    spec = getattr(env, "spec", None)
-    if getattr(spec, "max_episode_steps", None):
-        return True
-    return bool(time_limits_of(env))
-
-
-def entries_of(name: str, env: Env, floats: np.dtype[Any]) -> list[Entry]:
-    """Return the entries of the observation of an env, which have at least one number."""
-    if not isinstance(env.observation_space, spaces.Space):
-        raise ValueError(
-            f"the observation_space of {name} is {shown(env.observation_space)}, not a space of "
-            "Gymnasium: set it in its __init__"
-        )
-    entries = [Entry(name, path, leaf, floats) for path, leaf in leaves(env.observation_space)]
-    if all(0 in entry.given for entry in entries):
-        raise ValueError(
-            f"the observation_space of {name} is {env.observation_space}, which has no numbers; "
-            "observe at least one, such as a constant"
-        )
-    return entries
-
-
-def _check_same_spaces(name: str, row: int, env: Env, first: Env) -> None:
-    """Raise a `ValueError` for an env whose spaces are not those of the first one."""
-    for which in ("action_space", "observation_space"):
-        if getattr(env, which) != getattr(first, which):
-            raise ValueError(
-                f"the {which} of {name} is {getattr(env, which)} in row {row}, but "
-                f"{getattr(first, which)} in row 0: all envs of a run need the same spaces"
+        """Close the env; what it raises is a warning, because nothing depends on it any more."""
+        try:
+            self.env.close()
+        except Exception as error:
+            warnings.warn(
+                f"the env {self.name} cannot be closed ({type(error).__name__}: "
+                f"{shortened(str(error))})",
+                stacklevel=2,
             )
+
+
+def _counted(answer: Any) -> str:
+    """Return how many values there are, or what else an env has returned."""
+    return f"{len(answer)} values" if isinstance(answer, (tuple, list)) else shown(answer)
+
+
+class TorchRLPlant(Plant):
+    """One TorchRL env without a batch.
+
+    Args:
+        env: the env.
+        row: its number in a batch.
+
+    Attributes:
+        after: the entries after the last step or reset.
+    """
+
+    ended_by = "StepCounter"
+
+    def __init__(self, env: EnvBase, row: int) -> None:
+        own = env.base_env if isinstance(env, TransformedEnv) else env
+        super().__init__(type(own).__name__, row)
+        self.env, self.limit = env, limit_of(env)
+
+    def begin(self, seed: int) -> None:
+        """Begin an episode."""
+        self.seed, self.steps = seed, 0
+        # TorchRL's envs may seed the global generators, from which policies sample.
+        with (
+            torch.random.fork_rng(range(torch.cuda.device_count())),
+            foreign(self.place, "reset"),
+        ):
+            self.env.set_seed(seed)
+            self.after = self.state = self.env.reset()
+
+    def step(self, action: Tensor) -> None:
+        """Take a step; one whose episode is over stays as it is, with reward 0."""
+        reward = self.env.reward_key
+        if self.after["done"].any():
+            self.after = self.after.copy().set(reward, self.env.full_reward_spec[reward].zero())
+            return
+        self.steps += 1
+        given = self.state.copy().set(self.env.action_key, action.to(self.env.device))
+        with foreign(self.place, "step"):
+            step = self.env.step(given)
+            self._truncate(step["next"])
+            self.after, self.state = step["next"], self.env.step_mdp(step)
+
+    def _truncate(self, after: TensorDictBase) -> None:
+        """End an episode that is too long."""
+        if not after["done"].any() and self.is_too_long():
+            for name in ("done", "truncated"):
+                ends = after.get(name, None)
+                if ends is not None:
+                    after[name] = torch.ones_like(ends)

@@ -1,68 +1,18 @@
 """TorchRL envs without batch as one batched env."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
 from coil_rl.envs.limits import check_range
 from coil_rl.foreign.batch import SeededRows
-from coil_rl.foreign.faults import SET_LIMIT, foreign, warn_of_limit
-from coil_rl.foreign.limit import COUNTER, limit_of
-
-
-@dataclass
-class _EnvRow:
-    """One TorchRL env of a batch; see `rows` of `SeededRows`."""
-
-    env: EnvBase
-    number: int
-    limit: int | None = None  # steps of an episode, for an env that names no limit
-    steps: int = 0  # since the reset
-
-    def begin(self, seed: int) -> None:
-        self.steps = 0
-        # TorchRL's envs may seed the global generators, from which policies sample.
-        with (
-            torch.random.fork_rng(range(torch.cuda.device_count())),
-            foreign(f"the env {self.name} (row {self.number}, seed {seed})", "reset"),
-        ):
-            self.env.set_seed(seed)
-            self.after = self.state = self.env.reset()
-
-    @property
-    def name(self) -> str:
-        """Class of the env of the user."""
-        env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
-        return type(env).__name__
-
-    def step(self, action: Tensor) -> None:
-        reward = self.env.reward_key
-        if self.after["done"].any():
-            self.after = self.after.copy().set(reward, self.env.full_reward_spec[reward].zero())
-            return
-        self.steps += 1
-        given = self.state.copy().set(self.env.action_key, action.to(self.env.device))
-        with foreign(f"the env {self.name} (row {self.number}, step {self.steps})", "step"):
-            step = self.env.step(given)
-            if self.limit is not None and self.steps >= self.limit:
-                self._truncate(step["next"])
-            self.after, self.state = step["next"], self.env.step_mdp(step)
-
-    def _truncate(self, after: TensorDictBase) -> None:
-        """End the episode, unless it is over."""
-        if after["done"].any():
-            return
-        warn_of_limit(self.name, self.steps, COUNTER, SET_LIMIT)
-        for name in ("done", "truncated"):
-            flag = after.get(name, None)
-            if flag is not None:
-                after[name] = torch.ones_like(flag)
+from coil_rl.foreign.plant import TorchRLPlant
+from coil_rl.foreign.rows import Rows
 
 
 class EnvBatch(SeededRows):
@@ -121,9 +71,9 @@ class EnvBatch(SeededRows):
             raise ValueError(
                 f"{name} must have one action, it has {', '.join(map(str, one.action_keys))}"
             )
-        limit = limit_of(one)
+        self.held = Rows([TorchRLPlant(env, row) for row, env in enumerate(envs)])
         super().__init__(
-            [_EnvRow(env, number, limit) for number, env in enumerate(envs)],
+            self.held,
             num_envs,
             seed,
             first_seed,
@@ -142,4 +92,5 @@ class EnvBatch(SeededRows):
         if stepped:
             specs.append(self.full_reward_spec)
         keys = [key for spec in specs for key in spec.keys(True, True)]
-        return torch.stack([row.after.select(*keys) for row in self.rows]).to(self.device)
+        after = [plant.after.select(*keys) for plant in self.held.plants]
+        return torch.stack(after).to(self.device)

@@ -17,19 +17,19 @@ import sys
 import time
 import traceback
 import warnings
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from multiprocessing.connection import Connection, wait
-from multiprocessing.util import Finalize
-from typing import Any, Protocol
+from multiprocessing.util import Finalize, register_after_fork
+from typing import Any
 
 import torch
 from numpy.typing import NDArray
 
 from coil_rl.foreign.faults import ForeignError
+from coil_rl.foreign.rows import Entries, GymnasiumRows
 
 AUTO = "auto"
 SAVED = 2e-3  # seconds; a batched step of this length pays for the messages
@@ -39,31 +39,10 @@ PATIENCE = 5.0  # seconds between two messages while processes start, and until 
 # Signals that are meant for the program: it saves its state, and then ends its processes itself.
 IGNORED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
 
-Key = str | tuple[str, ...]
-Entries = dict[Key, NDArray[Any]]
+MakeRows = Callable[[range], GymnasiumRows]
 
 _log = logging.getLogger(__name__)
 _seconds: dict[str, float | None] = {}  # of a step of one row, by env
-_open: "weakref.WeakSet[Connection]" = weakref.WeakSet()  # this program's ends of all pipes
-
-
-class Shard(Protocol):
-    """The rows of one process."""
-
-    def begin_rows(self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]) -> None:
-        """Begin episodes, and take some actions in each."""
-
-    def step_rows(self, actions: Any) -> None:
-        """Take a step in all rows."""
-
-    def entries_of_rows(self) -> Entries:
-        """Return the entries of all rows, [rows, ...]."""
-
-    def picture(self, row: int) -> NDArray[Any]:
-        """Return a picture of a row."""
-
-    def close(self) -> None:
-        """Close all rows."""
 
 
 @dataclass
@@ -115,7 +94,7 @@ class Workers:
         ForeignError: for a fault of an env or a controller, and for a process that died.
     """
 
-    def __init__(self, make: Callable[[range], Shard], rows: int, count: int, name: str) -> None:
+    def __init__(self, make: MakeRows, rows: int, count: int, name: str) -> None:
         edges = [rows * number // count for number in range(count + 1)]
         self.ranges = [range(*pair) for pair in pairwise(edges)]
         self.name = name
@@ -269,7 +248,7 @@ def choose(
     return count
 
 
-def timed(make: Callable[[range], Shard], draw: Callable[[], Any]) -> float | None:
+def timed(make: MakeRows, draw: Callable[[], Any]) -> float | None:
     """Return the seconds of a step of one row, measured in a process of its own; None if it fails.
 
     Args:
@@ -295,7 +274,8 @@ def _started(serve: Callable[..., None], *arguments: Any) -> tuple[Connection, A
     """Fork a process; return this program's end of the pipe to it, and the process."""
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe()
-    _open.add(here)
+    # A pipe that another process holds open too would not say that its program has ended.
+    register_after_fork(here, Connection.close)
     process = context.Process(target=_in_process, args=(serve, there, *arguments), daemon=True)
     with warnings.catch_warnings():
         # Newer Pythons warn of a fork beside threads; those here hold no lock that an env needs.
@@ -310,9 +290,6 @@ def _in_process(serve: Callable[..., None], pipe: Connection, *arguments: Any) -
     for name in IGNORED:
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
-    # A pipe that another process holds open too would not say that its program has ended.
-    for other in list(_open):
-        other.close()
     torch.set_num_threads(1)  # threads do not survive a fork
     serve(pipe, *arguments)
     sys.stdout.flush()
@@ -320,7 +297,7 @@ def _in_process(serve: Callable[..., None], pipe: Connection, *arguments: Any) -
     os._exit(0)  # what the program does at its end, such as on a GPU, is not for its copies
 
 
-def _serve(pipe: Connection, make: Callable[[range], Shard], own: range) -> None:
+def _serve(pipe: Connection, make: MakeRows, own: range) -> None:
     """Make rows, and do what the batch asks of them until it closes the pipe."""
     reply, shard = _caught(lambda: make(own))
     with suppress(EOFError, OSError):  # the batch has ended
@@ -333,14 +310,11 @@ def _serve(pipe: Connection, make: Callable[[range], Shard], own: range) -> None
         shard.close()
 
 
-def _done(shard: Shard, name: str, arguments: Sequence[Any]) -> Any:
+def _done(shard: GymnasiumRows, name: str, arguments: Sequence[Any]) -> Any:
     if name == "picture":
         return shard.picture(*arguments)
-    if name == "begin":
-        shard.begin_rows(*arguments)
-    else:
-        shard.step_rows(*arguments)
-    return shard.entries_of_rows()
+    (entries,) = shard.begin(*arguments) if name == "begin" else shard.step(*arguments)
+    return entries
 
 
 def _caught(call: Callable[[], Any]) -> tuple[_Reply, Any]:
@@ -358,21 +332,21 @@ def _caught(call: Callable[[], Any]) -> tuple[_Reply, Any]:
     return reply, value
 
 
-def _time(pipe: Connection, make: Callable[[range], Shard], draw: Callable[[], Any]) -> None:
+def _time(pipe: Connection, make: MakeRows, draw: Callable[[], Any]) -> None:
     """Send the duration of a step; the first one is left out."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             shard = make(range(1))
-            shard.begin_rows({0: 0}, {})
-            shard.step_rows([draw()])
+            shard.begin({0: 0}, {})
+            shard.step([draw()])
             taken: list[float] = []
             while len(taken) < MOST_STEPS and (len(taken) < LEAST_STEPS or sum(taken) < LONGEST):
                 began = time.perf_counter()
-                shard.step_rows([draw()])
+                (entries,) = shard.step([draw()])
                 taken.append(time.perf_counter() - began)
-                if shard.entries_of_rows()["done"].any():
-                    shard.begin_rows({0: len(taken)}, {})
+                if entries["done"].any():
+                    shard.begin({0: len(taken)}, {})
             shard.close()
             seconds: float | None = min(taken)  # other programs only make a step longer
         except Exception:  # the same fault follows where it is told

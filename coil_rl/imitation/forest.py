@@ -12,7 +12,8 @@ from torch import Tensor
 
 from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
-from coil_rl.imitation.regressors import Regressor, needs_scikit_learn
+from coil_rl.extras import require
+from coil_rl.imitation.regressors import Regressor
 
 MOST_TREES = 10_000
 AT_ONCE = 16_384  # rows times trees, whose nodes fit into the cache
@@ -78,8 +79,9 @@ class ForestRegressor(Regressor):
 
     def fit(self, x: Tensor, y: Tensor) -> None:
         """Fit y [N, outputs] to x [N, inputs] from scratch, in double precision."""
-        with needs_scikit_learn("a forest"):
-            from sklearn.ensemble import RandomForestRegressor
+        require("a forest", "imitate", "sklearn")
+        from sklearn.ensemble import RandomForestRegressor
+
         target = y.squeeze(-1) if self.outputs == 1 else y
         forest = RandomForestRegressor(**self.options)
         forest.fit(x.cpu().double().numpy(), target.cpu().double().numpy())

@@ -143,8 +143,8 @@ class Imitation(Learner):
             dataset = torch.cat([self.dataset, pairs])
         if not len(dataset):
             raise UserError(
-                f"none of {batch.numel()} steps is to be learned: there is no recent command at "
-                "any, or the robot stands; check env.command, the topic of the commands"
+                f"none of {batch.numel()} steps is to be learned: {self.kept_key} is false at all "
+                "of them"
             )
         self.dataset = dataset
         x, y = self.concat(*(dataset[key] for key in self.in_keys)), dataset["action"]

@@ -7,8 +7,7 @@ its fitted state can be saved. So the learner is the same for a network, a fores
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import ClassVar, Self
 
 import torch
@@ -18,7 +17,6 @@ from torch.nn import functional as F
 from torchrl.modules import MLP
 
 from coil_rl.envs.limits import LARGEST_SEED, check_range
-from coil_rl.errors import UserError
 from coil_rl.learners.encoders import Mlp
 from coil_rl.schedules import Linear, Schedule, schedule
 
@@ -161,18 +159,3 @@ class LinearRegressor(Regressor):
     def forward(self, x: Tensor) -> Tensor:
         """Predict y [*batch, outputs] for x [*batch, inputs]."""
         return (x.double() @ self.weights + self.bias).to(x)
-
-
-@contextmanager
-def needs_scikit_learn(what: str) -> Iterator[None]:
-    """Say which extra brings scikit-learn, if it cannot be imported in the block.
-
-    Args:
-        what: needs it.
-    """
-    try:
-        yield
-    except ImportError as error:
-        raise UserError(
-            f"{what} needs scikit-learn ({error}): python -m pip install 'coil-rl[imitate]'"
-        ) from error

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from coil_rl.errors import UserError
-from coil_rl.imitation.regressors import Regressor, needs_scikit_learn
+from coil_rl.extras import require
+from coil_rl.imitation.regressors import Regressor
 from coil_rl.output import progress
 
 MAX_FOLDS = 10
@@ -42,8 +43,9 @@ def cross_validate(
             f"{len(x)} samples are too few to validate; use at least {MIN_SAMPLES}, or "
             "learner.validate=false"
         )
-    with needs_scikit_learn("the validation (learner.validate=true)"):
-        from sklearn.model_selection import train_test_split
+    require("the validation (learner.validate=true)", "imitate", "sklearn")
+    from sklearn.model_selection import train_test_split
+
     rows = np.arange(len(x))
     splits: dict[str, list[Split]] = {
         "random_split": [train_test_split(rows, test_size=TEST_SHARE, random_state=seed)]
@@ -80,8 +82,9 @@ def group_splits(groups: Tensor) -> list[Split]:
             "all samples are from one track, so no track can be left out; set "
             "learner.group_key=null"
         )
-    with needs_scikit_learn("the validation (learner.validate=true)"):
-        from sklearn.model_selection import GroupKFold
+    require("the validation (learner.validate=true)", "imitate", "sklearn")
+    from sklearn.model_selection import GroupKFold
+
     return list(GroupKFold(min(count, MAX_FOLDS)).split(labels, groups=labels))
 
 

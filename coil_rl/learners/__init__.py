@@ -1,7 +1,6 @@
 """Learning algorithms: each updates a policy from batches of experience."""
 
 from coil_rl.learners.a2c import A2C as A2C
-from coil_rl.learners.advisor import Advisor as Advisor
 from coil_rl.learners.anchor import Anchor as Anchor
 from coil_rl.learners.dqn import DQN as DQN
 from coil_rl.learners.dynamic_coil import AfterFrames as AfterFrames
@@ -11,7 +10,6 @@ from coil_rl.learners.dynamic_coil import PhaseSchedule as PhaseSchedule
 from coil_rl.learners.encoders import Cnn as Cnn
 from coil_rl.learners.encoders import Gru as Gru
 from coil_rl.learners.encoders import Mlp as Mlp
-from coil_rl.learners.ibrl import IBRL as IBRL
 from coil_rl.learners.kickstart import FilteredKickstartLoss as FilteredKickstartLoss
 from coil_rl.learners.kickstart import KickstartLoss as KickstartLoss
 from coil_rl.learners.ppo import PPO as PPO

@@ -14,21 +14,17 @@ overrides then take a second:
 import contextlib
 import functools
 import logging
-import math
 import os
 import re
-import shlex
-import shutil
 import signal
 import sys
 import threading
-import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import hydra
 import yaml
@@ -36,30 +32,21 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import coil_rl.config  # noqa: F401  registers the root configurations
 from coil_rl import programs
-from coil_rl.config.sentences import is_no_bug, sentence
+from coil_rl.config.compose import keep_written, key_of
+from coil_rl.config.messages import is_no_bug, refuse
 from coil_rl.config.trust import trust_packages
-from coil_rl.config.written import keep_written, key_of
-from coil_rl.errors import RunningError, UserError
-from coil_rl.files import FAILED_JOBS
-from coil_rl.output import SafeStream, say
+from coil_rl.errors import UserError
+from coil_rl.output import SafeStream
 from coil_rl.programs.folders import spelled
+from coil_rl.programs.sweeps import Jobs, is_sweep, remove_unused
 from coil_rl.run.stopping import STOP
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
-HYDRA_FILES = (
-    "config.yaml",
-    "hydra.yaml",
-    "overrides.yaml",
-)  # in the subfolder hydra.output_subdir of a job
-_new_folders: list[Path] = []  # made for this run or sweep, the innermost first
-_interrupts: list[int] = []  # signals of this program
-_sweep: list[str] = []  # folder of the sweep of this program, if it is one
 MOST_PROCESSES = 64  # of joblib, or four for each processor if those are more
 
 
@@ -67,44 +54,64 @@ class NoSweepError(UserError):
     """A program without sweeps was started with several values of a key; none of them is run."""
 
 
-class NewFolders(Callback):
-    """Record the folders that Hydra is about to make.
+class Signals:
+    """The signals that a program gets.
 
-    It makes them before the configuration is checked.
+    Attributes:
+        received: their numbers. They are remembered, because a module that is being imported may
+            swallow a `KeyboardInterrupt`.
     """
 
-    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Record the folder of a run."""
-        _record(config, "hydra.run.dir")
+    def __init__(self) -> None:
+        self.received: list[int] = []
 
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Record the folder of a sweep, and say how it goes on if it is stopped."""
-        _record(config, "hydra.sweep.dir")
-        _sweep[:] = [str(config.hydra.sweep.dir)]
-        Path(_sweep[0], FAILED_JOBS).unlink(missing_ok=True)
-        if "existing" in config:  # the jobs are runs, which go on where they were stopped
-            command = _sweep_command(sys.argv, _sweep[0])
-            say(f"if this sweep is stopped, go on with: {command}", error=True)
+    def listen(self) -> None:
+        """Handle signals, in this process or in that of a job of a sweep."""
+        if threading.current_thread() is not threading.main_thread():
+            return  # other threads cannot
+        if signal.getsignal(signal.SIGINT) is programs.interrupted:
+            signal.signal(signal.SIGINT, self._interrupt)
+        for name in ("SIGTERM", "SIGHUP", "SIGUSR1"):  # the last two are missing on Windows
+            number = getattr(signal, name, None)
+            # A program under nohup ignores SIGHUP.
+            if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, self._interrupt)
+
+    def _interrupt(self, signum: int, frame: FrameType | None) -> None:
+        """Raise a `KeyboardInterrupt`, unless a training ends its update first."""
+        self.received.append(signum)
+        if signum == signal.SIGINT or not STOP.ask():
+            raise KeyboardInterrupt
+
+
+class OwnFolder(Callback):
+    """Keep the folder of a run from Hydra, which makes it before the configuration is checked.
+
+    While Hydra makes folders it is the working folder; the program makes its own after the check.
+    """
+
+    def __init__(self) -> None:
+        self.folder = ""  # none in a sweep, whose folders are Hydra's
+        self.subfolder: str | None = None
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Take the folder out of the configuration."""
+        with contextlib.suppress(OmegaConfBaseException):  # Hydra raises the same error next
+            self.folder = os.path.abspath(str(config.hydra.run.dir))
+            self.subfolder = config.hydra.output_subdir
+            self._set(config, ".", None)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Record the folder of a job of a sweep."""
-        folder = Path(config.hydra.runtime.output_dir)
-        if folder.parent in _new_folders and folder not in _new_folders:
-            _new_folders.insert(0, folder)
+        """Put it back, before the program begins."""
+        if self.folder:
+            self._set(config, self.folder, self.subfolder)
+            config.hydra.runtime.output_dir = self.folder
+            HydraConfig.instance().set_config(config)
 
-
-def _record(config: DictConfig, key: str) -> None:
-    try:
-        folder = Path(str(OmegaConf.select(config, key))).absolute()
-        folder /= str(OmegaConf.select(config, "hydra.output_subdir") or "")
-    except OmegaConfBaseException:
-        return  # Hydra raises the same error next
-    _new_folders[:] = _missing(folder)
-
-
-def _missing(folder: Path) -> list[Path]:
-    """Return what does not exist of a folder and those that it is in, the innermost first."""
-    return [place for place in (folder, *folder.parents) if not os.path.exists(place)]
+    @staticmethod
+    def _set(config: DictConfig, folder: str, subfolder: str | None) -> None:
+        OmegaConf.set_readonly(config.hydra, False)
+        config.hydra.run.dir, config.hydra.output_subdir = folder, subfolder
 
 
 def overrides() -> list[tuple[str, str]]:
@@ -179,7 +186,7 @@ def check_run(config: DictConfig) -> None:
 
     See `coil_rl.config.check.check`.
     """
-    from coil_rl.config.saved import holds
+    from coil_rl.config.folder import holds
     from coil_rl.run.folder import is_evaluated
 
     folder = Path(config.run_dir)
@@ -210,30 +217,29 @@ def run_program(
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
-    _new_folders.clear()
-    _interrupts.clear()
-    _sweep.clear()
     bugs: list[Exception] = []
-    jobs = Jobs(config_name)
+    jobs, signals = Jobs(config_name), Signals()
 
     @functools.wraps(task)
     def checked(config: DictConfig) -> Any:
         try:
-            return _do(task, check, config)
+            return _do(task, check, config, signals)
         except KeyboardInterrupt as error:
-            if jobs.is_sweep():
+            if is_sweep():
                 raise KeyboardInterrupt(f"continue with: {jobs.command}") from error
             raise
         except Exception as error:
-            if jobs.is_sweep() and not isinstance(error, NoSweepError):
+            if is_sweep() and not isinstance(error, NoSweepError):
                 return jobs.fail(error)
+            if is_sweep():
+                remove_unused(Path(HydraConfig.get().sweep.dir))
             if is_no_bug(error):
                 # Here, because Hydra prints a line of its own for an error of the task.
                 refuse(config_name, error)
             bugs.append(error)
             raise
 
-    with program(config_name):
+    with program(config_name, signals):
         sys.argv[1:] = map(spelled, sys.argv[1:])
         _check_options(config_name)
         try:
@@ -253,36 +259,67 @@ def run_program(
             if error in bugs:
                 raise
             refuse(config_name, error)
-        jobs.report()
 
 
 def _do(
-    task: Callable[[DictConfig], Any], check: Callable[[DictConfig], None], config: DictConfig
+    task: Callable[[DictConfig], Any],
+    check: Callable[[DictConfig], None],
+    config: DictConfig,
+    signals: Signals,
 ) -> Any:
     """Do a task after a check of its configuration, and return its result."""
-    _listen()
+    signals.listen()
     _draw_into_files()
-    if Jobs.is_sweep() and "existing" in config:
+    if is_sweep() and "existing" in config:
         config.existing = "resume"  # so that a sweep goes on by the same command
     keep_written(config, str(HydraConfig.get().job.config_name), *typed())
     trust_packages(config.get("trust", []), config)
-    if config.get("run_dir"):  # which the check makes, if it is not Hydra's own
-        _new_folders[:0] = _missing(Path(config.run_dir).absolute())
-    check(config)
-    programs.imported()
-    if _interrupts:
-        raise KeyboardInterrupt
-    return task(config)
+    has_folder = bool(config.get("run_dir"))
+    made = _missing(Path(config.run_dir).absolute()) if has_folder else []
+    try:
+        check(config)
+        if has_folder and not is_sweep():
+            _make_folder(config)
+        programs.imported()
+        if signals.received:
+            raise KeyboardInterrupt
+        return task(config)
+    except Exception:
+        for folder in made:
+            with contextlib.suppress(OSError):  # it is not empty, or was not made
+                folder.rmdir()
+        raise
+
+
+def _missing(folder: Path) -> list[Path]:
+    """Return what does not exist of a folder and those that it is in, the innermost first."""
+    return [place for place in (folder, *folder.parents) if not os.path.exists(place)]
+
+
+def _make_folder(config: DictConfig) -> None:
+    """Make the folder of a run, with what Hydra keeps in it for some programs."""
+    folder, hydra_config = Path(config.run_dir), HydraConfig.get()
+    folder.mkdir(parents=True, exist_ok=True)
+    if hydra_config.output_subdir is not None:
+        place = folder / hydra_config.output_subdir
+        place.mkdir(exist_ok=True)
+        OmegaConf.save(config, place / "config.yaml")
+        OmegaConf.save(hydra_config.overrides.task, place / "overrides.yaml")
 
 
 @contextmanager
-def program(name: str) -> Iterator[None]:
+def program(name: str, signals: Signals | None = None) -> Iterator[None]:
     """End the process with one sentence on standard error instead of a traceback.
 
     The exit code is 2 for a mistake of the user, and 130 for Ctrl-C, SIGTERM, SIGHUP and SIGUSR1.
     After one of the last three a training first ends its update and saves its state.
+
+    Args:
+        name: of the program.
+        signals: those that it gets.
     """
-    _listen()
+    signals = Signals() if signals is None else signals
+    signals.listen()
     _draw_into_files()
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.formatwarning = lambda message, *_, **__: f"{name}: {message}\n"
@@ -291,7 +328,7 @@ def program(name: str) -> Iterator[None]:
         yield
     except (Exception, KeyboardInterrupt) as error:
         # A library may raise an error of its own on the way out of an interrupt.
-        if _interrupts or isinstance(error, KeyboardInterrupt):
+        if signals.received or isinstance(error, KeyboardInterrupt):
             reasons = map(str, error.args) if isinstance(error, KeyboardInterrupt) else ()
             print(f"{name}: {'; '.join(['interrupted', *reasons])}", file=sys.stderr)
             sys.exit(130)
@@ -310,19 +347,6 @@ def _end(stream: Any) -> Any:
     return open(os.devnull, "w", encoding="utf-8") if stream.broken else stream.stream
 
 
-def _listen() -> None:
-    """Handle signals, in this process or in that of a job of a sweep."""
-    if threading.current_thread() is not threading.main_thread():
-        return  # other threads cannot
-    if signal.getsignal(signal.SIGINT) is programs.interrupted:
-        signal.signal(signal.SIGINT, _interrupt)
-    for name in ("SIGTERM", "SIGHUP", "SIGUSR1"):  # the last two are missing on Windows
-        number = getattr(signal, name, None)
-        # A program under nohup ignores SIGHUP.
-        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _interrupt)
-
-
 def _draw_into_files() -> None:
     """Choose a backend for matplotlib that needs no window and no notebook, in this process.
 
@@ -330,136 +354,6 @@ def _draw_into_files() -> None:
     and matplotlib ends its import with an error.
     """
     os.environ["MPLBACKEND"] = "agg"
-
-
-def _interrupt(signum: int, frame: FrameType | None) -> None:
-    """Raise a `KeyboardInterrupt`, unless a training ends its update first.
-
-    It is remembered, because a module that is being imported may swallow it.
-    """
-    _interrupts.append(signum)
-    if signum == signal.SIGINT or not STOP.ask():
-        raise KeyboardInterrupt
-
-
-class Jobs:
-    """The jobs of a sweep, which may run in other processes.
-
-    One that fails leaves the others alone.
-
-    A job that fails writes a line into a file in the folder of the sweep.
-
-    Args:
-        name: of the program.
-    """
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.arguments = list(sys.argv)  # those of a process of its own are others
-
-    @staticmethod
-    def is_sweep() -> bool:
-        """Return whether this is a job of a sweep."""
-        return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
-
-    @property
-    def command(self) -> str:
-        """The command that continues the sweep, as a shell reads it."""
-        return _sweep_command(self.arguments, HydraConfig.get().sweep.dir)
-
-    def fail(self, error: Exception) -> float:
-        """Note that a job failed, and return NaN, its result.
-
-        A job whose run another process is working on has not failed: it is left to that process,
-        so that several programs can share a sweep.
-
-        Args:
-            error: a mistake of the user, or a bug, whose traceback is printed.
-        """
-        hydra_config = HydraConfig.get()
-        job = f"job {hydra_config.job.num} ({' '.join(hydra_config.overrides.task)})"
-        if isinstance(error, RunningError):
-            say(f"{self.name}: {job} is left to the process that works on it", error=True)
-            return math.nan
-        reason = sentence(error)
-        if not is_no_bug(error):
-            traceback.print_exception(error)
-            reason = f"{type(error).__name__}: {reason}"
-        line = f"{job}: {reason}"
-        say(f"{self.name}: {line}; the other jobs go on", error=True)
-        with contextlib.suppress(OSError):  # it is empty
-            Path(hydra_config.runtime.output_dir).rmdir()
-        path = Path(hydra_config.sweep.dir, FAILED_JOBS)
-        # Another program of the same sweep, all of whose jobs failed, may have removed the folder.
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", encoding="utf-8") as file:
-            file.write(f"{line}\n")
-        return math.nan
-
-    def report(self) -> None:
-        """End the program with exit code 2 if jobs have failed."""
-        path = Path(_sweep[0], FAILED_JOBS) if _sweep else None
-        if path is None or not path.is_file():
-            return
-        # Several programs may do the same sweep, and a job fails in each of them.
-        lines = list(dict.fromkeys(path.read_text(encoding="utf-8").splitlines()))
-        count = "1 job" if len(lines) == 1 else f"{len(lines)} jobs"
-        refuse(
-            self.name,
-            UserError(
-                f"{count} of this sweep failed: {_by_reason(lines)}; correct the cause, and do "
-                f"what is missing by {_sweep_command(self.arguments, _sweep[0])}"
-            ),
-        )
-
-
-def _by_reason(lines: Sequence[str]) -> str:
-    """Return the lines of failed jobs in one, each reason once.
-
-    Args:
-        lines: such as "job 0 (method=ppo seed=0): the env ...".
-    """
-    jobs: dict[str, list[str]] = {}
-    for line in lines:
-        job, _, reason = line.partition("): ")
-        jobs.setdefault(reason, []).append(f"{job})")
-    parts = []
-    for reason, failed in jobs.items():
-        numbers = ", ".join(job.split()[1] for job in failed)
-        parts.append(f"{failed[0]}: {reason}" if len(failed) == 1 else f"jobs {numbers}: {reason}")
-    return "; ".join(parts)
-
-
-def _sweep_command(arguments: Sequence[str], folder: str) -> str:
-    """Return the command that continues a sweep, as a shell reads it.
-
-    Args:
-        arguments: of the program that began it, its own path first.
-        folder: of the sweep.
-    """
-    program, *others = arguments
-    if not any(argument.startswith("hydra.sweep.dir=") for argument in others):
-        others.append(f"hydra.sweep.dir={folder}")
-    return shlex.join([f"coil-{Path(program).stem.removeprefix('coil-')}", *others])
-
-
-def refuse(name: str, error: Exception) -> NoReturn:
-    """End the program with one sentence and exit code 2.
-
-    New folders that hold no files of the task are removed.
-    """
-    for folder in filter(os.path.exists, _new_folders):  # a name may be too long for one
-        inside = {path for path in folder.rglob("*") if not path.is_dir()}
-        of_jobs = set()
-        for path in inside:
-            if path.name == "hydra.yaml":
-                of_jobs |= {path.with_name(file) for file in HYDRA_FILES}
-        of_sweep = ("multirun.yaml", FAILED_JOBS)
-        if all(path.name in of_sweep or path in of_jobs for path in inside):
-            shutil.rmtree(folder, ignore_errors=True)
-    _new_folders.clear()
-    print(f"{name}: {sentence(error)}", file=sys.stderr)
-    sys.exit(2)
 
 
 def _check_options(config_name: str) -> None:

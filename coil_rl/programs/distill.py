@@ -11,16 +11,16 @@ from coil_rl.programs import app
 
 def distill(config: DictConfig) -> float:
     """Train the missing proxies of all guides; return the lowest mean test reward of a proxy."""
-    from coil_rl.config import distillation
-    from coil_rl.config.build import build_guides
-    from coil_rl.config.start import run_configured
+    from coil_rl.config import proxies
+    from coil_rl.config.assemble import run_configured
+    from coil_rl.config.parts import build_guides
     from coil_rl.report.runs import read_runs
     from coil_rl.report.table import TABLES, markdown_table, return_format
     from coil_rl.run.folder import is_evaluated
 
     table, found = [], 0
     for name in build_guides(config):
-        proxy_config = distillation.proxy_config(config, name)
+        proxy_config = proxies.proxy_config(config, name)
         found += is_evaluated(Path(proxy_config.run_dir))
         reward = run_configured(proxy_config, wait=True)
         (finished,) = read_runs([Path(proxy_config.run_dir)])

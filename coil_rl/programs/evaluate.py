@@ -34,8 +34,9 @@ def evaluate(config: DictConfig) -> float:
     """Evaluate a run or guides; return the mean reward of the deterministic policy."""
     import torch
 
-    from coil_rl.config.build import assemble, env_maker, trial
-    from coil_rl.config.pretrained import run_folder
+    from coil_rl.config.assemble import assemble, trial
+    from coil_rl.config.folder import run_folder
+    from coil_rl.config.parts import env_maker
     from coil_rl.run.judge import judge, report_outcome
     from coil_rl.run.parts import SOME_ROWS
 
@@ -67,11 +68,11 @@ def with_exported(config: DictConfig, file: str) -> DictConfig:
     Raises:
         UserError: for a file that cannot be used, or a policy whose guide is outside.
     """
-    from coil_rl.export import ExportedGuide
+    from coil_rl.config.nodes import build
 
-    ExportedGuide(file)
-    alone = config.copy()
     target = {"_target_": "coil_rl.export.ExportedGuide", "file": str(file)}
+    build(target, "exported")
+    alone = config.copy()
     with open_dict(alone):
         alone.guide["exported"] = target
         # Degraded advice is not a part of a policy that acts.
@@ -93,9 +94,9 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
         UserError: for a folder without a run, one without tracks although tracks are given, or an
             env that does not write what is measured.
     """
-    from coil_rl.config.build import env_maker
     from coil_rl.config.check import check_measures
-    from coil_rl.config.saved import read_config
+    from coil_rl.config.folder import read_config
+    from coil_rl.config.parts import env_maker
     from coil_rl.config.values import check_values
     from coil_rl.run.parts import SOME_ROWS, TEST
 
@@ -119,7 +120,7 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
 
 def _check_advice(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> None:
     """Raise a `UserError` if degraded advice is asked for, but the policy has no advice."""
-    from coil_rl.config.build import advises
+    from coil_rl.config.parts import advises
 
     if advises(config) and not resolved.get("exported"):
         return

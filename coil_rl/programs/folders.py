@@ -10,7 +10,7 @@ from pathlib import Path
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
-from coil_rl.config.written import quoted
+from coil_rl.config.compose import quoted
 
 # Keys that hold one folder or file; `folder` of coil-report may be a list of folders, too.
 KEYS = (

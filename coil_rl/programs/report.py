@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, ListConfig
 
-from coil_rl.config.pretrained import PREFIX
+from coil_rl.config.folder import PREFIX
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.programs import app
 
@@ -65,7 +65,7 @@ def report(config: DictConfig) -> None:
         for kind, rows in tables.items()
     ]
     notes = [
-        page.notes(against, compared),
+        *page.notes(against, compared),
         *page.unpaired(against, compared),
         *page.handed_over(finished),
         *page.begun(finished),
@@ -75,7 +75,7 @@ def report(config: DictConfig) -> None:
         *differences,
         *of_changed_guides(finished),
         *of_guides_of_labels(finished),
-        page.progress(len(finished), len(runs), failed_jobs(folders)),
+        *page.progress(len(finished), len(runs), failed_jobs(folders)),
     ]
     training = [*page.training(finished), *page.guide_training(finished)]
     sections.append(Section("", [*training, *notes]))

@@ -8,12 +8,12 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from coil_rl.config.pretrained import PREFIX
+from coil_rl.config.folder import PREFIX
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
 from coil_rl.output import say
-from coil_rl.programs import app, folders, imported, plan
+from coil_rl.programs import app, folders, imported, sweeps
 
 # What may be given beside resume=FOLDER.
 BESIDE_RESUME = ("trust=", "budget.frames=")
@@ -21,28 +21,28 @@ BESIDE_RESUME = ("trust=", "budget.frames=")
 
 def train(config: DictConfig) -> float:
     """Do one run and return the mean test reward of its deterministic policy."""
-    from coil_rl.config.start import run_configured
+    from coil_rl.config.assemble import run_configured
 
     if config.resume is not None:
         raise UserError(
             f"resume={config.resume} belongs on the command line, alone: coil-train resume=FOLDER"
         )
-    return run_configured(config, command=app.command_line(), callback=plan.pace(config))
+    return run_configured(config, command=app.command_line())
 
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration, or for what nothing reads.
 
     In a sweep a word may be meant for other runs. They are known to Hydra's own sweeper only, for
-    which `coil_rl.programs.plan` has compared them; for another one each run says what it ignores.
+    which `sweeps.Plan` has compared them; for another one each run says what it ignores.
     """
     from coil_rl.config.unread import check_read, unread
 
     app.check_run(config)
     words = app.typed().task
-    if not app.Jobs.is_sweep():
+    if not sweeps.is_sweep():
         check_read(config, words)
-    elif not plan.knows_all_runs(HydraConfig.get().sweeper):
+    elif not sweeps.knows_all_runs(HydraConfig.get().sweeper):
         for sentence in unread(config, words):
             say(f"{sentence}, if no other run of this sweep reads it", error=True)
 
@@ -58,9 +58,9 @@ def resume(folder: Path, frames: int | None = None) -> float:
         UserError: for a folder without a run, or one that cannot be resumed or would write outside
             of its folder.
     """
-    from coil_rl.config.build import assemble
+    from coil_rl.config.assemble import assemble
     from coil_rl.config.check import check
-    from coil_rl.config.saved import read_config
+    from coil_rl.config.folder import read_config
     from coil_rl.run.folder import is_evaluated, locked
 
     config = read_config(folder, "resume", goes_on=True)

@@ -123,21 +123,21 @@ class Group:
         """Mean score, with the interval over the cases: of the means over seeds in each case."""
         return estimate(self.scores.mean(axis=0))
 
-    def known(self, measure: str, case: int | None = None) -> tuple[int, int]:
-        """Return in how many of the episodes a measure is known, and the number of episodes.
+    def counts(self, case: int | None = None) -> dict[str, int]:
+        """Return the number of `episodes`, and by measure in how many of them it is known.
 
         Args:
-            measure: name of the measure.
             case: index of the only case to count; None for all of them.
         """
-        if measure not in self.table:
-            return 0, 0
-        known, episodes = _episodes(self.table, measure)
-        if case is not None:
-            known, episodes = (
-                each.xs(self.cases[case], level="case") for each in (known, episodes)
-            )
-        return int(known.sum()), int(episodes.sum())
+        rows = self._rows(case)
+        counts = {"episodes": int(_episodes(rows, "reward")[1].sum())}
+        for name in self.measures:
+            if name in rows:
+                counts[name] = int(_episodes(rows, name)[0].sum())
+        return counts
+
+    def _rows(self, case: int | None) -> pd.DataFrame:
+        return self.table if case is None else self.table.xs(self.cases[case], level="case")
 
     @property
     def rank(self) -> tuple[bool, float, float]:
@@ -181,7 +181,7 @@ class Group:
         Args:
             case: index of the only case to count; None for all of them.
         """
-        rows = self.table if case is None else self.table.xs(self.cases[case], level="case")
+        rows = self._rows(case)
         means = {"reward": float(rows["reward"].mean(skipna=False))}
         for name, each in self.measures.items():
             if name in rows:
@@ -300,16 +300,13 @@ class Comparison:
             group: the policy.
             case: index of the only case to count; None for all of them.
         """
-        names: dict[str, None] = {}
-        for each in self.groups:
-            for name in each.measures:
-                known, episodes = each.known(name)
-                if 0 < known < episodes:
-                    names[name] = None
+        found = [each.counts() for each in self.groups]
+        names = [name for each in found for name in each if 0 < each[name] < each["episodes"]]
         if not names:
             return {}
-        counts = {"episodes": group.known("reward", case)[1]}
-        return counts | {f"{name}{EPISODES}": group.known(name, case)[0] for name in names}
+        counts = group.counts(case)
+        known = {f"{name}{EPISODES}": counts.get(name, 0) for name in names}
+        return {"episodes": counts["episodes"]} | known
 
     def case_table(self) -> list[dict[str, Any]]:
         """Return one row per policy and case."""

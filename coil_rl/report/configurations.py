@@ -9,6 +9,7 @@ from typing import Any
 
 from coil_rl.measures import Measure
 from coil_rl.report.runs import FALLBACK, Run
+from coil_rl.report.sentences import REPORT
 
 CALLED_SEED = ("seed", "random_state")  # ends of keys; the second is of scikit-learn
 # Keys, or parents of keys, on which the numbers of a run do not depend, or only by rounding.
@@ -66,9 +67,7 @@ def distinguish(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
             continue
         configurations = {index: relevant(runs[index]) for index in of_label}
         keys = _telling_first(keys, list(configurations.values()))
-        sentences.append(
-            f"The runs of {label} differ in {_listed(keys)}, so they are not means of one another."
-        )
+        sentences += REPORT.said("divided", label=label, keys=keys)
         values = [[configurations[index].get(key) for key in keys] for index in of_label]
         for index, shown in zip(of_label, _shown(keys, values), strict=True):
             distinguished[index] = _relabelled(runs[index], f"{label} ({shown})")
@@ -103,13 +102,8 @@ def of_several_envs(runs: Sequence[Run]) -> list[str]:
         runs: finished runs.
     """
     nodes = [run.settings.get("env") or {} for run in runs]
-    names = list(dict.fromkeys(str(node.get("id") or node.get("_target_")) for node in nodes))
-    if len(names) < 2:
-        return []
-    return [
-        f"The runs are in {len(names)} envs ({', '.join(map(_text, names))}): compare those of one "
-        "env only."
-    ]
+    names = dict.fromkeys(str(node.get("id") or node.get("_target_")) for node in nodes)
+    return REPORT.said("several_envs", names=list(map(_text, names)))
 
 
 def of_several_conditions(runs: Sequence[Run]) -> list[str]:
@@ -125,9 +119,7 @@ def of_several_conditions(runs: Sequence[Run]) -> list[str]:
     differ = [key for key in differing(runs) if _is_condition(key)]
     # An empty group beside its keys says nothing.
     keys = [key for key in differ if not any(each.startswith(f"{key}.") for each in differ)]
-    if not keys:
-        return []
-    return [f"The runs differ in {_listed(keys)}: compare those under the same conditions only."]
+    return REPORT.said("conditions", keys=keys)
 
 
 def _is_condition(key: str) -> bool:
@@ -141,25 +133,14 @@ def of_several_definitions(runs: Sequence[Run]) -> list[str]:
     Args:
         runs: finished runs.
     """
-    sentences = []
-    for name in dict.fromkeys(name for run in runs for name in run.measures):
-        labels: dict[Measure, str] = {}
-        for run in runs:
-            if name in run.measures:
-                # The heading and the format change no number.
-                measured = replace(run.measures[name], title="", format="auto")
-                labels.setdefault(measured, run.label)
-        if len(labels) > 1:
-            sentences.append(
-                f"The measure {name} is defined in {len(labels)} ways (by "
-                f"{' and '.join(labels.values())}): compare its numbers of one definition only."
-            )
-    return sentences
-
-
-def _listed(keys: Sequence[str]) -> str:
-    """Return keys as a text, the first ones of many."""
-    return ", ".join(keys[:MOST_KEYS]) + (" and others" if len(keys) > MOST_KEYS else "")
+    labels: dict[str, dict[Measure, str]] = {}
+    for run in runs:
+        for name, measure in run.measures.items():
+            # The heading and the format change no number.
+            measured = replace(measure, title="", format="auto")
+            labels.setdefault(name, {}).setdefault(measured, run.label)
+    several = [(name, list(of.values())) for name, of in labels.items() if len(of) > 1]
+    return REPORT.said("definitions", measures=several)
 
 
 def _telling_first(keys: Sequence[str], configurations: Sequence[Mapping[str, Any]]) -> list[str]:

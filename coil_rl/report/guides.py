@@ -1,11 +1,12 @@
 """Guides in the evaluations of runs: which ones are the same, and which ones changed.
 
-Every run evaluates its guides anew, in the same cases.
+Every run evaluates its guides anew, in the same cases. Evaluations with equal cases and returns
+have one number, so that guides are compared by sets of numbers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from coil_rl.report.configurations import guide_follows_seed, of_guide
 from coil_rl.report.runs import GUIDE, Run
+from coil_rl.report.sentences import REPORT, listed
 from coil_rl.report.statistics import Array
 
 if TYPE_CHECKING:
@@ -20,8 +22,9 @@ if TYPE_CHECKING:
 
 SAME_RETURN = 1e-5  # of the range of the compared returns; the rest is rounding
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
-MOST_SHOWN = 3  # labels in a sentence, and parts of the seeds of each
-MOST_SEEDS = 4  # in a part
+MOST_SEEDS = 4  # in a part of the seeds of a label
+
+Numbers = dict[str, dict[str, dict[int, int]]]  # of evaluations, by guide, label and seed
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,43 +33,35 @@ class Guide:
 
     Attributes:
         name: "guide", or "guide NAME".
+        different: the different evaluations of all guides.
         labels: which share the guide.
-        results: the different evaluations of the guide.
-        of_runs: the evaluation of each run, by label and seed.
+        of_runs: the number of the evaluation of each run in `different`, by label and seed.
     """
 
     name: str
+    different: Sequence[pd.DataFrame]
     labels: list[str] = field(default_factory=list)
-    results: list[pd.DataFrame] = field(default_factory=list)
-    of_runs: dict[tuple[str, int], pd.DataFrame] = field(default_factory=dict)
-
-    def add(self, label: str, of_seeds: Mapping[int, pd.DataFrame]) -> None:
-        """Let a label share the guide.
-
-        Args:
-            label: of the runs.
-            of_seeds: the evaluation in each of them by seed.
-        """
-        self.labels.append(label)
-        self.results[:] = _different([*self.results, *of_seeds.values()])
-        self.of_runs.update({(label, seed): rows for seed, rows in of_seeds.items()})
-
-    def numbers(self) -> dict[tuple[str, int], int]:
-        """Return the number of the evaluation of each run, by label and seed."""
-        return {run: _position(self.results, rows) for run, rows in self.of_runs.items()}
+    of_runs: dict[tuple[str, int], int] = field(default_factory=dict)
 
     def listed(self) -> str:
         """Return the labels as a text, the first ones of many."""
-        more = len(self.labels) - LABELS_IN_NAME
-        if more <= 1:
-            return ", ".join(self.labels)
-        return f"{', '.join(self.labels[:LABELS_IN_NAME])} and {more} more"
+        return listed(self.labels, LABELS_IN_NAME)
+
+    @property
+    def own(self) -> list[int]:
+        """The numbers of its different evaluations."""
+        return list(dict.fromkeys(self.of_runs.values()))
+
+    def numbers(self) -> dict[tuple[str, int], int]:
+        """Return the place of the evaluation of each run in `rows`, by label and seed."""
+        return {run: self.own.index(number) for run, number in self.of_runs.items()}
 
     def rows(self) -> pd.DataFrame:
         """Return all different evaluations, numbered by the column `seed`."""
         import pandas as pd
 
-        return pd.concat([rows.assign(seed=number) for number, rows in enumerate(self.results)])
+        tables = [self.different[number] for number in self.own]
+        return pd.concat([rows.assign(seed=place) for place, rows in enumerate(tables)])
 
 
 def is_guide(frame: pd.DataFrame) -> pd.Series:
@@ -88,15 +83,23 @@ def shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[Guide]:
     Args:
         labels: the evaluations by label.
     """
+    tables = (
+        (label, seed, rows)
+        for label, frame in labels.items()
+        for seed, rows in frame.groupby("seed", sort=False)
+    )
+    numbers, different = _numbered(tables)
     guides: list[Guide] = []
-    for label, frame in labels.items():
-        for name, rows in frame[is_guide(frame)].groupby("driver", sort=False):
-            of_seeds = dict(iter(rows.groupby("seed", sort=False)))
-            same = _same_guide(guides, name, list(of_seeds.values()))
+    for name, of_labels in numbers.items():
+        of_name: list[Guide] = []
+        for label, of_seeds in of_labels.items():
+            same = next((each for each in of_name if _share(of_seeds.values(), each.own)), None)
             if same is None:
-                same = Guide(name)
-                guides.append(same)
-            same.add(label, of_seeds)
+                same = Guide(name, different)
+                of_name.append(same)
+            same.labels.append(label)
+            same.of_runs.update({(label, seed): number for seed, number in of_seeds.items()})
+        guides += of_name
     return guides
 
 
@@ -109,20 +112,15 @@ def of_changed_guides(runs: Sequence[Run]) -> list[str]:
         runs: finished runs; those of one label have one configuration.
     """
     found: dict[str, list[str]] = {}
-    for run, name, of_seeds in _guides_without_seed(runs):
-        parts = _alike(of_seeds)
-        if len(parts) > 1:
-            shown = [_some(list(map(str, seeds)), MOST_SEEDS) for seeds in parts]
-            found.setdefault(name, []).append(f"{run.label} seeds {_some(shown, joint=' / ')}")
-    warnings = []
-    for name, labels in found.items():
-        warnings.append(
-            f"The {name} has different returns in the same cases in runs of the same configuration "
-            f"({_some(labels, joint='; ')}): either the env, the guide or what they use changed "
-            "between these runs, and they are not to be pooled, or the guide or the env draws "
-            "random numbers of its own."
-        )
-    return warnings
+    for name, of_labels in _without_seed(runs)[0].items():
+        for label, of_seeds in of_labels.items():
+            parts: dict[int, list[int]] = {}
+            for seed in sorted(of_seeds):
+                parts.setdefault(of_seeds[seed], []).append(seed)
+            if len(parts) > 1:
+                shown = listed((listed(each, MOST_SEEDS) for each in parts.values()), joint=" / ")
+                found.setdefault(name, []).append(f"{label} seeds {shown}")
+    return REPORT.said("changed_guides", guides=found)
 
 
 def of_guides_of_labels(runs: Sequence[Run]) -> list[str]:
@@ -134,111 +132,63 @@ def of_guides_of_labels(runs: Sequence[Run]) -> list[str]:
     Args:
         runs: finished runs; those of one label have one configuration.
     """
-    first: dict[str, list[tuple[str, dict[str, Any], list[pd.DataFrame]]]] = {}
+    numbers, different = _without_seed(runs)
+    settings = {run.label: of_guide(run) for run in reversed(runs)}
     differ: dict[str, list[str]] = {}
-    for run, name, of_seeds in _guides_without_seed(runs):
-        settings, results = of_guide(run), _different(of_seeds.values())
-        known = first.setdefault(name, [])
-        others = [each for each in known if each[1] == settings and _in_same(results, each[2])]
-        if others and not any(_share(results, theirs) for _, _, theirs in others):
-            differ.setdefault(name, []).append(f"{others[0][0]} / {run.label}")
-        known.append((run.label, settings, results))
-    warnings = []
-    for name, labels in differ.items():
-        warnings.append(
-            f"The {name} has different returns in the same cases in runs of different labels, "
-            f"whose guide, env and cases have one configuration ({_some(labels, joint='; ')}): "
-            "either the env, the guide or what they use changed between these runs, and they are "
-            "not to be compared, or the guide or the env draws random numbers of its own."
-        )
-    return warnings
+    for name, of_labels in numbers.items():
+        known: list[tuple[str, tuple[Any, list[Any]], list[int]]] = []
+        for label, of_seeds in of_labels.items():
+            ours = list(of_seeds.values())
+            alike = settings[label], different[ours[0]]["case"].tolist()
+            others = [each for each in known if each[1] == alike]
+            if others and not any(_share(ours, theirs) for *_, theirs in others):
+                differ.setdefault(name, []).append(f"{others[0][0]} / {label}")
+            known.append((label, alike, ours))
+    return REPORT.said("guides_of_labels", guides=differ)
 
 
-def _guides_without_seed(
-    runs: Sequence[Run],
-) -> Iterator[tuple[Run, str, dict[int, pd.DataFrame]]]:
-    """Yield each guide of each label that does not depend on the seed of the run.
-
-    With its name come the first run of the label, and the guide's evaluations by seed.
-    """
+def _without_seed(runs: Sequence[Run]) -> tuple[Numbers, list[pd.DataFrame]]:
+    """Return the evaluations of the guides that do not depend on the seed, see `_numbered`."""
+    follow = set()
     for label in dict.fromkeys(run.label for run in runs):
-        of_label = [run for run in runs if run.label == label]
-        if not guide_follows_seed(of_label):
-            for name, of_seeds in _by_seed(of_label).items():
-                yield of_label[0], name, of_seeds
+        if guide_follows_seed([run for run in runs if run.label == label]):
+            follow.add(label)
+    return _numbered(
+        (run.label, run.seed, run.evaluation) for run in runs if run.label not in follow
+    )
 
 
-def _in_same(results: Sequence[pd.DataFrame], others: Sequence[pd.DataFrame]) -> bool:
-    """Return whether evaluations of two labels are in the same cases."""
-    return results[0]["case"].tolist() == others[0]["case"].tolist()
-
-
-def _share(results: Sequence[pd.DataFrame], others: Sequence[pd.DataFrame]) -> bool:
-    """Return whether the evaluations of one of two labels contain those of the other."""
-    pairs = ((results, others), (others, results))
-    return any(all(_contains(ours, each) for each in theirs) for theirs, ours in pairs)
-
-
-def _by_seed(runs: Sequence[Run]) -> dict[str, dict[int, pd.DataFrame]]:
-    """Return the evaluations of each guide by the seed of the run."""
-    of_guides: dict[str, dict[int, pd.DataFrame]] = {}
-    for run in runs:
-        guides = run.evaluation[is_guide(run.evaluation)]
-        for name, rows in guides.groupby("driver", sort=False):
-            of_guides.setdefault(str(name), {})[run.seed] = rows
-    return of_guides
-
-
-def _alike(of_seeds: Mapping[int, pd.DataFrame]) -> list[list[int]]:
-    """Return the seeds with equal evaluations together.
+def _numbered(
+    tables: Iterable[tuple[str, int, pd.DataFrame]],
+) -> tuple[Numbers, list[pd.DataFrame]]:
+    """Return the number of the evaluation of each guide, and the different evaluations.
 
     Args:
-        of_seeds: the evaluation of each seed.
+        tables: label, seed and evaluation of each run.
     """
-    results = _different(of_seeds.values())
-    parts: list[list[int]] = [[] for _ in results]
-    for seed in sorted(of_seeds):
-        parts[_position(results, of_seeds[seed])].append(seed)
-    return sorted(parts)
-
-
-def _some(texts: Sequence[str], most: int = MOST_SHOWN, joint: str = ", ") -> str:
-    """Return texts as one, the first ones of many.
-
-    Args:
-        texts: to join.
-        most: number of the texts that are shown.
-        joint: between them.
-    """
-    return joint.join([*texts[:most], *(["..."] if len(texts) > most else [])])
-
-
-def _different(results: Iterable[pd.DataFrame]) -> list[pd.DataFrame]:
-    """Return evaluations without duplicates."""
+    numbers: Numbers = {}
     different: list[pd.DataFrame] = []
-    for result in results:
-        if not _contains(different, result):
-            different.append(result)
-    return different
+    for label, seed, table in tables:
+        for name, rows in table[is_guide(table)].groupby("driver", sort=False):
+            equal = (place for place, each in enumerate(different) if _is_same(each, rows))
+            number = next(equal, len(different))
+            if number == len(different):
+                different.append(rows)
+            numbers.setdefault(str(name), {}).setdefault(label, {})[seed] = number
+    return numbers, different
 
 
-def _contains(results: Sequence[pd.DataFrame], result: pd.DataFrame) -> bool:
-    """Return whether one of several evaluations has the cases and returns of another one."""
-    return _position(results, result) < len(results)
+def _share(ours: Iterable[int], theirs: Iterable[int]) -> bool:
+    """Return whether the evaluations of one of two labels contain those of the other."""
+    one, other = set(ours), set(theirs)
+    return one <= other or other <= one
 
 
-def _position(results: Sequence[pd.DataFrame], result: pd.DataFrame) -> int:
-    """Return the first of several evaluations that is equal to another one; without, their number.
-
-    Equal are the cases and the returns.
-    """
-    cases, returns = result["case"].tolist(), result["reward"].to_numpy(float)
-    for number, other in enumerate(results):
-        if other["case"].tolist() == cases and _same_returns(
-            other["reward"].to_numpy(float), returns
-        ):
-            return number
-    return len(results)
+def _is_same(one: pd.DataFrame, other: pd.DataFrame) -> bool:
+    """Return whether two evaluations have the same cases and returns."""
+    if one["case"].tolist() != other["case"].tolist():
+        return False
+    return _same_returns(one["reward"].to_numpy(float), other["reward"].to_numpy(float))
 
 
 def _same_returns(one: Array, other: Array) -> bool:
@@ -252,13 +202,3 @@ def _same_returns(one: Array, other: Array) -> bool:
     both = both[np.isfinite(both)]
     tolerance = SAME_RETURN * float(np.ptp(both)) if both.size else 0.0
     return np.allclose(one, other, rtol=1e-7, atol=tolerance, equal_nan=True)
-
-
-def _same_guide(
-    guides: Sequence[Guide], name: str, results: Sequence[pd.DataFrame]
-) -> Guide | None:
-    """Return the first guide with a name whose results contain the given ones, or the reverse."""
-    for guide in guides:
-        if guide.name == name and _share(results, guide.results):
-            return guide
-    return None

@@ -11,17 +11,18 @@ from itertools import chain
 from statistics import mean
 from typing import Any
 
+from coil_rl.measures import with_shares
 from coil_rl.record import UNTESTED
 from coil_rl.report.comparison import Comparison, Group
-from coil_rl.report.curves import learning
+from coil_rl.report.curves import learning, points
 from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run, begun_with
+from coil_rl.report.sentences import REPORT
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
 from coil_rl.report.table import AUTO_FORMAT, TABLES, Table, fitted, return_format
 
 Block = Table | str  # a table or a paragraph
 
 MAX_CASES = 8  # in a table
-MOST_SOURCES = 3  # of earlier policies in a sentence
 IN_CASE = "in "  # prefix of columns, since a case may have the name of another column
 GUIDE_RETURN = "guide/"  # prefix of columns of metrics.csv
 GUIDE_CALLS = "guide/calls"  # is no return
@@ -40,30 +41,11 @@ def section(
     columns = _columns(comparison, rows, against)
     shown = with_cells(rows, comparison.score[1])
     columns = fitted(shown, columns)
-    for row, group in zip(shown, comparison.groups, strict=True):
-        row |= _shares(row, group, columns)
+    shown = with_shares(shown, [group.counts() for group in comparison.groups], columns)
     parts = _parts(comparison, TERM, "term of the reward", AUTO_FORMAT)
     parts += _parts(comparison, PER_STEP, "reward of a step", ".3f")
     cases = cases_table(comparison.groups, "report_cases.csv")
     return [Table(shown, columns), *parts, cases]
-
-
-def _shares(
-    row: Mapping[str, Any], group: Group, columns: Mapping[str, tuple[str, str]]
-) -> dict[str, str]:
-    """Return the cells of a policy whose means leave episodes out, as `12.3 (4 of 8)`.
-
-    Args:
-        row: of the table.
-        group: the policy.
-        columns: heading and number format by name.
-    """
-    cells = {}
-    for name in group.measures:
-        known, episodes = group.known(name)
-        if name in columns and 0 < known < episodes:
-            cells[name] = f"{row[name]:{columns[name][1]}} ({known} of {episodes})"
-    return cells
 
 
 def _columns(
@@ -134,30 +116,17 @@ def guide_training(runs: Sequence[Run]) -> list[Table]:
     rows: list[dict[str, Any]] = []
     columns = {"label": ("guides' own return, before to after", ""), "seeds": ("seeds", "")}
     for label, of_label in _trained(runs):
-        curves = [run.curve for run in of_label]
-        row: dict[str, Any] = {"label": label, "seeds": len(curves)}
-        for key in chain.from_iterable(curve[0] for curve in curves):
-            if key.startswith(GUIDE_RETURN) and key != GUIDE_CALLS and key not in row:
-                row[key] = _before_to_after(curves, key)
+        row: dict[str, Any] = {"label": label, "seeds": len(of_label)}
+        for key in dict.fromkeys(chain.from_iterable(run.curve[0] for run in of_label)):
+            if key.startswith(GUIDE_RETURN) and key != GUIDE_CALLS:
+                known = [points(run.curve, key)[:, 1] for run in of_label]
+                before, after = ([each[end] for each in known if len(each)] for end in (0, -1))
+                spec = return_format([mean(before), mean(after)]) if before else ""
+                row[key] = _mean_of_some(before, len(of_label), spec, after)
                 columns[key] = (key.removeprefix(GUIDE_RETURN), "")
         if len(row) > 2:
             rows.append(row)
     return [Table(rows, columns)] if rows else []
-
-
-def _before_to_after(curves: Sequence[Sequence[Mapping[str, float]]], key: str) -> str | None:
-    """Return the first and the last number of a column as a cell, means over the runs.
-
-    A run without a number in the column does not count.
-    """
-    columns = [[line[key] for line in curve if key in line] for curve in curves]
-    numbers = [[each for each in column if not math.isnan(each)] for column in columns]
-    known = [column for column in numbers if column]
-    if not known:
-        return None
-    before, after = mean(column[0] for column in known), mean(column[-1] for column in known)
-    spec = return_format([before, after])
-    return f"{before:{spec}} to {after:{spec}}{some_of(len(known), len(curves))}"
 
 
 def training(runs: Sequence[Run]) -> list[Table]:
@@ -171,26 +140,34 @@ def training(runs: Sequence[Run]) -> list[Table]:
     rows: list[dict[str, Any]] = []
     for label, of_label in _trained(runs):
         numbers = [learning(run) for run in of_label]
-        seconds = [run.seconds for run in of_label if run.seconds is not None]
         row: dict[str, Any] = {key: mean(seed[key] for seed in numbers) for key in numbers[0]}
         row["label"], row["seeds"] = label, len(of_label)
-        row["seconds"] = mean(seconds) if seconds else None
-        if 0 < len(seconds) < len(of_label):
-            row["seconds"] = f"{mean(seconds):.0f}{some_of(len(seconds), len(of_label))}"
+        seconds = [run.seconds for run in of_label if run.seconds is not None]
+        row["seconds"] = _mean_of_some(seconds, len(of_label), ".0f")
         for key in ("until_90", "until_100"):
-            row[f"{key} cell"] = _reached([seed[key] for seed in numbers])
+            reached = [seed[key] for seed in numbers if not math.isnan(seed[key])]
+            row[f"{key} cell"] = _mean_of_some(reached, len(of_label), ",.0f")
         if not math.isnan(row["area"]):
             rows.append(row)
     rows.sort(key=lambda row: -float(row["area"]))
     return [Table(rows, TABLES["learning"]["columns"])] if rows else []
 
 
-def _reached(frames: Sequence[float]) -> str | None:
-    """Return the mean frames up to a level as a cell, given those of each seed; NaN for never."""
-    reached = [number for number in frames if not math.isnan(number)]
-    if not reached:
+def _mean_of_some(
+    known: Sequence[float], seeds: int, spec: str, after: Sequence[float] = ()
+) -> str | None:
+    """Return the mean over some seeds as a cell that says how many; None without a number.
+
+    Args:
+        known: numbers of the seeds that have one.
+        seeds: number of all seeds.
+        spec: format of the mean.
+        after: a second number of each of these seeds.
+    """
+    if not known:
         return None
-    return f"{mean(reached):,.0f}{some_of(len(reached), len(frames))}"
+    means = " to ".join(f"{mean(numbers):{spec}}" for numbers in (known, after) if numbers)
+    return f"{means}{some_of(len(known), seeds)}"
 
 
 def some_of(reached: int, seeds: int) -> str:
@@ -203,24 +180,21 @@ def some_of(reached: int, seeds: int) -> str:
     return f" ({reached} of {seeds} seeds)" if reached < seeds else ""
 
 
-def notes(against: str | None, compared: Mapping[str, Comparison]) -> str:
+def notes(against: str | None, compared: Mapping[str, Comparison]) -> list[str]:
     """Return an explanation of the tables.
 
     Args:
         against: what the policies are compared with, see `Comparison.table`.
         compared: the policies, by kind of actions, such as "sampled".
     """
-    reasons = [comparison.plain_because for comparison in compared.values()]
-    used = {
-        "order": True,
-        "normalised": any(comparison.normalised for comparison in compared.values()),
-        "plain": any(reasons),
-        "against": against is not None,
-        "sampled": "sampled" in compared,
-    }
-    text = " ".join(TABLES["drivers"]["notes"][key] for key in used if used[key])
-    because = next(filter(None, reasons), "")
-    return text.format(other=_other(against), seeds=SIGN_FLIP_SEEDS, because=because)
+    return REPORT.said(
+        "notes",
+        other=_other(against),
+        normalised=any(comparison.normalised for comparison in compared.values()),
+        because="".join(dict.fromkeys(each.plain_because for each in compared.values())),
+        sampled="sampled" in compared,
+        seeds=SIGN_FLIP_SEEDS,
+    )
 
 
 def unpaired(against: str | None, compared: Mapping[str, Comparison]) -> list[str]:
@@ -230,15 +204,8 @@ def unpaired(against: str | None, compared: Mapping[str, Comparison]) -> list[st
         against: what the policies are compared with, see `Comparison.table`.
         compared: the policies, by kind of actions.
     """
-    names = dict.fromkeys(
-        chain.from_iterable(comparison.unpaired(against) for comparison in compared.values())
-    )
-    if not names:
-        return []
-    return [
-        f"No seed in common with {_other(against)}: {', '.join(names)}. Differences are between "
-        "runs of the same seed, so there is none."
-    ]
+    names = chain.from_iterable(each.unpaired(against) for each in compared.values())
+    return REPORT.said("unpaired", names=list(dict.fromkeys(names)), other=_other(against))
 
 
 def handed_over(runs: Sequence[Run]) -> list[str]:
@@ -249,23 +216,12 @@ def handed_over(runs: Sequence[Run]) -> list[str]:
     Args:
         runs: finished runs.
     """
-    sentences = []
-    tested = [run for run in runs if run.handed_over]
-    for label in dict.fromkeys(run.label for run in tested):
-        counts = Counter(run.handed_over for run in tested if run.label == label)
-        untested = counts.pop(UNTESTED, 0)
-        if counts:
-            listed = ", ".join(f"{policy} {count}" for policy, count in counts.most_common())
-            sentences.append(
-                f"The runs of {label} handed over the policy that was best in a test at their end, "
-                f"whose steps are among their frames: {listed}."
-            )
-        if untested:
-            sentences.append(
-                f"Of the runs of {label} {untested} had no frames left for a test and handed over "
-                "their last policy."
-            )
-    return sentences
+    counts: dict[str, Counter[str]] = {}
+    for run in runs:
+        if run.handed_over:
+            counts.setdefault(run.label, Counter())[run.handed_over] += 1
+    labels = [(label, of.pop(UNTESTED, 0), of.most_common()) for label, of in counts.items()]
+    return REPORT.said("handed_over", labels=labels)
 
 
 def begun(runs: Sequence[Run]) -> list[str]:
@@ -278,17 +234,10 @@ def begun(runs: Sequence[Run]) -> list[str]:
     for run in runs:
         if (source := begun_with(run.settings)) is not None:
             sources.setdefault(run.label, {})[source] = None
-    sentences = []
-    for label, named in sources.items():
-        listed = ", ".join(list(named)[:MOST_SOURCES])
-        more = f" and {len(named) - MOST_SOURCES} more" if len(named) > MOST_SOURCES else ""
-        sentences.append(
-            f"Runs of {label} began with {listed}{more}, whose frames are not among theirs."
-        )
-    return sentences
+    return REPORT.said("begun", labels=sources)
 
 
-def progress(finished: int, started: int, refused: int = 0) -> str:
+def progress(finished: int, started: int, refused: int = 0) -> list[str]:
     """Return a sentence on the runs that the tables leave out.
 
     Args:
@@ -296,17 +245,7 @@ def progress(finished: int, started: int, refused: int = 0) -> str:
         started: number of all runs.
         refused: number of jobs of sweeps that were refused or failed.
     """
-    jobs = ""
-    if refused:
-        jobs = f" {refused} jobs of the sweeps were refused or failed, see failed_jobs.txt."
-    if finished == started == 1:
-        return f"The one run that was started is finished.{jobs}"
-    if finished == started:
-        return f"All {started} runs that were started are finished.{jobs}"
-    return (
-        f"{finished} of {started} runs that were started are finished; "
-        f"repeat their command to finish the others.{jobs}"
-    )
+    return REPORT.said("progress", finished=finished, started=started, refused=refused)
 
 
 def _trained(runs: Sequence[Run]) -> Iterator[tuple[str, list[Run]]]:
@@ -316,7 +255,7 @@ def _trained(runs: Sequence[Run]) -> Iterator[tuple[str, list[Run]]]:
 
 
 def _other(against: str | None) -> str:
-    return "its guide" if against == GUIDE else str(against)
+    return "its guide" if against == GUIDE else against or ""
 
 
 def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list[Table]:

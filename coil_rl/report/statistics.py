@@ -66,24 +66,47 @@ def mean_interval(values: ArrayLike) -> tuple[Any, Any, Any]:
     return mean, mean - half, mean + half
 
 
+def interval(values: ArrayLike) -> Estimate:
+    """Return the mean of one value per seed or case with its 95 % t interval, and no p-value.
+
+    A single value has no interval. NaN or no values give NaN.
+
+    Args:
+        values: [N].
+    """
+    of_each = np.asarray(values, dtype=np.float64)
+    if not of_each.size or not np.isfinite(of_each).all():
+        return Estimate(math.nan, seeds=len(of_each))
+    if len(of_each) == 1:
+        return Estimate(float(of_each[0]))
+    mean, low, high = map(float, mean_interval(of_each))
+    return Estimate(mean, low, high, len(of_each))
+
+
+def difference(ours: ArrayLike, theirs: ArrayLike) -> Estimate:
+    """Return how much more one of two has than the other for the same seeds or cases.
+
+    Args:
+        ours: [N].
+        theirs: [N], in the same order.
+    """
+    return interval(np.subtract(ours, theirs, dtype=np.float64))
+
+
 def estimate(values: ArrayLike) -> Estimate:
     """Return the mean of one value per seed, with its interval and p-value.
 
     From ten seeds on, p is the share of sign patterns of the values with such a mean (two-sided,
-    exact up to 14 seeds); with fewer it is that of a t test. A single seed has no interval and no
-    p-value. NaN or no seeds give NaN.
+    exact up to 14 seeds); with fewer it is that of a t test. A single seed has no p-value.
 
     Args:
         values: one value per seed, [seeds].
     """
     from scipy import stats
 
-    of_seeds = np.asarray(values, dtype=np.float64)
-    if not of_seeds.size or not np.isfinite(of_seeds).all():
-        return Estimate(math.nan, seeds=len(of_seeds))
-    if len(of_seeds) == 1:
-        return Estimate(float(of_seeds[0]))
-    mean, low, high = map(float, mean_interval(of_seeds))
+    found, of_seeds = interval(values), np.asarray(values, dtype=np.float64)
+    if math.isnan(found.low):
+        return found
     if len(of_seeds) >= SIGN_FLIP_SEEDS:
         p = stats.permutation_test(
             (of_seeds,),
@@ -93,11 +116,11 @@ def estimate(values: ArrayLike) -> Estimate:
             vectorized=True,
             rng=np.random.default_rng(0),
         ).pvalue
-    elif high == mean:
-        p = float(mean == 0)
+    elif found.high == found.mean:
+        p = float(found.mean == 0)
     else:
-        p = 2 * stats.t.sf(abs(mean) / stats.sem(of_seeds), len(of_seeds) - 1)
-    return Estimate(mean, low, high, len(of_seeds), float(p))
+        p = 2 * stats.t.sf(abs(found.mean) / stats.sem(of_seeds), len(of_seeds) - 1)
+    return found._replace(p=float(p))
 
 
 def holm(p_values: ArrayLike) -> Array:

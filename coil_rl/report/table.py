@@ -10,13 +10,11 @@ from itertools import chain
 from numbers import Real
 from typing import Any, NamedTuple, TypeGuard
 
-import tabulate
 import yaml
 
 from coil_rl.files import whole_file
 from coil_rl.record import csv_text, plain
 
-tabulate.MIN_PADDING = 0  # extra width of headings
 # Columns and notes by table.
 TABLES: Any = yaml.safe_load((resources.files("coil_rl.conf") / "tables.yaml").read_text("utf-8"))
 
@@ -128,16 +126,20 @@ def markdown_table(rows: Rows, columns: Columns) -> str:
     """
     values = _values(rows, columns)
     specs = _specs(values, columns)
-    return tabulate.tabulate(
-        [
-            [_escaped(_format(value, spec)) for value, spec in zip(row, specs, strict=True)]
-            for row in values
-        ],
-        headers=[_escaped(_format(heading, "")) for heading, _ in columns.values()],
-        tablefmt="pipe",
-        colalign=["right" if right else "left" for right in _numeric(values)] or None,
-        disable_numparse=True,
-    )
+    lines = [[_escaped(_format(heading, "")).strip() for heading, _ in columns.values()]]
+    for row in values:
+        cells = zip(row, specs, strict=True)
+        lines.append([_escaped(_format(value, spec)).strip() for value, spec in cells])
+    right = _numeric(values) or [False] * len(columns)
+    rule = []
+    for column, numbers in enumerate(right):
+        width = max(len(line[column]) for line in lines)
+        for line in lines:
+            line[column] = f" {line[column]:{'>' if numbers else '<'}{width}} "
+        rule.append(f"{'-' * (width + 1)}:" if numbers else f":{'-' * (width + 1)}")
+    if not values:
+        rule = ["-" * len(cell) for cell in lines[0]]
+    return "\n".join(f"|{'|'.join(line)}|" for line in (lines[0], rule, *lines[1:]))
 
 
 def fitted(rows: Rows, columns: Columns) -> dict[str, tuple[str, str]]:

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.measures import Measure
 from coil_rl.output import progress
-from coil_rl.run.evaluation import Totals, episodes
+from coil_rl.run.evaluation import Totals, totals_of
 from coil_rl.run.exploration import Exploring, noise_of
 from coil_rl.run.parts import SOME_ROWS
 from coil_rl.run.policy_batch import PoliciesBeside, memory_keys, traced
@@ -161,10 +161,9 @@ class TrainingCases:
         env = self._copy(self.copies)
         return self._acted(env, policy, sampled=False).results()["return"]
 
-    @torch.no_grad()
     def _acted(self, env: EnvBase, policy: TensorDictModuleBase, *, sampled: bool) -> Totals:
         """Return the totals of a policy in the rows of the present cases, and count its steps."""
-        totals = Totals({"return": Measure(unravel_key(env.reward_key), "sum")})
+        measured = {"return": Measure(unravel_key(env.reward_key), "sum")}
         before = guide_calls(env)
         with (
             torch.random.fork_rng(),
@@ -175,9 +174,8 @@ class TrainingCases:
                 if isinstance(part, SeededGenerator):  # of a transform: the env does not seed it
                     part.generator.manual_seed(self.env_seed + number)
             torch.manual_seed(self.env_seed)
-            steps = episodes(env, policy, sampled=sampled, cases=self.count, tick=bar.update)
-            for after, running in steps:
-                totals.add(after, running)
+            options = {"sampled": sampled, "cases": self.count, "tick": bar.update}
+            totals = totals_of(env, policy, measured, **options)
         self.steps += int(totals.steps.sum())
         self.episodes += totals.steps.numel()
         self.longest = max(self.longest, int(totals.steps.max()))

@@ -3,7 +3,7 @@
 A policy alone is not enough: its action may be a residual that is added to a guide's, it observes
 advice, and it may have a memory. Here the whole chain of the run is applied to observations that
 come from anywhere: guides, transforms, normaliser, policy, and what the transforms make of its
-action. It is the chain of an evaluation, step for step, without the env and what disturbs it.
+action. It is the chain of an evaluation, without the env and what disturbs it.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_explorati
 
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.transforms import GuideActions, undisturbed
+from coil_rl.transforms.chain import Chain, Past
 
 
 class Controller:
@@ -56,15 +57,15 @@ class Controller:
             raise ValueError(f"a controller needs an env of one row, not {list(env.batch_size)}")
         self.env, self.policy = undisturbed(env.eval()), policy
         self.plant, self.folder, self.which = env.base_env, folder, which
-        guides = [part for part in self.env.transform.modules() if isinstance(part, GuideActions)]
+        self.chain = Chain(self.env, policy)
+        guides = [part for part in self.chain.links if isinstance(part, GuideActions)]
         self.read = {unravel_key(key) for part in (policy, *guides) for key in part.in_keys}
         self._check_read()
         self.reset()
 
     def reset(self) -> None:
         """Begin an episode: forget everything."""
-        self._acted: TensorDictBase | None = None  # the last state with the policy's action
-        self._executed: TensorDictBase | None = None  # the same after the transforms of the action
+        self.past: Past | None = None
 
     def act(self, observation: Any) -> Any:
         """Return the action for an observation.
@@ -90,28 +91,28 @@ class Controller:
         Args:
             entries: what the env writes before the transforms of the run, [1].
         """
-        state = self._state(entries)
+        # Transforms of others may look at these.
+        self.plant._complete_done(self.plant.full_done_spec, entries)
+        if self.past is not None:
+            entries.update(self.plant.full_reward_spec.zero())
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            self._acted = self.policy(state)
-        self._executed = self.env.transform.inv(self._acted)
-        action: Tensor = self._executed[self.env.action_key]
+            data, self.past = self.chain(entries, self.past)
+        action: Tensor = data[self.env.action_key]
         return action
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the next actions of the episode depend on, besides their observations."""
-        parts = {"acted": self._acted, "executed": self._executed}
-        state: dict[str, Any] = {
-            name: None if part is None else part.to_dict() for name, part in parts.items()
-        }
-        return state | {"transforms": copy.deepcopy(self.env.transform.state_dict())}
+        past = None
+        if self.past is not None:
+            past = [[(key, _plain(value)) for key, value in own.items()] for own in self.past]
+        return {"past": past, "transforms": copy.deepcopy(self.env.transform.state_dict())}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        batch = self.env.batch_size
-        self._acted, self._executed = (
-            None if state[name] is None else TensorDict.from_dict(state[name], batch_size=batch)
-            for name in ("acted", "executed")
-        )
+        past, batch = state["past"], self.env.batch_size
+        self.past = None
+        if past is not None:
+            self.past = [{key: _restored(value, batch) for key, value in own} for own in past]
         self.env.transform.load_state_dict(state["transforms"])
 
     def _check_read(self) -> None:
@@ -122,33 +123,18 @@ class Controller:
                     f"{'/'.join(key)} is read by the policy or its guide, but is no part of an "
                     "observation"
                 )
-        if isinstance(self.plant, GymnasiumEnv) and self.plant.rows[0].controllers:
-            names = ", ".join(self.plant.rows[0].controllers)
+        if isinstance(self.plant, GymnasiumEnv) and self.plant.held.plants[0].controllers:
+            names = ", ".join(self.plant.held.plants[0].controllers)
             warnings.warn(
                 f"the controller {names} belongs to an env of its own, in which nothing happens: "
                 "its advice is right only if it reads nothing but the observation",
                 stacklevel=3,
             )
 
-    def _state(self, entries: TensorDictBase) -> TensorDictBase:
-        """Return what the policy sees: the entries of the env after all transforms."""
-        self.plant._complete_done(self.plant.full_done_spec, entries)
-        transform = self.env.transform
-        if self._acted is None or self._executed is None:
-            transform._reset_env_preprocess(None)
-            return transform._reset(entries.empty(), entries)
-        entries.update(self.plant.full_reward_spec.zero())
-        memory = self._acted.get("next", None)
-        if memory is not None:  # what the policy remembers, as an env keeps it
-            entries.update(memory.exclude(*entries.keys(True, True)))
-        after = transform._step(self._executed, entries)
-        after = self.env._step_proc_data(after)
-        return self.env.step_mdp(self._acted.set("next", after))
-
     def _entries(self, observation: Any) -> TensorDictBase:
         """Return the entries of the env for an observation, with the batch dimension."""
         if isinstance(self.plant, GymnasiumEnv):
-            return self.plant.encode(observation, first=self._acted is None)
+            return self.plant.encode(observation, first=self.past is None)
         spec = self.plant.full_observation_spec
         entries = spec.zero()
         if not isinstance(observation, Mapping) and not is_tensor_collection(observation):
@@ -184,6 +170,14 @@ class Controller:
         if isinstance(self.plant, GymnasiumEnv):
             return self.plant.decode(action)
         return action.reshape(action.shape[len(self.env.batch_size) :]).cpu().numpy()
+
+
+def _plain(value: Any) -> Any:
+    return value.to_dict() if is_tensor_collection(value) else value
+
+
+def _restored(value: Any, batch: torch.Size) -> Any:
+    return TensorDict.from_dict(value, batch_size=batch) if isinstance(value, dict) else value
 
 
 def _put(entries: TensorDictBase, key: Any, value: Any) -> None:

@@ -22,7 +22,7 @@ from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.report.runs import RETURN
 from coil_rl.run import checkpoint
-from coil_rl.run.evaluation import Totals, episodes
+from coil_rl.run.evaluation import totals_of
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.policy_batch import policy_batch
 
@@ -148,7 +148,6 @@ def _evenly(ends: Sequence[int], parts: int) -> list[int]:
     return sorted(numbers)
 
 
-@torch.no_grad()
 def measures(
     env: EnvBase,
     policy: TensorDictModuleBase,
@@ -173,7 +172,4 @@ def measures(
     for group, reduction in (("episode", "last"), ("step", "mean")):
         keys = (watch or {}).get(group, {})
         measured |= {name: Measure.of(key, reduction=reduction) for name, key in keys.items()}
-    totals = Totals(measured)
-    for after, running in episodes(env, policy, cases=cases, tick=tick):
-        totals.add(after, running)
-    return totals.results()
+    return totals_of(env, policy, measured, cases=cases, tick=tick).results()

@@ -25,7 +25,7 @@ from coil_rl import record
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.anchor import hold_of
 from coil_rl.learners.learner import Learner
-from coil_rl.report.statistics import mean_interval
+from coil_rl.report.statistics import difference
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
 from coil_rl.run.curve import EvaluationCurve
@@ -158,32 +158,27 @@ class Delivery:
     def after_update(self, update: int) -> dict[str, float]:
         """Test, hand over, and return the mean returns by name."""
         last = {name: value.clone() for name, value in self.learner.policy.state_dict().items()}
-        if not self._fits():
-            return self._hand_over_untested(last)
-        candidates: dict[str, Any] = {"last": last} | self._guides()
-        earlier = self._earlier(update)
-        if earlier is not None:
-            candidates["earlier"] = checkpoint.load(earlier)
-        returns = self._tested(candidates)
+        candidates: dict[str, Any] = {"last": last}
+        returns: dict[str, Tensor] = {}
+        earlier = None
+        if self._fits():
+            candidates |= self._guides()
+            earlier = self._earlier(update)
+            if earlier is not None:
+                candidates["earlier"] = checkpoint.load(earlier)
+            returns = self._tested(candidates)
         means = {name: float(values.mean()) for name, values in returns.items()}
-        chosen = max(means, key=lambda name: means[name])
-        cases = len(returns["last"])
+        chosen = max(means, key=lambda name: means[name], default="last")
         checkpoint.save(candidates[chosen], weights_file(self.folder, HANDED_OVER))
         self._report(chosen, means, returns, earlier)
         guides = [mean for name, mean in means.items() if name not in ("last", "earlier")]
         numbers = (
-            means["last"],
+            means.get("last", math.nan),
             means.get("earlier", math.nan),
             max(guides, default=math.nan),
-            float(cases),
+            float(len(returns.get("last", ()))),
         )
         return dict(zip(self.names, numbers, strict=True))
-
-    def _hand_over_untested(self, last: dict[str, Any]) -> dict[str, float]:
-        """Hand over the last policy without a test, and return NaN for its mean returns."""
-        checkpoint.save(last, weights_file(self.folder, HANDED_OVER))
-        self._report(record.UNTESTED, {}, {"last": torch.empty(0)}, None)
-        return dict.fromkeys(self.names, math.nan) | {"delivery/cases": 0.0}
 
     def _earlier(self, update: int) -> Path | None:
         """Return the file of the kept policy with the highest return in training, if it is known.
@@ -260,15 +255,15 @@ class Delivery:
         Args:
             chosen: name of the policy that is handed over.
             means: of the returns, by name.
-            returns: of each policy in each case, by name.
+            returns: of each policy in each case, by name; empty without a test.
             earlier: file of the best kept policy; None: there is none.
         """
         ahead = None
-        if chosen not in ("last", record.UNTESTED):
-            ahead = mean_interval((returns[chosen] - returns["last"]).tolist())
+        if chosen != "last":
+            ahead = difference(returns[chosen].tolist(), returns["last"].tolist())[:3]
         report = record.Delivery(
-            policy=chosen,
-            cases=len(returns["last"]),
+            policy=chosen if returns else record.UNTESTED,
+            cases=len(returns.get("last", ())),
             steps=self.cases.steps,
             calls=self.cases.calls,
             returns=dict(means),

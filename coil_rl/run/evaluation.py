@@ -39,9 +39,14 @@ class EvaluationResult:
     rate: float = float("nan")
 
     @property
+    def rewards(self) -> list[float]:
+        """Reward of each episode."""
+        return [float(episode["reward"]) for episode in self.episodes]
+
+    @property
     def mean_reward(self) -> float:
         """Mean of the episodes."""
-        return float(sum(episode["reward"] for episode in self.episodes) / len(self.episodes))
+        return sum(self.rewards) / len(self.episodes)
 
     def split(self, parts: int) -> list[EvaluationResult]:
         """Return consecutive parts of equally many episodes."""
@@ -187,6 +192,17 @@ class Totals:
                 number = count > 0
             results[name] = _within(measure, number, count)
         return results
+
+
+@torch.no_grad()
+def totals_of(
+    env: EnvBase, policy: TensorDictModuleBase, measures: Mapping[str, Measure], **options: Any
+) -> Totals:
+    """Return the measures of one episode on every row of an env; `options` as for `episodes`."""
+    totals = Totals(measures)
+    for after, running in episodes(env, policy, **options):
+        totals.add(after, running)
+    return totals
 
 
 def _flags(entry: Tensor) -> Tensor:

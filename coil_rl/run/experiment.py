@@ -85,9 +85,6 @@ class Experiment:
         self.returns: deque[float] = deque(maxlen=self.EPISODES)
         self.measuring = [callback for callback in self.callbacks if callback.names]
         self.acting = [callback for callback in self.callbacks if not callback.names]
-        self.acting.append(Checkpoints(self, self.checkpoint_every))
-        if self.curve is not None:
-            self.acting.append(self.curve)
 
     @property
     def all_updates(self) -> int:
@@ -161,7 +158,7 @@ class Experiment:
         self.metrics.describe(self.identity)
         if self.updates == 0:
             first = self._measure({})
-            if (sentence := start_test(first)) is not None:
+            for sentence in start_test(first):
                 say(sentence, error=True)
             self.frames_before = self.before + self.tested
             first |= self._taken()
@@ -244,15 +241,25 @@ class Experiment:
         }
 
     def _act(self, row: Mapping[str, float]) -> None:
-        for callback in self.acting:
-            if not callback.due(self.updates, self.all_updates, row):
-                continue
-            if callback is self.curve:
-                self._evaluate(callback)
-            else:
-                callback.after_update(self.updates)
+        """Let the callbacks act after an update, write the checkpoint, and continue the curve.
 
-    def _evaluate(self, curve: Callback) -> None:
+        A training that is asked to stop writes its checkpoint, and is interrupted.
+
+        Args:
+            row: of the log; empty before the first update.
+        """
+        update, updates = self.updates, self.all_updates
+        for callback in self.acting:
+            if callback.due(update, updates, row):
+                callback.after_update(update)
+        if row and (update % self.checkpoint_every == 0 or update == updates or STOP.requested):
+            self.save()
+            if STOP.requested:
+                raise KeyboardInterrupt
+        if self.curve is not None and self.curve.due(update, updates, row):
+            self._evaluate(self.curve)
+
+    def _evaluate(self, curve: EvaluationCurve) -> None:
         """Evaluate the kept policies; a training that is stopped meanwhile saves its state first.
 
         The evaluation takes long and changes nothing of the state, so that it is done again by the
@@ -382,39 +389,6 @@ def check_identity(
         raise UserError(
             f"{file} belongs to a run with budget.frames={frames}, not {lengths[0]}; {PUT_BACK}"
         )
-
-
-class Checkpoints:
-    """Writes the checkpoint of an experiment every few updates and at its end; a `Callback`.
-
-    Args:
-        experiment: the experiment.
-        every: updates between two checkpoints.
-    """
-
-    names: Sequence[str] = ()
-
-    def __init__(self, experiment: Experiment, every: int) -> None:
-        self.experiment, self.every = experiment, every
-
-    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
-        """Return whether to write a checkpoint after an update; not before the first one.
-
-        It is due every few updates, at the end, and if the training is asked to stop.
-        """
-        return bool(row) and (update % self.every == 0 or update == updates or STOP.requested)
-
-    def after_update(self, update: int) -> dict[str, float]:
-        """Write the checkpoint, and stop the training if it is asked to.
-
-        Raises:
-            UserError: for a NaN in the state.
-            KeyboardInterrupt: if the training is asked to stop.
-        """
-        self.experiment.save()
-        if STOP.requested:
-            raise KeyboardInterrupt
-        return {}
 
 
 def watched_keys(env: EnvBase, watch: Watch) -> list[NestedKey]:

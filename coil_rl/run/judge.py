@@ -31,12 +31,13 @@ from coil_rl.output import decoration, progress, say
 from coil_rl.report import Returns, markdown_table
 from coil_rl.report.pictures import Picture
 from coil_rl.report.runs import FALLBACK
-from coil_rl.report.statistics import mean_interval
+from coil_rl.report.statistics import difference
 from coil_rl.report.table import AUTO_FORMAT, fitted, return_format
 from coil_rl.run.evaluation import EvaluationResult, evaluate_policy
 from coil_rl.run.fallback import Fallback
 from coil_rl.run.parts import TEST, EnvMaker
 from coil_rl.run.policy_batch import PartlySampled, traced
+from coil_rl.run.reasons import SENTENCES
 from coil_rl.transforms.action_space import random_action
 
 COLUMNS = {
@@ -274,15 +275,14 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, share: float 
     rows = [row for row, _ in pairs]
     columns = fitted(rows, columns)
     page = [markdown_table(with_shares(rows, [counts for _, counts in pairs], columns), columns)]
-    if count > MAX_CASES:
-        page.append(f"Means of {count} cases; all are in evaluation.csv.")
+    page += SENTENCES.said("many_cases", cases=count, shown=MAX_CASES)
     if has_policy and count > 1 and trial.guides:
         # An env that fails with random actions costs this sentence, and not the results.
         with decoration("the comparison with the guide"):
             chance, mine = trial.chance(), judgement.shown[trial.label]
-            page += [not_worse(mine, judgement.shown[name], name, chance) for name in trial.guides]
-    if share is not None:
-        page.append(f"With fallback the guide acted in {share:.1%} of the steps.")
+            for name in trial.guides:
+                page += not_worse(mine, judgement.shown[name], name, chance)
+    page += SENTENCES.said("fallback", share=share)
     return "\n\n".join([*page, *trial.notes])
 
 
@@ -313,7 +313,9 @@ class PolicyAndGuides(TensorDictModuleBase):
         return tensordict.set("action", action)
 
 
-def not_worse(policy: EvaluationResult, guide: EvaluationResult, name: str, chance: float) -> str:
+def not_worse(
+    policy: EvaluationResult, guide: EvaluationResult, name: str, chance: float
+) -> list[str]:
     """Return the sentence whether a policy is not worse than a guide in the same cases.
 
     The answer is yes if the whole t interval of the difference is above minus 1 % of what the guide
@@ -326,25 +328,24 @@ def not_worse(policy: EvaluationResult, guide: EvaluationResult, name: str, chan
         name: of the guide.
         chance: mean reward of random actions.
     """
-    pairs = zip(policy.episodes, guide.episodes, strict=True)
-    differences = [mine["reward"] - other["reward"] for mine, other in pairs]
-    if not any(differences):
-        return (
-            f"Not worse than {name} on these {len(differences)} cases: yes, the return is the same "
-            "in each of them."
-        )
-    _, low, high = mean_interval(differences)
+    mine, theirs = policy.rewards, guide.rewards
+    found = difference(mine, theirs)
     allowed = ALLOWED_LOSS * abs(guide.mean_reward - chance)
     answer = "undecided"
-    if low >= -allowed:
+    if found.low >= -allowed:
         answer = "yes"
-    elif high < -allowed:
+    elif found.high < -allowed:
         answer = "no"
-    spec = return_format([policy.mean_reward, guide.mean_reward])
-    return (
-        f"Not worse than {name} on these {len(policy.episodes)} cases: {answer} (difference of the "
-        f"rewards {low:+{spec}} to {high:+{spec}}, 95 % interval; {allowed:{spec}} less is "
-        "allowed, 1 % of the way from random actions to the guide)."
+    return SENTENCES.said(
+        "not_worse",
+        name=name,
+        cases=len(mine),
+        same=mine == theirs,
+        answer=answer,
+        low=found.low,
+        high=found.high,
+        allowed=allowed,
+        spec=return_format([policy.mean_reward, guide.mean_reward]),
     )
 
 

@@ -15,8 +15,8 @@ from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.learners.policy import Entries, Policy, by_key
-from coil_rl.transforms import GuideActions
-from coil_rl.transforms.normalised_action import NormalisedAction
+from coil_rl.transforms.guide_transform import SeededGenerator
+from coil_rl.transforms.link import Link
 
 ENDS = {"done", "terminated", "truncated"}
 
@@ -32,16 +32,15 @@ class LeanEnv:
         self.base = env.base_env if isinstance(env, TransformedEnv) else env
         self.batch_size, self.device = env.batch_size, env.device
         transforms = _transforms(env)
-        self.advice = [each for each in transforms if isinstance(each, GuideActions)]
-        self.actions = [each for each in transforms if isinstance(each, NormalisedAction)]
+        self.links = [each for each in transforms if isinstance(each, Link)]
         self.sums = [each.out_keys[0] for each in transforms if isinstance(each, RewardSum)]
 
     @staticmethod
     def covers(env: EnvBase) -> bool:
         """Return whether the steps of an env have this form.
 
-        They have if it is one of this project with advice, a normalised action and a sum of rewards
-        at most, and if no guide looks at the past.
+        They have if it is one of this project, and if its transforms are a sum of rewards and links
+        that remember, record and draw nothing.
 
         Args:
             env: with transforms.
@@ -63,23 +62,23 @@ class LeanEnv:
             action: as the transforms get it.
             before: entries before the step, of which the sums of rewards are read.
         """
-        for each in self.actions:
-            if each.units is not None:
-                action = each.units.denormalise(action)
         # An env of this project reads its action by the key only; a dictionary is made at once.
-        after = self.base._step(Entries(action=action))
+        acted: Any = Entries(action=action)
+        for link in reversed(self.links):
+            link.act(acted, {})
+        after = self.base._step(acted)
         for key in self.sums:
             after.set(key, before[key] + after["reward"])
-        for guides in self.advice:
-            after = guides._call(after)
+        for link in self.links:
+            link.observe(after, {})
         return after
 
     def reset(self, rows: Tensor) -> TensorDictBase:
         """Return the entries after a reset of some rows, [B, 1]."""
         mask = self.few(_reset=rows)
         first = self.base._reset(mask)
-        for guides in self.advice:
-            first = guides._reset(mask, first)
+        for link in self.links:
+            first = link._reset(mask, first)
         return first
 
     def few(self, **entries: Tensor) -> TensorDict:
@@ -167,11 +166,12 @@ def _transforms(env: EnvBase) -> list[Transform]:
 
 def _is_known(transform: Transform) -> bool:
     """Return whether a lean step does what a transform does."""
-    if type(transform) is GuideActions:
-        return not transform.needs_past
     if type(transform) is RewardSum:
         return list(transform.in_keys) == ["reward"]
-    return type(transform) is NormalisedAction
+    if not isinstance(transform, Link) or transform.needs_past or transform.passed:
+        return False
+    draws = any(isinstance(part, SeededGenerator) for part in transform.children())
+    return not (draws or transform.state or transform.records)
 
 
 def _observed(policy: Any, keys: Sequence[NestedKey]) -> list[NestedKey]:

@@ -46,7 +46,7 @@ from coil_rl.run.guide_returns import guide_returns
 from coil_rl.run.judge import Evaluation, Trial, judge, report_outcome
 from coil_rl.run.next_step import next_step
 from coil_rl.run.parts import TRAIN, EnvMaker
-from coil_rl.run.reasons import handed_over, start_test
+from coil_rl.run.reasons import SENTENCES, handed_over, start_test
 from coil_rl.run.stopping import resume_command
 from coil_rl.run.training import training_of
 from coil_rl.run.weights import put_weights
@@ -453,12 +453,12 @@ class Run:
     def reasons(self) -> list[str]:
         """Return the sentences on how the training began, and on its tests."""
         rows = record.METRICS.need(self.folder) if self.has_agent else []
-        found = [start_test(rows[0])] if rows else []
+        found = start_test(rows[0]) if rows else []
         if (source := begun_with(self.settings)) is not None:
-            found.append(f"It began with {source}, whose frames are not among those of this run.")
+            found += SENTENCES.said("begun", source=source)
         if self.which == HANDED_OVER and self.delivery == "tested":
-            found.append(handed_over(self.folder))
-        return [sentence for sentence in found if sentence is not None]
+            found += handed_over(self.folder)
+        return found
 
     def _guide_results(
         self, evaluation: Evaluation, pictures: Sequence[Picture]

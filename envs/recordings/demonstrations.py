@@ -1,19 +1,24 @@
 """What recordings demonstrate: how many scans have steering to learn, and why others have none."""
 
-from coil_rl.envs.recordings.replay_env import McapReplayEnv
+from collections.abc import Iterator
+from typing import Any
+
 from coil_rl.envs.recordings.views import caution_about_view
 
 
-def about_demonstrations(env: McapReplayEnv) -> list[str]:
-    """Return a line about each recording, and one about all together.
+def about_demonstrations(env: Any) -> Iterator[str]:
+    """Yield a line about each recording, and one about all together.
 
     It says how many scans are learned, how many are left out and why, and what makes the meaning of
     the recording doubtful.
 
     Args:
-        env: without transforms.
+        env: a `McapReplayEnv`.
+
+    Raises:
+        ValueError: if no scan has steering to learn.
     """
-    lines, first, kept, total = [], 0, 0, 0
+    first, kept, total = 0, 0, 0
     for recording in env.recordings:
         scans = slice(first, first + len(recording.ranges))
         first = scans.stop
@@ -25,7 +30,7 @@ def about_demonstrations(env: McapReplayEnv) -> list[str]:
             f"{int(stale.sum())} without a command of the last {recording.command_age:.2f} s, "
             f"{int((standing & ~stale).sum())} of a robot that stands"
         )
-        lines.append("; the file ".join([line, *recording.remarks]))
+        yield "; the file ".join([line, *recording.remarks])
         caution = caution_about_view(
             recording,
             env.cones[scans].cpu().numpy(),
@@ -34,6 +39,10 @@ def about_demonstrations(env: McapReplayEnv) -> list[str]:
             env.perception,
         )
         if caution:
-            lines.append(f"Warning: {caution}.")
-    lines.append(f"{len(env.recordings)} recordings: {kept} of {total} scans are learned.")
-    return lines
+            yield f"Warning: {caution}."
+    yield f"{len(env.recordings)} recordings: {kept} of {total} scans are learned."
+    if not kept:
+        raise ValueError(
+            "no scan has recorded steering to learn: there is no recent command at any, or the "
+            "robot stands; give env.command=TOPIC, or other recordings"
+        )

@@ -6,8 +6,9 @@ no effect on the drive. This shows what a policy would do on a real robot before
 
 import math
 import os
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +19,9 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import check_range
+from coil_rl.envs.recordings.demonstrations import about_demonstrations
+from coil_rl.envs.recordings.folders import RecordingError
+from coil_rl.envs.recordings.mcap_files import read_messages
 from coil_rl.envs.recordings.reading import read_recording
 from coil_rl.envs.recordings.recording import STANDS, Recording
 from coil_rl.envs.reward import HISTORY, recent_mean
@@ -78,9 +82,29 @@ class McapReplayEnv(EnvBase):
         ValueError: for a value outside its range, and without a recording.
     """
 
+    reacts = False  # nothing that a policy does changes what comes next
+
+    @staticmethod
+    def whole_pass(arguments: Mapping[str, Any]) -> tuple[int, int]:
+        """Return how many recordings there are, and how many scans the longest has, at least 1.
+
+        One that cannot be read counts as one scan: what is wrong is said when the env is made.
+
+        Args:
+            arguments: of the constructor; `recordings` and `scan` are read.
+        """
+        recordings = arguments["recordings"]
+        paths = [recordings] if isinstance(recordings, (str, Path)) else list(recordings or ())
+        topic = str(arguments.get("scan", "/scan"))
+        return max(1, len(paths)), max([_scans(str(path), topic) for path in paths], default=1)
+
+    def demonstrations(self) -> Iterator[str]:
+        """Yield lines on what there is to learn; a `ValueError` if there is nothing."""
+        return about_demonstrations(self)
+
     def __init__(
         self,
-        recordings: AnyPath | Recording | Sequence[AnyPath | Recording],
+        recordings: AnyPath | Recording | Sequence[AnyPath | Recording] | None,
         perception: Perceive,
         *,
         num_envs: int | None = None,
@@ -109,7 +133,7 @@ class McapReplayEnv(EnvBase):
         if isinstance(recordings, (str, os.PathLike, Recording)):
             sources = [recordings]
         else:
-            sources = list(recordings)
+            sources = list(recordings or ())
         if not sources:
             raise ValueError("recordings is empty; give at least one MCAP file or rosbag2 folder")
         read = partial(
@@ -240,6 +264,15 @@ class McapReplayEnv(EnvBase):
         entries["info"] = TensorDict(info, self.batch_size, device=self.device)
         entries["omega"] = (steering * self.max_steering).sin() * (self.speed / self.car_length)
         return TensorDict(entries, self.batch_size, device=self.device)
+
+
+@lru_cache(maxsize=256)
+def _scans(path: str, topic: str) -> int:
+    """Return the number of messages on the topic of the scans, at least 1."""
+    try:
+        return max(1, len(read_messages(path, [topic]).messages[topic]))
+    except RecordingError:
+        return 1
 
 
 def _joined(parts: Sequence[NDArray[Any]]) -> Tensor:

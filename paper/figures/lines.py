@@ -26,8 +26,8 @@ from scipy.spatial import cKDTree
 from coil_paper.figures.ego_view import Array, marker
 from coil_rl import EvaluationResult, Track, UserError, open_run
 from coil_rl.envs import SIDES
-from coil_rl.listening import LEFT, RIGHT, classify, smooth_line
 from coil_rl.report import DrivenLines, markdown_table, style
+from coil_studies.listening import LEFT, RIGHT, classify, smooth_line
 
 INSIDE_COLOUR = "#eceff2"
 HALF_WIDTH = 1.5  # m, of the straightened track

@@ -57,8 +57,8 @@ def drive(config: DictConfig) -> None:
 
 def _controller(config: DictConfig) -> tuple[Any, Setup]:
     """Return what drives, and what it drives with: as in its training where nothing is given."""
-    from coil_rl.config.load import open_run
     from coil_rl.config.nodes import build
+    from coil_rl.config.python import open_run
     from coil_rl.output import say
     from coil_robot.setup import Setup, setup_of
 
@@ -84,8 +84,7 @@ def _setup(config: DictConfig, trained: Setup) -> Setup:
 
 def _changed(part: Any, node: Any, name: str) -> Any:
     """Return a dataclass with the values that a node gives, which are those that are not null."""
-    from coil_rl.config.arguments import check_arguments
-    from coil_rl.config.nodes import build
+    from coil_rl.config.nodes import build, check_arguments
 
     values: Any = OmegaConf.to_container(node, resolve=True)
     values = {key: each for key, each in values.items() if each not in (None, {"_target_": None})}

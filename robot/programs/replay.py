@@ -78,10 +78,10 @@ def replay(config: DictConfig) -> None:
 
 def _load_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Policies]:
     """Return the runs and all policies by name, guides first."""
-    from coil_rl.config.build import assemble, build_guides
+    from coil_rl.config.assemble import assemble
     from coil_rl.config.check import check_guide_in_env
-    from coil_rl.config.pretrained import run_folder
-    from coil_rl.config.saved import read_config
+    from coil_rl.config.folder import read_config, run_folder
+    from coil_rl.config.parts import build_guides
     from coil_robot.replay.open_loop import RECORDED
 
     guides = build_guides(config) if config.guide else {}
@@ -112,7 +112,7 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
 
     These are `annotated.mcap`, its Foxglove layout, `steering.csv` and `steering.png`.
     """
-    from coil_rl.config.build import assemble
+    from coil_rl.config.assemble import assemble
     from coil_rl.files import write_text
     from coil_rl.report import write_csv
     from coil_robot.replay.annotation import annotate, foxglove_layout

@@ -16,7 +16,7 @@ import torch
 
 import coil_paper
 import coil_rl
-from coil_rl.config.arguments import check_arguments
+from coil_rl.config.nodes import check_arguments
 from coil_rl.errors import UserError
 from coil_rl.ranges import Count, Interval, Len, NonNegative, Positive, Share, checked
 from coil_rl.schedules import Linear, Schedule

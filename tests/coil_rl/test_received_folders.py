@@ -6,8 +6,8 @@ import shutil
 import pytest
 from run_folders import driven, make_run
 
+from coil_rl.config.folder import read_config
 from coil_rl.config.nodes import build
-from coil_rl.config.saved import read_config
 from coil_rl.errors import UserError
 from coil_rl.foreign.controllers import RecordedGuide
 from coil_rl.learners.dynamic_coil import PhaseSchedule

@@ -11,9 +11,9 @@ from torchrl.envs import TransformedEnv
 from worlds import driving_measures
 
 from coil_rl.compiled import Compiled
+from coil_rl.cones.spline import SplineGuide
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
 from coil_rl.envs.reward import TERMS
-from coil_rl.guides.spline import SplineGuide
 from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.testing import check_env
 from coil_rl.transforms import GuideActions

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from oracle import OneCar, Outcome, guide_action, midpoints
 from torchrl.envs import TransformedEnv
 
+from coil_rl.cones.spline import SplineGuide
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
 from coil_rl.envs.reward import TERMS
-from coil_rl.guides.spline import SplineGuide
 from coil_rl.transforms import ObservationDelay
 
 Array = NDArray[np.float64]

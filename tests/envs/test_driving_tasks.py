@@ -7,8 +7,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from coil_rl.cones.spline import SplineGuide
 from coil_rl.envs import ConeTrackEnv, DrivingTasksEnv, Track
-from coil_rl.guides.spline import SplineGuide
 from coil_rl.testing import check_env
 
 TASKS = {

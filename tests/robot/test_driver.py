@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_module
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from coil_rl.config.build import build_learner, env_maker
+from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.envs import Perception, SimulatedRobotEnv, simulated_cone_classifier
 from coil_rl.envs.recordings.mcap_files import read_messages
 from coil_rl.envs.recordings.reading import read_recording

@@ -3,8 +3,7 @@ from typing import Any, Literal, Protocol
 
 import pytest
 
-from coil_rl.config.arguments import check_arguments
-from coil_rl.config.nodes import build
+from coil_rl.config.nodes import build, check_arguments
 from coil_rl.envs import Track
 from coil_rl.errors import UserError
 

@@ -1,6 +1,6 @@
 import pytest
 
-from coil_rl.config.python import compose_train
+from coil_rl.config.compose import compose_train
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,10 @@ from drives import drive
 from programs import ROOT
 from run_folders import make_untrained_run
 
-from coil_rl.config.build import assemble
-from coil_rl.config.load import open_run
-from coil_rl.config.python import compose_train
-from coil_rl.config.saved import holds
+from coil_rl.config.assemble import assemble
+from coil_rl.config.compose import compose_train
+from coil_rl.config.folder import holds
+from coil_rl.config.python import open_run
 from coil_rl.envs import McapReplayEnv
 from coil_rl.errors import UserError
 from coil_rl.guides import SplineGuide

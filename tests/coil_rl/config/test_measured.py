@@ -2,8 +2,8 @@ import pytest
 from omegaconf import DictConfig
 
 from coil_rl import UserError
-from coil_rl.config.measured import complete_measures
-from coil_rl.config.python import compose_train
+from coil_rl.config.compose import compose_train
+from coil_rl.config.values import complete_measures
 
 ADDED = "evaluation.measures.last_reward."
 WORDS = ["env=pendulum", "method=ppo"]

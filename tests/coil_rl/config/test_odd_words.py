@@ -11,10 +11,10 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from programs import called
 
-from coil_rl.config.build import env_maker
 from coil_rl.config.check import check_parts
-from coil_rl.config.python import compose_train
-from coil_rl.config.sentences import is_no_bug, sentence
+from coil_rl.config.compose import compose_train
+from coil_rl.config.messages import is_no_bug, sentence
+from coil_rl.config.parts import env_maker
 from coil_rl.config.unread import check_read
 
 SMALL = ["evaluation.cases=2", "evaluation.curve.num_envs=2", "logger=none"]

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 from hydra.utils import get_object
 
-from coil_rl.config.old_names import GONE, OLD_NAMES, renamed
+from coil_rl.config.old_names import GONE, OLD_NAMES, renamed, with_todays_keys
 from coil_rl.errors import UserError
 
 PATH = Path("config.yaml")
@@ -21,3 +21,13 @@ def test_parts_that_moved_are_found_at_any_depth():
 def test_part_that_went_is_refused(old):
     with pytest.raises(UserError, match=r"config.yaml is of an earlier version: .*; train again"):
         renamed({"learner": {"regressor": {"_target_": old}}}, PATH)
+
+
+def test_keys_that_were_renamed_are_found_in_the_method_only():
+    search = {"search": {"cases": 4}}
+    found = with_todays_keys({"label": "tune", "method": {"name": "tune", **search}, "env": search})
+    assert found == {
+        "label": "tune",
+        "method": {"name": "tune", "run": {"cases": 4}},
+        "env": search,
+    }

@@ -12,11 +12,11 @@ from programs import called
 from tiny_runs import trained
 
 import coil_rl
-from coil_rl.config import pretrained
-from coil_rl.config.pretrained import CARD, CHECKSUMS, LARGEST
+from coil_rl.config import folder as folders
+from coil_rl.config.folder import CARD, CHECKSUMS, LARGEST
 from coil_rl.run.training import INIT
 
-PLACE = Path(pretrained.__file__).parents[1] / "policies"
+PLACE = Path(folders.__file__).parents[1] / "policies"
 NAMES = coil_rl.pretrained_names()
 
 
@@ -57,7 +57,7 @@ def test_unknown_name_lists_the_known_ones():
 def test_changed_file_is_refused_before_it_is_read(file, tmp_path, monkeypatch):
     name = "cone_track/ppo"
     shutil.copytree(PLACE, tmp_path / "policies")
-    monkeypatch.setattr(pretrained, "_place", lambda: tmp_path / "policies")
+    monkeypatch.setattr(folders, "_place", lambda: tmp_path / "policies")
     path = tmp_path / "policies" / name / file
     path.write_bytes(path.read_bytes() + b"\n")
     with pytest.raises(coil_rl.UserError, match=f"{file} is not the file that was shipped"):

@@ -5,22 +5,28 @@ from programs import called
 
 import coil_rl
 from coil_rl import UserError, compose_train
+from coil_rl.config.compose import Job
 from coil_rl.config.unread import check_read, check_sweep
-from coil_rl.config.written import Job
 
-GUIDE = "method=guide trains nothing; leave it out"
+GUIDE = "(method=guide); leave it out"
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("proxy.seed=3", "proxy.seed=3 has no effect: method=coil trains no guides"),
+        (
+            "proxy.seed=3",
+            "proxy.seed=3 has no effect: nothing in this run reads proxy.seed (method=coil)",
+        ),
         ("preset.perception.scale=2", "nothing in this run reads preset.perception.scale"),
         ("method=dagger budget.minibatches=3", "nothing in this run reads budget.minibatches"),
-        ("learner=sac training.learning_rate=1", "reads training.learning_rate; leave it out"),
+        (
+            "learner=sac training.learning_rate=1",
+            "reads training.learning_rate (method=coil); leave it out",
+        ),
         ("training.imitation_env.assignment=random", "reads training.imitation_env.assignment"),
-        ("training.tests.starts=5", "this run compares no policies while it trains"),
-        ("recording=drive.mcap", "nothing in this run reads recording; leave it out"),
+        ("training.tests.starts=5", "reads training.tests.starts (method=coil)"),
+        ("recording=drive.mcap", "nothing in this run reads recording (method=coil); leave it out"),
         ("method=guide learner.gamma=0.9", GUIDE),
         ("method=guide learner=sac", GUIDE),
         ("method=guide training.noise_correlation=0.5", GUIDE),
@@ -28,15 +34,21 @@ GUIDE = "method=guide trains nothing; leave it out"
         ("method=guide budget.frames=100", GUIDE),
         ("method=guide evaluation.curve.points=2", GUIDE),
         ("method=guide logger=csv", GUIDE),
-        ("action=choices training.noise_correlation=0.5", "the actions of this env are choices"),
-        ("method=oil training.noise_correlation=0.5", "method=oil imitates, and explores without"),
+        (
+            "action=choices training.noise_correlation=0.5",
+            "reads training.noise_correlation (method=coil)",
+        ),
+        (
+            "method=oil training.noise_correlation=0.5",
+            "reads training.noise_correlation (method=oil)",
+        ),
         (
             "method=ppo +degrade@evaluation.advice.zeroed=zeroed",
-            "method=ppo gives the agent no adv",
+            "reads evaluation.advice.zeroed (method=ppo)",
         ),
         (
             "method=dynamic_coil_sequential +degrade@evaluation.advice.zeroed=zeroed",
-            "gives the agent no advice that could be degraded; leave it out",
+            "reads evaluation.advice.zeroed (method=dynamic_coil_sequential)",
         ),
     ],
 )
@@ -99,7 +111,7 @@ def test_guide_alone_reads_what_says_how_it_drives(word):
 def test_value_that_an_env_refers_to_is_read_by_a_guide_alone():
     words = ["method=guide", "env.time_limit=${budget.steps}", "budget.steps=3"]
     assert unread(*words) == ""
-    assert "method=guide trains nothing" in unread("method=guide", "budget.steps=3")
+    assert "(method=guide)" in unread("method=guide", "budget.steps=3")
 
 
 def swept(word, *runs):
@@ -156,13 +168,13 @@ def test_runs_that_do_not_read_a_word_are_told_apart_by_all_that_differs_if_need
 def test_sweep_says_before_its_first_run_what_runs_do_not_read(tmp_path):
     words = ["-m", "method=guide,guide", "+experiment=placebo", "budget.frames=100"]
     refused = called("train", *words, cwd=tmp_path, code=2)
-    sentence = "budget.frames=100 has no effect in any run of this sweep: method=guide trains noth"
+    sentence = "budget.frames=100 has no effect in any run of this sweep: nothing in this run"
     assert sentence in refused.stderr
     assert "#0" not in refused.stdout
     assert not (tmp_path / "outputs").exists()
     words = ["-m", "method=guide,ppo", "proxy.seed=3,4", "env.rate=0"]
     refused = called("train", *words, cwd=tmp_path, code=2)
-    assert "proxy.seed=3,4 has no effect in any run of this sweep: method=guide" in refused.stderr
+    assert "proxy.seed=3,4 has no effect in any run of this sweep: nothing" in refused.stderr
     words = ["-m", "method=guide,ppo", "learner.gamma=0.9", "env.rate=0"]  # each run is refused
     said = called("train", *words, cwd=tmp_path, code=2).stderr
     assert said.count("learner.gamma=0.9 has no effect in the runs with method=guide; the oth") == 1
@@ -176,9 +188,9 @@ def test_words_from_python_are_read_too(tmp_path):
     words = ["logger=none", "proxy.seed=3"]
     folder = tmp_path / "run"
     with pytest.raises(
-        UserError, match=r"proxy\.seed=3 has no effect: method=ppo trains no guides"
+        UserError, match=r"proxy\.seed=3 has no effect: nothing in this run reads proxy\.seed"
     ):
         coil_rl.prepare("cone_track", method="ppo", folder=folder, overrides=words)
-    with pytest.raises(UserError, match=r"budget\.frames=64 has no effect: method=guide trains"):
+    with pytest.raises(UserError, match=r"budget\.frames=64 has no effect: .*method=guide"):
         coil_rl.prepare("cone_track", guide="spline", method="guide", frames=64, folder=folder)
     assert not folder.exists()

@@ -15,9 +15,8 @@ from exported_sums import write
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
-from coil_rl.config.build import assemble
-from coil_rl.config.pretrained import folder_of
-from coil_rl.config.saved import read_config
+from coil_rl.config.assemble import assemble
+from coil_rl.config.folder import folder_of, read_config
 from coil_rl.export import ExportedPolicy, drive, export_policy
 from coil_rl.run.parts import TEST
 

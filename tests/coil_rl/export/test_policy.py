@@ -174,7 +174,7 @@ def test_file_that_is_no_onnx_is_refused(tmp_path):
 
 
 def test_missing_package_names_the_extra(tmp_path, monkeypatch):
-    monkeypatch.setattr("coil_rl.export.session.find_spec", lambda name: None)
+    monkeypatch.setattr("coil_rl.extras.find_spec", lambda name: None)
     with pytest.raises(coil_rl.UserError, match=r"onnxruntime: .*pip install 'coil-rl\[export\]'"):
         ExportedPolicy(write(tmp_path))
 
@@ -208,7 +208,7 @@ def test_exported_guide_acts_in_its_own_action_only(name, tmp_path):
     for other, (spec, first, _) in SPACES.items():
         space = ActionSpace(spec, 1, first)
         if other == name:
-            guide.in_space(space)
+            guide.meet(space, {})
             continue
         with pytest.raises(UserError, match=r"is a policy for Sum, .*its action goes from"):
-            guide.in_space(space)
+            guide.meet(space, {})

@@ -321,7 +321,7 @@ def test_actions_too_fine_for_the_dtype_keep_their_own(low, high, own, expected)
     wish = torch.tensor([[edge + 0.125, edge + 0.875]], dtype=torch.float64)
     env.step(state.set("action", wish.to(expected)))
     if expected == torch.float64:
-        assert torch.equal(torch.as_tensor(env.rows[0].gate.env.unwrapped.got), wish[0])
+        assert torch.equal(torch.as_tensor(env.held.plants[0].env.unwrapped.got), wish[0])
 
 
 @pytest.mark.parametrize("dtype", [np.int32, np.uint32, np.int64, float])
@@ -385,7 +385,7 @@ def test_controller_beside_an_env_gets_a_copy_of_its_observation():
     env = GymnasiumEnv(partial(Own, 0.0, 0.5), controllers={"careless": careless})
     seen = env.rollout(3)["next", "observation"]
     assert seen.flatten().tolist() == [0.5, 1.0, 1.5]
-    assert env.rows[0].observation.tolist() == [1.5]
+    assert env.held.plants[0].observation.tolist() == [1.5]
 
 
 def test_matrix_is_a_vector_of_which_controllers_give_the_matrix():
@@ -406,7 +406,7 @@ def test_matrix_is_a_vector_of_which_controllers_give_the_matrix():
     action = data["controller", "ones"]
     assert action.shape == (2, 6)
     env.step(data.set("action", action))
-    assert np.allclose(env.rows[1].gate.env.unwrapped.received, ones(None, None))
+    assert np.allclose(env.held.plants[1].env.unwrapped.received, ones(None, None))
 
 
 @pytest.mark.parametrize(("name", "said"), [("success", False), ("sucess", True)])
@@ -557,8 +557,8 @@ def test_controllers_act_beside_their_envs():
 
 
 def test_heuristic_of_gymnasium_lands():
-    path = "gymnasium.envs.box2d.lunar_lander:heuristic"
-    env = build("LunarLander-v3", 4, first_seed=0, controllers={"heuristic": path})
+    heuristic = pytest.importorskip("gymnasium.envs.box2d.lunar_lander").heuristic
+    env = build("LunarLander-v3", 4, first_seed=0, controllers={"heuristic": heuristic})
     carrier, total = env.reset(), torch.zeros(4, 1)
     while not carrier["done"].all():
         carrier = env.step(carrier.set("action", carrier["controller", "heuristic"]))["next"]
@@ -577,7 +577,7 @@ def test_discrete_controller_gives_indices():
 @pytest.mark.parametrize("advice", [[0.0], [0.0, float("nan")], None])
 def test_wrong_advice_names_the_controller(advice):
     env = GymnasiumEnv("Echo-v0", controllers={"broken": lambda env, observation: advice})
-    with pytest.raises(ValueError, match=r"controller broken gave .*, not an action of Box"):
+    with pytest.raises(ValueError, match="the controller broken beside the env Echo-v0 "):
         env.reset()
 
 
@@ -587,7 +587,7 @@ def test_pictures_show_the_first_row():
     assert env.rate == 20
     assert env.render().tolist() == np.full((2, 2, 3), 3).tolist()
     assert build("Echo-v0").render() is None
-    assert [row.gate.env.render_mode for row in env.rows] == ["rgb_array", None, None]
+    assert [plant.env.render_mode for plant in env.held.plants] == ["rgb_array", None, None]
 
 
 def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
@@ -620,17 +620,12 @@ def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
         (
             "CartPole-v1",
             {"controllers": {"pid": "math:PID"}},
-            "controller pid: 'math:PID' cannot be imported",
+            r"'math:PID' is a text; write {_target_: math.PID, _partial_: true}",
         ),
         (
             "CartPole-v1",
-            {"controllers": {"pid": "builtins:str"}},
+            {"controllers": {"pid": str}},
             r"controller pid: str needs a method act\(obs",
-        ),
-        (
-            "CartPole-v1",
-            {"controllers": {"pid": "fractions:Fraction"}},
-            "controller pid cannot be made with its env",
         ),
         (
             "Echo-v0",

@@ -15,11 +15,9 @@ import coil_rl.learners
 from coil_rl.learners import (
     A2C,
     DQN,
-    IBRL,
     PPO,
     SAC,
     TRPO,
-    Advisor,
     DynamicCoil,
     KickstartLoss,
     Reinforce,
@@ -30,6 +28,7 @@ from coil_rl.learners.learner import Learner
 from coil_rl.learners.minibatches import Minibatches
 from coil_rl.learners.several_agents import SummedRewards
 from coil_rl.run.rollout import Rollout
+from coil_studies import IBRL, Advisor
 
 FOLDER = Path(coil_rl.learners.__file__).parent
 
@@ -178,7 +177,7 @@ def test_learner_needs_only_an_update_and_a_state():
     assert idle.critic is None
 
 
-@pytest.mark.parametrize("kind", [PPO, A2C, Reinforce, TRPO, Advisor, DynamicCoil, SAC, IBRL, DQN])
+@pytest.mark.parametrize("kind", [PPO, A2C, Reinforce, TRPO, DynamicCoil, SAC, DQN, Advisor, IBRL])
 def test_each_argument_of_a_learner_is_named_and_documented(kind):
     _, *parameters = inspect.signature(kind.__init__).parameters.values()
     assert all(each.kind is not each.VAR_KEYWORD for each in parameters)

@@ -15,9 +15,9 @@ from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, Unbo
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.config.build import build_guides, env_maker
 from coil_rl.config.check import check
-from coil_rl.config.load import open_run
+from coil_rl.config.parts import build_guides, env_maker
+from coil_rl.config.python import open_run
 from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.errors import UserError
 from coil_rl.learners import (

@@ -7,10 +7,11 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded
 from torchrl.envs import Compose, TransformedEnv
 
-from coil_rl.learners import IBRL, SAC, FilteredKickstartLoss
+from coil_rl.learners import SAC, FilteredKickstartLoss
 from coil_rl.run.rollout import Rollout
 from coil_rl.testing import check_env
 from coil_rl.transforms import AdaptiveMixedAction, GradualResidual, GuideActions, Takeover
+from coil_studies import IBRL
 
 SMALL = {"starts": 8, "batch_size": 8, "ratio": 2, "hidden": [8]}
 WAYS = {

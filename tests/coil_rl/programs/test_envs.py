@@ -15,7 +15,7 @@ from programs import called, shipped
 from slow import some_fast
 
 import coil_rl.config.schema  # noqa: F401 registers the schema
-from coil_rl.config.build import env_maker
+from coil_rl.config.parts import env_maker
 
 FILES = shipped("env")
 REPLAYS = ["mcap_replay"]  # of recordings, see config/test_replay.py

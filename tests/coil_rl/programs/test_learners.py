@@ -5,8 +5,8 @@ from hydra import compose, initialize_config_module
 from programs import shipped
 from slow import some_fast
 
-from coil_rl.config.build import build_learner, env_maker
 from coil_rl.config.check import check
+from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.errors import UserError
 from coil_rl.run.rollout import Rollout
 

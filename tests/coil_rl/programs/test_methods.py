@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_module
 from slow import some_fast
 from tiny_runs import METHODS, TRACKS, trained
 
-from coil_rl.config.load import open_run
+from coil_rl.config.python import open_run
 from coil_rl.errors import UserError
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume

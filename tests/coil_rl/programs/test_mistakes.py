@@ -22,9 +22,9 @@ from run_folders import make_untrained_run
 
 import coil_rl
 import coil_rl.run.run  # noqa: F401  before `started` replaces functions that it imports
-from coil_rl.config.build import build_learner, env_maker
 from coil_rl.config.check import check
-from coil_rl.config.sentences import sentence
+from coil_rl.config.messages import sentence
+from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.errors import UserError
 from coil_rl.programs import app, train
 from coil_rl.run import checkpoint, judge
@@ -199,7 +199,7 @@ def refusal(name, *arguments):
             "guide.spline._target_=coil_rl.guides.Nope",
             "guide.spline: there is no 'coil_rl.guides.Nope'; check",
         ),
-        ("guide.spline._target_=coil_rl.guides.spline.FAR", "is 1000.0, which cannot be called"),
+        ("guide.spline._target_=coil_rl.cones.spline.FAR", "is 1000.0, which cannot be called"),
         ("guide=zero guide.zero._target_=builtins.dict", "makes dict, not TensorDictModuleBase"),
         (
             "guide=zero guide.zero._target_=subprocess.run",
@@ -327,7 +327,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
         # folders
         ("hydra.run.dir=/dev/null/run", "/dev/null/run cannot be used (Not a directory)"),
         (f"label={'x' * 300}", "cannot be used (File name too long); choose a shorter name"),
-        ("run_dir=/dev/null", "the run's folder /dev/null cannot be used (File exists)"),
+        ("run_dir=/dev/null", "/dev/null cannot be used (File exists); choose another folder"),
         # tracks and sweeps
         ("track=folder", "track.dir must be given: write track.dir=VALUE"),
         ("track=folder track.dir=/nowhere", "/nowhere cannot be read (No such file or directory)"),

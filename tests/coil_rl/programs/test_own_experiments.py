@@ -9,8 +9,7 @@ from omegaconf import OmegaConf
 from programs import CONF, called, shipped
 
 from coil_rl.config.check import check_parts
-from coil_rl.programs import plan
-from coil_rl.programs.plan import Pace, described, duration, estimated
+from coil_rl.programs.sweeps import described
 
 # What each experiment needs besides an env of one's own.
 OWN = {
@@ -142,32 +141,8 @@ def test_jobs_that_fail_for_one_reason_are_named_with_it_once(tmp_path):
     assert last.count("there is no module no") == 1
 
 
-def test_plan_and_estimate_are_in_words():
+def test_plan_is_in_words():
     assert described([100, 100, 0]).startswith(
         "this sweep has 3 runs with 200 frames of training in all, 100 each;"
     )
     assert ", 100 to 300 each;" in described([100, 300])
-    assert [duration(seconds) for seconds in (0.2, 40, 600, 9000)] == [
-        "1 s",
-        "40 s",
-        "10 min",
-        "2.5 h",
-    ]
-    assert "of all 3 runs takes about 10 min" in estimated(0.01, [20_000] * 3)
-    assert "100,000 frames of training take about 17 min" in estimated(0.01, [])
-
-
-def test_estimate_is_not_misled_by_a_slow_first_update(monkeypatch):
-    said = []
-    clock = iter([0.0, 100.0, *(100.0 + 3 * update for update in range(1, 8))])
-    monkeypatch.setattr(plan, "say", lambda text, error: said.append(text))
-    monkeypatch.setattr(plan.time, "monotonic", lambda: next(clock))
-    monkeypatch.setattr(plan.HydraConfig, "get", lambda: OmegaConf.create({"sweep": {"dir": "x"}}))
-    monkeypatch.setattr(plan, "_said", [])
-    monkeypatch.setattr(plan, "_frames", [1000] * 10)
-    pace = Pace(frames=600)
-    for update in range(9):
-        assert pace.due(update, 10, {})
-        pace.after_update(update)
-    assert not pace.due(9, 10, {})
-    assert "of all 10 runs takes about 50 s" in said[0]

@@ -67,7 +67,7 @@ def test_wrong_override_is_refused_without_heavy_imports(tmp_path):
 def test_training_imports_no_library_that_it_does_not_use():
     """Each of these takes half a second or more in every training, and is for something else."""
     script = (
-        "import coil_rl.config.build, coil_rl.config.check, sys\n"
+        "import coil_rl.config.assemble, coil_rl.config.check, sys\n"
         "others = {'pandas', 'scipy.stats', 'scipy.interpolate', 'sklearn', 'skops'}\n"
         "print(sorted(others & set(sys.modules)))\n"
     )

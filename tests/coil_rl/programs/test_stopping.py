@@ -11,7 +11,7 @@ import time
 import pytest
 from programs import TINY, called, command, environment, program
 
-from coil_rl.programs.app import Jobs
+from coil_rl.programs.sweeps import Jobs
 from coil_rl.run import checkpoint, stopping
 from coil_rl.run.folder import is_evaluated, locked
 

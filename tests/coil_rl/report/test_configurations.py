@@ -100,7 +100,7 @@ def test_many_differences_are_numbered(runs):
         "coil (1: a=5, b=5, c=5, ...)",
         "coil (2: a=7, b=7, c=7, ...)",
     ]
-    assert "a, b, c and others" in sentences[0]
+    assert "a, b, c and 2 more" in sentences[0]
 
 
 @pytest.mark.parametrize(

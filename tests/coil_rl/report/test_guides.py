@@ -46,7 +46,7 @@ def test_each_guide_and_each_label_with_such_runs_is_named(runs):
 
 def test_many_seeds_are_shortened(runs):
     (sentence,) = of_changed_guides(runs({seed: float(seed) for seed in range(20)}))
-    assert "(coil seeds 0 / 1 / 2 / ...)" in sentence
+    assert "(coil seeds 0 / 1 / 2 and 17 more)" in sentence
 
 
 def test_equal_guides_and_those_of_other_labels_are_not_accused(runs):

@@ -3,9 +3,10 @@ from pathlib import Path
 
 from run_folders import driven, make_run, make_sweep
 
+from coil_rl.record import UNTESTED
 from coil_rl.report import page, write_csv
 from coil_rl.report.comparison import compare
-from coil_rl.report.runs import UNTESTED, Run, read_runs
+from coil_rl.report.runs import Run, read_runs
 
 
 def section(folder, against=None):
@@ -194,10 +195,10 @@ def test_reason_of_plain_rewards_is_said(tmp_path):
     make_run(tmp_path / "0", "ppo", 0, driven("ppo", {"a": 1.0, "b": 2.0}))
     compared = {"deterministic": compare(read_runs([tmp_path]))}
     sentence = "Means are rewards, not fractions of a guide's: no guide was evaluated in the cases "
-    assert f"{sentence}of ppo." in page.notes(None, compared)
+    assert f"{sentence}of ppo." in page.notes(None, compared)[0]
     make_sweep(tmp_path / "sweep")
     compared = {"deterministic": compare(read_runs([tmp_path / "sweep"]))}
-    assert "Means are rewards" not in page.notes(None, compared)
+    assert "Means are rewards" not in page.notes(None, compared)[0]
 
 
 def test_empty_columns_and_many_cases_are_omitted(tmp_path):
@@ -207,8 +208,8 @@ def test_empty_columns_and_many_cases_are_omitted(tmp_path):
     assert not [word for word in ("advice", "better than") if word in text]
     assert text.endswith("The rewards in each of the 9 cases are in report_cases.csv.")
     compared = {"sampled": compare(read_runs([tmp_path]))}
-    assert "Difference" not in page.notes(None, compared)
-    assert "Difference to its guide: of the same seed" in page.notes("guide", compared)
+    assert "Difference" not in page.notes(None, compared)[0]
+    assert "Difference to its guide: of the same seed" in page.notes("guide", compared)[0]
 
 
 def test_means_of_some_seeds_only_say_so(tmp_path):

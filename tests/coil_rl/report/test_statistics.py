@@ -7,7 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from coil_rl.report.statistics import Estimate, count_of_seeds, estimate, holm, wins
+from coil_rl.report.statistics import (
+    Estimate,
+    count_of_seeds,
+    difference,
+    estimate,
+    holm,
+    wins,
+)
 
 
 def test_few_seeds_have_interval_and_p_of_a_t_test():
@@ -58,6 +65,16 @@ def test_estimates_without_spread_or_numbers():
             (single.low, single.high, single.p, estimate([]).mean, estimate([1.0, math.nan]).mean),
         )
     )
+
+
+def test_difference_is_that_of_pairs():
+    ours, theirs = [3.0, 5.0, 9.0], [1.0, 4.0, 6.0]
+    expected = stats.ttest_rel(ours, theirs).confidence_interval(0.95)
+    found = difference(ours, theirs)
+    assert (found.mean, found.seeds) == (2, 3)
+    assert found[1:3] == pytest.approx(tuple(expected))
+    assert math.isnan(difference([2.0], [1.0]).low)
+    assert math.isnan(difference([math.inf, 1.0], [1.0, 1.0]).mean)
 
 
 def test_cells_show_the_interval_if_there_is_one():

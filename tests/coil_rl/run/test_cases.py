@@ -6,7 +6,8 @@ from hydra import compose, initialize_config_module
 from programs import LAP
 from tensordict.nn import TensorDictModuleBase
 
-from coil_rl.config.build import assemble, build_learner, env_maker
+from coil_rl.config.assemble import assemble
+from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.learners.anchor import hold_of
 from coil_rl.run.cases import TrainingCases, further_cases, guide_calls
 from coil_rl.run.delivery import GuideActs

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_module
 from programs import called
 
 from coil_rl import open_run
-from coil_rl.config.build import env_maker
+from coil_rl.config.parts import env_maker
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.record import DELIVERY
 from coil_rl.run import checkpoint

@@ -46,7 +46,7 @@ def test_guide_acts_from_a_low_value_on_until_a_high_one():
 @pytest.mark.parametrize("zero", [0, -100, -1_000_000])  # that of the rewards means nothing
 def test_agent_is_not_worse_if_the_whole_interval_is_above_one_percent_less(agent, answer, zero):
     mine, guide = ([zero + reward for reward in each] for each in (agent, [100, 100, 100]))
-    sentence = not_worse(result_of(mine), result_of(guide), "guide", chance=zero)
+    (sentence,) = not_worse(result_of(mine), result_of(guide), "guide", chance=zero)
     assert f"Not worse than guide on these 3 cases: {answer} " in sentence
     _, low, high = mean_interval([reward - 100 for reward in agent])
     spec = return_format([sum(mine) / 3, sum(guide) / 3])
@@ -54,7 +54,7 @@ def test_agent_is_not_worse_if_the_whole_interval_is_above_one_percent_less(agen
 
 
 def test_agent_with_the_returns_of_its_guide_has_no_interval():
-    sentence = not_worse(result_of([100, 90]), result_of([100, 90]), "guide", chance=0)
+    (sentence,) = not_worse(result_of([100, 90]), result_of([100, 90]), "guide", chance=0)
     assert sentence == (
         "Not worse than guide on these 2 cases: yes, the return is the same in each of them."
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from programs import TINY, called
 
-from coil_rl.config import build
+from coil_rl.config import parts
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.guide_episodes import GUIDE_EPISODES, driven_once
 
@@ -92,6 +92,6 @@ def test_run_that_writes_its_table_again_does_not_drive_its_guide(tmp_path, monk
     def driven_again(*_):
         raise AssertionError("the guide was driven again")
 
-    monkeypatch.setattr(build, "_guide_results", driven_again)
+    monkeypatch.setattr(parts, "_guide_results", driven_again)
     called("train", f"resume={run}")
     assert {name: (run / name).read_bytes() for name in TABLES} == written

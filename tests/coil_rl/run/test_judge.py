@@ -6,8 +6,8 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from coil_rl.config.build import (
-    about_returns,
+from coil_rl.config.assemble import about_returns, trial
+from coil_rl.config.parts import (
     build_evaluation,
     build_guides,
     build_learner,
@@ -15,7 +15,6 @@ from coil_rl.config.build import (
     env_maker,
     guide_results,
     recorded,
-    trial,
 )
 from coil_rl.errors import UserError
 from coil_rl.report.pictures import Picture

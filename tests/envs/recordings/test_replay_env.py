@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 import coil_rl.config.schema  # noqa: F401  registers the typed roots
-from coil_rl.config.build import build
+from coil_rl.config.nodes import build
 from coil_rl.envs import (
     ConeTrackEnv,
     McapReplayEnv,

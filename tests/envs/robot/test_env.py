@@ -10,7 +10,7 @@ from worlds import driving_measures
 
 import coil_rl.config.schema  # noqa: F401  registers the typed roots
 from coil_rl import testing
-from coil_rl.config.build import env_maker
+from coil_rl.config.parts import env_maker
 from coil_rl.envs import (
     ConeTrackEnv,
     Perception,

@@ -1,0 +1,211 @@
+"""What acts without learning, in the cases of the table: measured once, and kept in a file."""
+
+import copy
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+from omegaconf import DictConfig, OmegaConf, open_dict
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from coil_rl.comparison.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, ZERO
+from coil_rl.comparison.entry import FIRST_CHOICE, MIDDLE, ZERO_ACTIONS
+from coil_rl.config.assemble import assemble
+from coil_rl.config.folder import read_config
+from coil_rl.config.nodes import build_all
+from coil_rl.config.parts import build_evaluation, env_maker
+from coil_rl.errors import file_of_a_run
+from coil_rl.report import write_csv
+from coil_rl.run import checkpoint
+from coil_rl.run.curve import POLICIES
+from coil_rl.run.evaluation import EvaluationResult
+from coil_rl.run.parts import TEST, EnvMaker
+from coil_rl.run.weights import put_weights
+from coil_rl.transforms.action_space import ActionSpace
+
+FILE = "baselines.csv"
+NAME = "baseline"  # column with the name
+ACTION = "baseline_action"  # column with the words for the action of `zero`
+REVERSED = {"_target_": "coil_rl.transforms.ScaledAdvice", "gain": -1.0}
+# Beside the delays of the env, which are kept: so names and memories are of their own.
+ONE = {"min_lag": 1, "max_lag": 1}  # steps
+LATE = {
+    "one_more_observation": {
+        "_target_": "coil_rl.transforms.ObservationDelay",
+        "memory_key": "one_more_late_observations",
+        **ONE,
+    },
+    "one_more_action": {
+        "_target_": "coil_rl.transforms.ActionDelay",
+        "memory_key": "one_more_late_actions",
+        **ONE,
+    },
+}
+
+
+class Acting(TensorDictModuleBase):
+    """Policy without an observation: neutral or random actions, in the unit of the env.
+
+    Args:
+        env: the env.
+        vectors: returns the action vectors of all rows.
+    """
+
+    def __init__(self, env: EnvBase, vectors: Callable[[ActionSpace, torch.Size], Tensor]) -> None:
+        self.in_keys: list[NestedKey] = []
+        self.out_keys: list[NestedKey] = [env.action_key]
+        super().__init__()
+        self.space = ActionSpace(env.full_action_spec[env.action_key], env.batch_dims)
+        self.vectors = vectors
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        vectors = self.vectors(self.space, tensordict.batch_size)
+        return tensordict.set(self.out_keys[0], self.space.actions(vectors))
+
+    @classmethod
+    def random(cls, env: EnvBase, seed: int = 0) -> "Acting":
+        """Return a policy with random actions, uniform in those of the env.
+
+        Args:
+            env: the env.
+            seed: of the draws.
+        """
+        return cls(env, partial(_random, torch.Generator().manual_seed(seed)))
+
+    @classmethod
+    def zero(cls, env: EnvBase) -> "Acting":
+        """Return a policy with the neutral action, see `words`.
+
+        Args:
+            env: the env.
+        """
+        return cls(env, _neutral)
+
+    @property
+    def words(self) -> str:
+        """What the neutral action is: 0 in each number only where each range is around 0."""
+        if self.space.units is None:
+            return FIRST_CHOICE
+        return ZERO_ACTIONS if (self.space.units.centre == 0).all() else MIDDLE
+
+
+def _random(generator: torch.Generator, space: ActionSpace, batch: torch.Size) -> Tensor:
+    draws = torch.rand((*batch, *space.agents, space.size), generator=generator)
+    return space.random(draws.to(space.spec.device, space.dtype))
+
+
+def _neutral(space: ActionSpace, batch: torch.Size) -> Tensor:
+    neutral = space.neutral()
+    return neutral.expand(*batch, *neutral.shape)
+
+
+def measure_baselines(config: DictConfig, folder: Path) -> None:
+    """Let guide, opposite, zero and random act in the cases of the table, unless that is done.
+
+    Args:
+        config: of a training with a guide.
+        folder: of the comparison, for the file.
+    """
+    if (folder / FILE).exists():
+        return
+    evaluation, make_env = build_evaluation(config), env_maker(config)
+    cases = len(evaluation.cases)
+    opposite = EnvMaker(
+        make_env.bare,
+        disturb=make_env.disturb,
+        guides=make_env.guides,
+        degrade=lambda: [*make_env.degrade(), *build_all({"opposite": REVERSED}, "degrade")],
+    )
+    rows: list[dict[str, Any]] = []
+    for name, (env, policy) in {
+        GUIDE: make_env.guided(cases, TEST),
+        OPPOSITE: opposite.guided(cases, TEST),
+    }.items():
+        rows += _rows(name, evaluation.run(env, policy))
+    env = make_env.plain(cases, TEST)
+    neutral = Acting.zero(env)
+    found = _rows(ZERO, evaluation.run(env, neutral))
+    rows += [row | {ACTION: neutral.words} for row in found]
+    env = make_env.plain(cases, TEST)
+    rows += _rows(RANDOM, evaluation.run(env, Acting.random(env, config.seed)))
+    write_csv(rows, folder / FILE)
+
+
+def measure_network(folder: Path, run: Path) -> None:
+    """Let the first network of a run act in the cases of the table, unless that is done.
+
+    Args:
+        folder: of the comparison, for the file.
+        run: folder of a finished run that kept its policies.
+    """
+    file = folder / "first_network.csv"
+    first = min((run / POLICIES).glob("*.pt"), default=None)
+    if file.exists() or first is None:
+        return
+    opened = assemble(read_config(run, "run"), run)
+    env = opened.make_env(len(opened.trial.evaluation.cases), TEST)
+    policy = opened.make_learner(env).policy  # type: ignore[misc]
+    put_weights(policy, checkpoint.load(first), first)
+    write_csv(_rows(NETWORK, opened.trial.evaluation.run(env, policy)), file)
+
+
+def measure_delayed(name: str, run: Path | None, config: DictConfig) -> pd.DataFrame:
+    """Return the episodes of a policy with one more step of delay on observation and action.
+
+    Args:
+        name: of the policy.
+        run: folder of its run; None for a guide or its opposite.
+        config: of a training with a guide, for these.
+    """
+    late = copy.deepcopy(config) if run is None else read_config(run, "run")
+    with open_dict(late):
+        late.disturb = OmegaConf.merge(late.disturb, LATE)
+        if name == OPPOSITE:
+            late.degrade = OmegaConf.merge(late.degrade, {"opposite": REVERSED})
+    evaluation = build_evaluation(late)
+    cases = len(evaluation.cases)
+    if run is None:
+        env, policy = env_maker(late).guided(cases, TEST)
+    else:
+        opened = assemble(late, run)
+        env = opened.make_env(cases, TEST)
+        policy = opened.policy(env)
+    return pd.DataFrame(_rows(name, evaluation.run(env, policy)))
+
+
+def read_baselines(folder: Path) -> pd.DataFrame:
+    """Return the rows of all that was measured in the cases of the table.
+
+    Args:
+        folder: of the comparison.
+
+    Raises:
+        UserError: if a file is empty or damaged.
+    """
+    tables = []
+    for file in (folder / FILE, folder / "first_network.csv"):
+        if file.exists():
+            with file_of_a_run(file, "remove it and compare again, which writes it anew"):
+                table = pd.read_csv(file)
+                tables.append(table.astype({NAME: str, "reward": float, "steps": int}))
+    return pd.concat(tables, ignore_index=True)
+
+
+def action_words(table: pd.DataFrame) -> str:
+    """Return what the action of `zero` is, in words; a file without them has zero actions.
+
+    Args:
+        table: its rows.
+    """
+    return str(table[ACTION].iloc[0]) if ACTION in table else ZERO_ACTIONS
+
+
+def _rows(name: str, result: EvaluationResult) -> list[dict[str, Any]]:
+    return [{NAME: name, **episode} for episode in result.episodes]

@@ -1,0 +1,304 @@
+"""A comparison of a guide with what learns, with it and without it, in a few minutes."""
+
+import json
+import math
+import os
+import shlex
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from omegaconf import DictConfig
+
+from coil_rl.comparison import timing
+from coil_rl.comparison.arms import (
+    ANCHORED,
+    ARMS,
+    PPO,
+    RANDOM,
+    TUNE,
+    arms_for,
+    check_words,
+    job_of,
+    short_words,
+)
+from coil_rl.comparison.baselines import (
+    measure_baselines,
+    measure_delayed,
+    measure_network,
+    read_baselines,
+)
+from coil_rl.comparison.entry import IDLE, Entry
+from coil_rl.comparison.jobs import job_name, run_jobs
+from coil_rl.comparison.outcome import Outcome, first_of, read_outcome
+from coil_rl.comparison.page import command_of, delayed_sentence, draw, guide_lines, page_of
+from coil_rl.comparison.same import identity_of, keep_plan, known_plan
+from coil_rl.comparison.timing import Plan
+from coil_rl.comparison.verdict import NOTHING, Verdict, verdict
+from coil_rl.config.check import check_parts
+from coil_rl.config.parts import env_maker
+from coil_rl.config.python import Named, composed, named
+from coil_rl.config.trust import trust_own
+from coil_rl.config.unread import check_read
+from coil_rl.errors import UserError
+from coil_rl.files import FAILED_JOBS, write_text
+from coil_rl.output import decoration, quietly, say
+from coil_rl.report import write_csv
+from coil_rl.run.folder import locked
+from coil_rl.run.parts import TEST
+
+PLAN, TABLE, PAGE, PICTURE = "compare.json", "compare.csv", "compare.md", "compare.png"
+FOUND = "verdict.json"
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What a comparison found.
+
+    Attributes:
+        folder: with the runs, the table, the page and the picture.
+        verdict: what to use, and why.
+        table: one row for each policy.
+        command: that trains what is recommended to the end; empty for none.
+        page: for people.
+    """
+
+    folder: Path
+    verdict: Verdict
+    table: pd.DataFrame
+    command: str
+    page: str
+
+
+def compare(
+    env: Any,
+    *,
+    guide: Any,
+    tune: Mapping[str, Any] | None = None,
+    minutes: float = 2.0,
+    frames: int | None = None,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    overrides: Sequence[str] = (),
+) -> Worth:
+    """Say whether a guide is worth it, and what to use, after a few minutes.
+
+    Args:
+        env: as for `train`.
+        guide: as for `train`.
+        tune: bounds of numbers of the guide by name, which are tuned too: [low, high] or [low,
+            high, "log"].
+        minutes: that it may take, about; it takes longer where an env or a guide is too slow.
+        frames: of a whole training, of which each job here gets a tenth at most; by default those
+            of the env's file.
+        seed: of the first trainings; the others have the next one.
+        folder: for everything that is written; one that holds this comparison goes on with it. By
+            default a new one in outputs/compare.
+        overrides: further words of the command line, such as "learner.gamma=0.98".
+
+    Raises:
+        UserError: for a mistake in an argument, with one sentence that says what to do.
+
+    Example:
+        >>> import coil_rl
+        >>> found = coil_rl.compare("Pendulum-v1", guide="swing_up")  # doctest: +SKIP
+        >>> print(found.page)  # doctest: +SKIP
+    """
+    place = new_folder() if folder is None else Path(folder).expanduser()
+    given = named(env, guide, str(place))
+    words = [*given.words, *overrides]
+    if frames is not None:
+        words.append(f"budget.frames={frames}")
+    if tune is not None:
+        given.nodes["tune"] = dict(tune)
+    return Comparison(Named(words, given.nodes), place, minutes=minutes, seed=seed).run()
+
+
+def new_folder() -> Path:
+    """Return the folder of a new comparison."""
+    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f")
+    return Path("outputs", "compare", f"{now}_{os.getpid()}")
+
+
+class Comparison:
+    """A comparison in a folder, new or begun before.
+
+    Args:
+        given: env, guide and everything else that was given.
+        folder: of the comparison; each training has a folder in it.
+        minutes: that it may take, about.
+        seed: of the first trainings.
+        command: by which it goes on if it is stopped; empty for none.
+
+    Raises:
+        UserError: for a word that a comparison decides itself, for no time, and for a file where
+            the folder is to be.
+    """
+
+    def __init__(
+        self,
+        given: Named,
+        folder: Path,
+        *,
+        minutes: float = 2.0,
+        seed: int = 0,
+        command: str = "",
+    ) -> None:
+        check_words(given.words)
+        if not 0 < minutes < math.inf:
+            raise UserError(f"minutes={minutes:g} must be above 0; 2 is the default")
+        if folder.is_file():
+            raise UserError(f"folder={folder} is a file; give a folder, or a name that is not used")
+        self.given, self.folder, self.minutes, self.seed = given, folder, minutes, seed
+        self.command = command
+        self.overhead = 0.0  # s, to prepare a training
+
+    def run(self) -> Worth:
+        """Compare, or go on with it, and return what was found; the page is written and printed.
+
+        Raises:
+            UserError: for a mistake in what was given, for a folder that holds something else, and
+                if another process uses the folder.
+        """
+        start = time.perf_counter()
+        config = self._checked()
+        self.overhead = time.perf_counter() - start
+        with self._new_or_kept():
+            (self.folder / FAILED_JOBS).unlink(missing_ok=True)
+            plan = self._plan(config)
+            short = short_words(self.given.words, config, plan.cases)
+            with quietly():
+                base = self._config(ANCHORED, plan.frames, short)
+                measure_baselines(base, self.folder)
+            failed = run_jobs(self._jobs(plan, short), self.folder, plan.frames)
+            return self._judge(plan, base, failed)
+
+    @contextmanager
+    def _new_or_kept(self) -> Iterator[None]:
+        """Lock the folder, and remove what was made for that if nothing else was written.
+
+        What another process or the user made stays.
+        """
+        lock = self.folder / ".lock"
+        is_new = not lock.exists()
+        made = [each for each in (self.folder, *self.folder.parents) if not each.exists()]
+        with locked(self.folder):
+            try:
+                yield
+            except BaseException:
+                if is_new and not (self.folder / PLAN).exists():
+                    lock.unlink(missing_ok=True)
+                    for each in made:
+                        with suppress(OSError):  # it is not empty
+                            each.rmdir()
+                raise
+
+    @property
+    def tunes(self) -> bool:
+        """Whether numbers of the guide are tuned."""
+        return "tune" in self.given.nodes
+
+    def _checked(self) -> DictConfig:
+        """Return the configuration of plain PPO with its whole budget, after a check of all."""
+        anchored = self._config(ANCHORED)
+        if len(anchored.guide) != 1:
+            found = ", ".join(map(str, anchored.guide)) or "none"
+            raise UserError(
+                f"guide: a comparison is about one guide, but there is {found}; give guide=NAME, "
+                "or guide=controller guide.controller.of=MODULE:NAME"
+            )
+        trust_own(anchored)
+        check_parts(anchored)
+        # What this arm does not read, none of them reads: it has a learner, advice and tests.
+        check_read(anchored, self.given.words)
+        if self.tunes:
+            check_parts(self._config(TUNE))
+        return self._config(PPO)
+
+    def _config(
+        self, name: str, frames: int | None = None, short: Sequence[str] = ()
+    ) -> DictConfig:
+        """Return the configuration of an arm, by default with the whole budget."""
+        job = job_of(self.given, ARMS[name], self.seed, frames, short)
+        return composed(job, self.folder / name)
+
+    def _plan(self, config: DictConfig) -> Plan:
+        """Return what is going to be done, and say it; a comparison that goes on has its plan."""
+        file = self.folder / PLAN
+        identity = identity_of(self.given, config, self.minutes, self.seed)
+        if file.exists():
+            plan = known_plan(file, identity)
+            say(f"{self.folder} goes on. {plan.described(self.minutes)}", error=True)
+            return plan
+        if any(self.folder.rglob("config.yaml")):
+            raise UserError(f"{self.folder} holds runs of something else; choose another folder")
+        if self.command:
+            say(f"if this is stopped, go on with: {self.command}", error=True)
+        say("coil-compare: timing the env and the guide", error=True)
+        with quietly():
+            pace = timing.measure(config, self.overhead)
+            env = env_maker(config).bare(1, TEST, None)
+        arms = arms_for(env, pace.step, tunes=self.tunes)
+        plan = timing.plan(config, pace, arms, self.minutes)
+        keep_plan(file, identity, plan)
+        say(f"{pace.sentence}\n{plan.described(self.minutes)}", error=True)
+        return plan
+
+    def _jobs(self, plan: Plan, short: Sequence[str]) -> dict[str, Named]:
+        """Return what each training consists of, by its name; each seed of all arms in turn."""
+        jobs = {}
+        for seed in range(self.seed, self.seed + plan.seeds):
+            for name in plan.arms:
+                job = job_of(self.given, ARMS[name], seed, plan.frames, short)
+                jobs[job_name(name, seed)] = job
+        return jobs
+
+    def _judge(self, plan: Plan, base: DictConfig, failed: Mapping[str, str]) -> Worth:
+        """Write and print what was found."""
+        with quietly():
+            outcome = read_outcome(self.folder, plan.arms, failed)
+            plain = first_of(outcome, PPO)
+            if plain is not None:
+                measure_network(self.folder, plain.folder)
+                outcome = read_outcome(self.folder, plan.arms, failed)
+            found = verdict(
+                outcome.entries, [name for name in plan.arms if name not in outcome.runs]
+            )
+            delayed = self._delayed(found, outcome, base)
+        command = command_of(self.given, found)
+        page = page_of(found, outcome, delayed, self._steps(outcome), command)
+        write_csv(outcome.rows, self.folder / TABLE)
+        write_text(self.folder / PAGE, f"{page}\n")
+        write_text(self.folder / FOUND, json.dumps(found.to_dict(command), indent=2))
+        with decoration(f"the picture in {self.folder}"):
+            cases = base.evaluation.curve.num_envs
+            if outcome.runs:
+                draw(outcome, guide_lines(outcome), cases, self.folder / PICTURE)
+        report = shlex.join(["coil-report", f"folder={self.folder}"])
+        more = f"; {report} has more" if outcome.runs else ""
+        say(f"{page}\nSee {self.folder}{more}.")
+        return Worth(self.folder, found, pd.DataFrame(outcome.rows), command, page)
+
+    def _delayed(self, found: Verdict, outcome: Outcome, base: DictConfig) -> str:
+        """Return the sentence about a delay of a guide or policy; empty for everything else."""
+        if found.use in (NOTHING, *IDLE):
+            return ""
+        run = first_of(outcome, found.use)
+        with decoration("the delay"):
+            table = measure_delayed(found.use, None if run is None else run.folder, base)
+            entry = outcome.entries[found.use]
+            late = Entry(found.use, table["reward"].to_numpy()[None])
+            write_csv(table.to_dict("records"), self.folder / "delayed.csv")
+            return delayed_sentence(entry, late, outcome.entries[RANDOM])
+        return ""
+
+    def _steps(self, outcome: Outcome) -> int:
+        """Return the env steps that only measured: all episodes of the table."""
+        runs = [run for each in outcome.runs.values() for run in each]
+        tables = [pd.read_csv(run.folder / "episodes.csv") for run in runs]
+        return sum(int(table["steps"].sum()) for table in [*tables, read_baselines(self.folder)])

@@ -1,0 +1,211 @@
+"""The page of a comparison: a picture, a table, three sentences, and the command to go on with."""
+
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from matplotlib.artist import Artist
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter
+
+from coil_rl.comparison.arms import ANCHORED, ARMS, TUNE
+from coil_rl.comparison.entry import Entry, difference
+from coil_rl.comparison.outcome import Outcome
+from coil_rl.comparison.verdict import Verdict
+from coil_rl.config.compose import key_of
+from coil_rl.config.python import Named
+from coil_rl.learners.anchor import StartTest
+from coil_rl.report import markdown_table, style
+from coil_rl.report.curves import RETURNS, draw_guides, mean_curve, points
+from coil_rl.report.runs import RETURN, Run
+from coil_rl.report.table import AUTO_FORMAT, return_format
+
+FEW = 4  # cases of a start test, below which only a very large difference is certain
+COLUMNS = {
+    "policy": ("policy", ""),
+    "return": ("return", AUTO_FORMAT),
+    "worst": ("worst case", AUTO_FORMAT),
+    "failures": ("failed", ".0%"),
+    "seeds": ("seeds", "d"),
+    "frames": ("frames", ",.0f"),
+    "seconds": ("seconds", ".0f"),
+    "calls": ("guide calls", ",.0f"),
+    "note": ("", ""),
+}
+
+
+def page_of(verdict: Verdict, outcome: Outcome, delayed: str, measured: int, command: str) -> str:
+    """Return the page.
+
+    Args:
+        verdict: the recommendation.
+        outcome: what was measured.
+        delayed: the sentence about a delay.
+        measured: env steps that only measured.
+        command: that trains the recommended method to the end; empty for none.
+    """
+    columns = dict(COLUMNS)
+    if all(np.isnan(row.get("failures", np.nan)) for row in outcome.rows):
+        del columns["failures"]
+    seeds = "of each training the mean over its seeds"
+    parts = [
+        *(f"{number}. {sentence}" for number, sentence in enumerate(verdict.sentences, 1)),
+        "",
+        markdown_table(outcome.rows, columns),
+        "",
+        f"Deterministic episodes in the same cases, which chose nothing; {seeds}. Frames are all "
+        "env steps that a training depends on, with those of its tests. Guide calls of guide and "
+        f"opposite are those of their episodes here. {measured:,} further env steps measured these "
+        "cases.",
+    ]
+    if few := few_cases(outcome.runs.get(ANCHORED, ())):
+        parts += ["", few]
+    if delayed:
+        parts += ["", delayed]
+    if command:
+        lead = "Train it to the end"
+        if verdict.use != verdict.train:
+            lead = "To see whether a whole training changes that"
+        parts += ["", f"{lead}: {command}"]
+    return "\n".join(parts)
+
+
+def few_cases(runs: Sequence[Run]) -> str:
+    """Return the sentence about start tests that held no guide after few cases; empty for none.
+
+    Args:
+        runs: of anchored COIL.
+    """
+    *_, cases, weight = StartTest.names
+    firsts = [run.curve[0] for run in runs if run.curve]
+    few = [row[cases] for row in firsts if row.get(cases, np.nan) < FEW and not row[weight]]
+    if not few:
+        return ""
+    return (
+        f"The start test of {ANCHORED}, which decides whether a guide is held, had only "
+        f"{max(few):.0f} cases in the frames of a training here, and held none in {len(few)} of "
+        f"{len(runs)} seeds. So few cases do not show for sure that a guide is good, so that "
+        f"{ANCHORED} may be better in a whole training, whose test has more of them."
+    )
+
+
+def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> str:
+    """Return the sentence about a step of delay on observation and action.
+
+    Args:
+        entry: what came out best.
+        late: the same with the delay.
+        random: random actions.
+    """
+    found = difference(late, Entry(entry.name, entry.returns[:1]))
+    own = float(entry.returns[0].mean())
+    kept = ""
+    if own > random.mean:  # else there is no distance to keep
+        share = (late.mean - random.mean) / (own - random.mean)
+        kept = f": it keeps {share:.0%} of its distance from random actions"
+    spec = return_format([late.mean, own])
+    which = f"{entry.name} of the first seed" if len(entry.returns) > 1 else entry.name
+    return (
+        f"With one step of delay on observation and action, which it was not trained with, "
+        f"{which} has {late.mean:{spec}} instead of {own:{spec}} ({found}){kept}."
+    )
+
+
+def command_of(given: Named, verdict: Verdict) -> str:
+    """Return the command that trains what is recommended to the end, as a shell reads it.
+
+    For objects that no command names it is a line of Python.
+
+    Args:
+        given: env, guide and everything else that was given.
+        verdict: the recommendation.
+    """
+    if not verdict.train:
+        return ""
+    arm = ARMS[verdict.train]
+    words = [word for word in given.words if arm.name == TUNE or key_of(word) != "tune"]
+    tune = given.nodes.get("tune")
+    if not [key for key in given.nodes if key != "tune"]:
+        if arm.name == TUNE and tune is not None:
+            bounds = ", ".join(f"{name}: {_bounds(each)}" for name, each in tune.items())
+            words.append(f"tune={{{bounds}}}")
+        return shlex.join(["coil-train", *map(_plain, [*words, *arm.words])])
+    method = arm.words[0].partition("=")[2]
+    others = [word for word in words if not word.startswith(("env=", "env.id=", "guide"))]
+    overrides = [*others, *arm.words[1:]]
+    arguments = [f"method={method!r}"]
+    if arm.name == TUNE:
+        arguments.append(f"tune={dict(tune or {})!r}")
+    if overrides:
+        arguments.append(f"overrides={overrides!r}")
+    return f"coil_rl.train(env, guide=guide, {', '.join(arguments)})"
+
+
+def _plain(word: str) -> str:
+    """Return a word without the quotes of its value, if Hydra reads the same value without them."""
+    bare = re.sub(r"^([\w.+@/]+)='([\w.:/-]+)'$", r"\1=\2", word)
+    return bare if _read(bare) == _read(word) else word
+
+
+def _read(word: str) -> tuple[type, Any] | None:
+    """Return the value of a word as Hydra reads it, with its type; None for what it cannot read."""
+    try:
+        value = OverridesParser.create().parse_override(word).value()
+    except HydraException:
+        return None
+    return type(value), value
+
+
+def _bounds(each: Any) -> str:
+    """Return bounds as Hydra reads them."""
+    return f"[{', '.join(map(str, each))}]"
+
+
+def draw(outcome: Outcome, lines: Mapping[str, float], cases: int | None, path: Path) -> None:
+    """Draw the learning curves of all arms, each seed thin and their mean thick, beside the guide.
+
+    Args:
+        outcome: what was measured.
+        lines: return of guide and opposite in the cases of the curves, by name.
+        cases: number of these cases.
+        path: of the picture.
+    """
+    strokes = style.strong_strokes(outcome.runs)
+    handles: list[Artist] = []
+    for name, stroke in strokes.items():
+        look = {"color": stroke.colour, "ls": stroke.linestyle}
+        count = len(outcome.runs[name])
+        handles.append(Line2D([], [], lw=2, label=f"{name} ({count} seeds)", **look))
+    with style.picture(path, None, handles, 4.2) as figure:
+        label = RETURNS if cases is None else f"{RETURNS}, mean of {cases} cases"
+        axes = figure.add_subplot(xlabel="frames", ylabel=label)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        style.lighten(axes)
+        for name, stroke in strokes.items():
+            look = {"color": stroke.colour, "ls": stroke.linestyle}
+            curves: Sequence[Run] = outcome.runs[name]
+            for run in curves:
+                axes.plot(*points(run.curve, RETURN).T, lw=0.7, alpha=0.6, **look)
+            frames, mean, *_ = mean_curve([run.curve for run in curves], RETURN)
+            axes.plot(frames, mean, lw=1.8, **look)
+        axes.margins(x=0.02)
+        axes.set_xlim(left=0)
+        draw_guides(axes, lines)
+
+
+def guide_lines(outcome: Outcome) -> dict[str, float]:
+    """Return the lines of the picture: the guide in the cases of the curve, if a run knows it.
+
+    Args:
+        outcome: what was measured.
+    """
+    for runs in outcome.runs.values():
+        for run in runs:
+            if run.guide_returns:
+                return dict(run.guide_returns)
+    return {}

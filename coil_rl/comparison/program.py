@@ -1,0 +1,134 @@
+"""coil-compare: is my guide worth it? Short trainings beside the guide, and what to use.
+
+  coil-compare env=mountain_car                            with the guide of the env's file
+  coil-compare env=gym env.id=Pendulum-v1 guide=controller guide.controller.of=my_package:PID
+  coil-compare env=pendulum tune='{gain: [0.1, 10, log]}'  would tuning the rule do it?
+
+minutes=2       that it may take, about; it says before how long it takes
+folder=FOLDER   for everything that is written; the same command with it goes on after a stop
+seed=0          of the first trainings; the others have the next one
+tune='{...}'    bounds of numbers of the guide, as of method=tune
+
+All other arguments are those of coil-train, but for what is compared: method and learner. See
+docs/compare.md.
+"""
+
+import logging
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+import coil_rl.config.schema  # noqa: F401  the types that the configurations begin with
+from coil_rl.config.compose import quoted
+from coil_rl.config.messages import sentence
+from coil_rl.config.trust import trust_packages
+from coil_rl.errors import UserError
+from coil_rl.programs import app, folders
+
+CONFIG_DIR = ("--config-dir", "-cd")  # of Hydra: a folder with YAML files of the user
+OWN = ("minutes", "folder", "seed", "tune")  # arguments that coil-train does not have
+
+
+def compare(arguments: Sequence[str]) -> None:
+    """Compare as the arguments of the program say.
+
+    Args:
+        arguments: of the command line.
+    """
+    own, words = _split(arguments)
+    folder = folders.folder(own["folder"]) if "folder" in own else None
+    minutes, seed = _number(own, "minutes", 2.0), _number(own, "seed", 0)
+    if not isinstance(seed, int):
+        raise UserError(f"seed={own['seed']} must be a whole number")
+    _check_composes(words)
+    # They import PyTorch, which takes seconds.
+    from coil_rl.comparison.compare import Comparison, new_folder
+    from coil_rl.config.python import Named
+
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    nodes: dict[str, Any] = {}
+    if "tune" in own:
+        nodes["tune"] = _value("tune", own["tune"])
+    trust = _value("trust", next((w[6:] for w in words if w.startswith("trust=")), "[]"))
+    trust_packages(trust)
+    place = new_folder() if folder is None else folder
+    others = [argument for argument in arguments if not argument.startswith("folder=")]
+    command = shlex.join(["coil-compare", *others, f"folder={place}"])
+    given = Named(words, nodes)
+    comparison = Comparison(given, place, minutes=float(minutes), seed=seed, command=command)
+    try:
+        comparison.run()
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"continue with: {command}") from None
+
+
+def _split(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Return the arguments of this program by name, and the words of `coil-train`."""
+    own: dict[str, str] = {}
+    words = []
+    rest = iter(arguments)
+    for argument in rest:
+        key, equals, value = argument.partition("=")
+        if key in CONFIG_DIR:
+            place = Path(value or next(rest, "")).expanduser().absolute()
+            if not place.is_dir():
+                raise UserError(f"{key}: {place} is no folder; give one with YAML files")
+            words.append(f"hydra.searchpath=[{quoted(f'file://{place}')}]")
+            continue
+        if argument.startswith("-"):
+            raise UserError(f"{argument} is no argument of coil-compare; give KEY=VALUE")
+        if key in OWN:
+            if not equals or not value:
+                raise UserError(f"{argument}: give {key}=VALUE")
+            own[key] = value
+        else:
+            words.append(folders.spelled(argument))
+    return own, words
+
+
+def _check_composes(words: Sequence[str]) -> None:
+    """Raise a `UserError` for a word that does not fit the configuration, in a moment."""
+    try:
+        with initialize_config_module("coil_rl.conf", version_base="1.3"):
+            compose("train", [*words, "method=coil_anchored", "run_dir=unused"])
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(sentence(error)) from error
+
+
+def _number(own: dict[str, str], key: str, default: float) -> float:
+    """Return a number of the command line."""
+    if key not in own:
+        return default
+    value = _value(key, own[key])
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 2**63:
+        raise UserError(f"{key}={own[key]} must be a number, at least 0")
+    return value
+
+
+def _value(key: str, text: str) -> Any:
+    """Return the value of an argument, as Hydra reads it."""
+    try:
+        return OverridesParser.create().parse_override(f"{key}={text}").value()
+    except HydraException as error:
+        raise UserError(f"{key}={text}: {sentence(error)}") from error
+
+
+def main() -> None:
+    """Entry point."""
+    arguments = sys.argv[1:]
+    if any(argument in ("-h", "--help") for argument in arguments):
+        print(__doc__.rstrip())
+        return
+    with app.program("compare"):
+        compare(arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,286 @@
+"""From the words of a command line and YAML files to a configuration: Hydra composes it.
+
+What a person wrote is what runs: values of YAML files, and of the command line.
+
+Hydra composes the groups in a fixed order, env before learner before method. So a value of a later
+group replaces the one that a user wrote in a file of an earlier group, `learner: {normalise: true}`
+in a file of an env for example, and nobody says so. Here every value that is written in a file of
+somebody else than coil-rl is put into its place again, unless the command line gives another one.
+
+The YAML files of guests: packages beside coil-rl that bring envs, guides, experiments, programs.
+
+A guest names the package of its files by an entry point, and Hydra then finds them like those of
+coil-rl, by the names of their folders:
+
+    [project.entry-points."coil_rl.conf"]
+    my_package = "my_package.conf"
+"""
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
+from typing import Any, NamedTuple
+
+from hydra import compose, initialize_config_module
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from coil_rl.config.messages import sentence
+from coil_rl.errors import UserError
+
+CORE = "coil_rl.conf"  # the package of our own files, and the group of the entry points
+
+
+@cache
+def packages() -> tuple[str, ...]:
+    """Return the packages with YAML files, coil-rl's own first."""
+    return (CORE, *sorted(entry.value for entry in metadata.entry_points(group=CORE)))
+
+
+@cache
+def shipped_places() -> tuple[str, ...]:
+    """Return where Hydra finds its own files, and those that are installed with coil-rl."""
+    entries = metadata.entry_points(group=CORE)
+    ours = sorted(each.value for each in entries if each.dist and each.dist.name == "coil-rl")
+    return ("pkg://hydra", "structured://", *(f"pkg://{package}" for package in (CORE, *ours)))
+
+
+class GuestFiles(SearchPathPlugin):
+    """Lets Hydra find the files of all of them in a program whose own file is in one of them."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append what is not there.
+
+        Args:
+            search_path: of the program.
+        """
+        places = [f"pkg://{package}" for package in packages()]
+        known = {element.path for element in search_path.get_path()}
+        if not known.isdisjoint(places):
+            for place in places:
+                if place not in known:
+                    search_path.append(CORE, place)
+
+
+Plugins.instance().register(GuestFiles)
+
+
+SEVERAL = ("guide", "disturb", "degrade")  # groups of which several files may be chosen
+REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
+
+
+@dataclass(frozen=True)
+class Written:
+    """A value in a file of a user.
+
+    Args:
+        key: its full key.
+        value: as written, perhaps a reference.
+        file: name of the file, for messages.
+        files: that file, and those whose defaults list leads to it.
+    """
+
+    key: str
+    value: Any
+    file: str
+    files: frozenset[str]
+
+
+class Job(NamedTuple):
+    """A run of a sweep, and all that differ from it by their seed only."""
+
+    words: Sequence[str]  # for the program, also those of the sweep
+    config: DictConfig  # composed
+
+
+def keep_written(
+    config: DictConfig, config_name: str, task: Sequence[str], hydra: Sequence[str] = ()
+) -> None:
+    """Put the values of users' files into their places, after Hydra has composed all files.
+
+    Hydra must be initialised.
+
+    Args:
+        config: composed; it is changed in place.
+        config_name: of the program.
+        task: overrides of the command line for the program.
+        hydra: overrides of the command line for Hydra.
+
+    Raises:
+        UserError: for a value that two files give differently, or that has no place.
+    """
+    overrides = [*task, *hydra]
+    loader: Any = GlobalHydra.instance().config_loader()
+    _, files = loader._parse_overrides_and_create_caching_repo(config_name, overrides)
+    for text in task:
+        group, value = key_of(text), text.partition("=")[2]
+        if group not in SEVERAL and value.startswith("[") and files.group_exists(group):
+            raise UserError(
+                f"{text} chooses several files of a group that takes one; for a run with each "
+                f"write -m {group}={value.strip('[]')}"
+            )
+    with open_dict(config):
+        # To look for files of users takes as long as to compose all files.
+        places = [source.full_path() for source in files.get_sources()]
+        if not all(place.startswith(shipped_places()) for place in places):
+            defaults = loader.compute_defaults_list(config_name, overrides, RunMode.RUN).defaults
+            # A choice of a file, such as method=coil, gives no value.
+            keys = [key_of(text) for text in task]
+            typed = [key for key in keys if not files.group_exists(key.replace(".", "/"))]
+            _keep(config, _written(defaults, files), typed)
+
+
+def _keep(config: DictConfig, values: Iterable[Written], typed: Sequence[str]) -> None:
+    """Put values of users' files into their places.
+
+    Args:
+        config: composed; it is changed in place.
+        values: in the order of composition.
+        typed: keys that the command line gives.
+
+    Raises:
+        UserError: for a value that two files give differently, or that has no place.
+    """
+    last: dict[str, Written] = {}
+    for written in values:
+        if any(covers(key, written.key) for key in typed):
+            continue
+        other = last.get(written.key, written)
+        last[written.key] = written
+        if other.value != written.value and not _lists(other, written):
+            raise UserError(
+                f"{written.key} is {other.value} in {other.file} and {written.value} in "
+                f"{written.file}; leave one out, or give it on the command line"
+            )
+        _put(config, written)
+
+
+def _put(config: DictConfig, written: Written) -> None:
+    """Set a value; a `UserError` if a node on its way is no node."""
+    parent = written.key.rpartition(".")[0]
+    node = OmegaConf.select(config, parent, throw_on_resolution_failure=False) if parent else config
+    if parent and node is not None and not isinstance(node, DictConfig):
+        raise UserError(
+            f"{written.file}: {written.key} has no place, because {parent} is {node!r}; leave it "
+            "out, or give it on the command line"
+        )
+    OmegaConf.update(config, written.key, written.value, merge=False, force_add=True)
+
+
+def key_of(text: str) -> str:
+    """Return the full key of an override of the command line.
+
+    Args:
+        text: such as "+learner.gamma=0.9", "~degrade" or "guide@other=spline".
+    """
+    return text.lstrip("+~").partition("=")[0].rpartition("@")[2].replace("/", ".")
+
+
+def quoted(text: str) -> str:
+    """Return a text in quotes of Hydra, where a backslash is special before a quote only.
+
+    Args:
+        text: a value for an override on the command line.
+    """
+    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), text)
+    return f"'{escaped}'"
+
+
+def covers(one: str, other: str) -> bool:
+    """Return whether one of two keys is the other, or is inside it.
+
+    Args:
+        one: a full key.
+        other: another one.
+    """
+    return one == other or other.startswith(f"{one}.") or one.startswith(f"{other}.")
+
+
+def _lists(one: Written, other: Written) -> bool:
+    """Return whether one of two files has the other in its defaults list, whose order is meant."""
+    return one.file in other.files or other.file in one.files
+
+
+def _written(defaults: Iterable[Any], files: Any) -> Iterator[Written]:
+    """Yield the values in the files of users, in the order of composition."""
+    defaults = [default for default in defaults if default.config_path is not None]
+    parents = {default.config_path: default.parent for default in defaults}
+    for default in defaults:
+        found = files.load_config(default.config_path)
+        if found is None or found.path.startswith(shipped_places()):
+            continue
+        lists = frozenset(f"{path}.yaml" for path in _ancestors(default, parents))
+        values: Any = OmegaConf.to_container(found.config, resolve=False)
+        for key, value in leaves(values, default.package or ""):
+            if key.partition(".")[0] not in ("hydra", "defaults"):
+                yield Written(key, value, f"{default.config_path}.yaml", lists)
+
+
+def _ancestors(default: Any, parents: Mapping[str, str | None]) -> set[str]:
+    """Return the path of a file and of those whose defaults list leads to it."""
+    paths = {default.config_path}
+    path = default.parent
+    while path is not None and path not in paths:
+        paths.add(path)
+        path = parents.get(path)
+    return paths
+
+
+def leaves(node: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Yield full key and value of everything in nested mappings that is no mapping.
+
+    Args:
+        node: the mapping.
+        name: its own full key; empty for the whole configuration.
+    """
+    if not isinstance(node, Mapping):
+        yield name, node
+        return
+    for key, value in node.items():
+        yield from leaves(value, f"{name}.{key}" if name else str(key))
+
+
+def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConfig:
+    """Return the configuration that `coil-train` composes from the words of its command line.
+
+    Args:
+        words: such as "method=coil" and "+experiment=placebo". YAML files of another package are
+            found with "hydra.searchpath=[pkg://PACKAGE.conf]".
+        with_hydra: whether the configuration has Hydra's own part, such as the folders of a sweep.
+
+    Raises:
+        UserError: for words that do not fit the configuration, with one sentence.
+    """
+    try:
+        with _own_hydra():
+            config = compose("train", list(words), return_hydra_config=with_hydra)
+            task = [word for word in words if not word.startswith("hydra.")]
+            keep_written(config, "train", task, [w for w in words if w not in task])
+            return config
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(sentence(error)) from error
+
+
+@contextmanager
+def _own_hydra() -> Iterator[None]:
+    """Compose files of this package in the block.
+
+    This works inside a program of Hydra with its own files, too.
+    """
+    program = GlobalHydra.instance()
+    outer = program.hydra
+    program.clear()
+    try:
+        with initialize_config_module("coil_rl.conf", version_base="1.3"):
+            yield
+    finally:
+        GlobalHydra.instance().hydra = outer

@@ -1,0 +1,211 @@
+"""The configuration in the folder of a run: written, read without running code, and compared.
+
+The folder may be that of a shipped policy: a finished run that is a part of the package, and is
+opened by its name. Wherever a program takes the folder of a run to read, `pretrained:NAME` names
+one. Its files are checked by their SHA-256 before any of them is read.
+"""
+
+import copy
+import hashlib
+import json
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from coil_rl.config.messages import sentence
+from coil_rl.config.old_names import renamed, with_todays_keys
+from coil_rl.config.schema import IGNORED_KEYS, TrainConfig
+from coil_rl.config.trust import check_config, shipped_logger
+from coil_rl.config.values import complete_measures, is_complete
+from coil_rl.errors import UserError, did_you_mean
+from coil_rl.files import LARGEST_NUMBERS, read_file, read_text
+from coil_rl.plain_yaml import read_yaml
+from coil_rl.run.folder import CONFIG, check_same, is_begun
+
+
+def settings(config: DictConfig) -> dict[str, Any]:
+    """Return what is saved of a configuration: plain values, without references."""
+    saved: Any = OmegaConf.to_container(config, resolve=True)
+    saved.pop("trust", None)  # it holds for one command
+    # Loggers write into `run_dir`, which may be another folder when the run is resumed.
+    saved["logger"] = OmegaConf.to_container(config.logger) if config.logger else None
+    return dict(saved)
+
+
+def read_config(
+    folder: Path,
+    key: str,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    goes_on: bool = False,
+) -> DictConfig:
+    """Return the configuration of the run in a folder.
+
+    The folder may come from anybody; `trust_packages` names packages that it may use.
+
+    Args:
+        folder: of the run.
+        key: of the calling program that names the folder, for the message.
+        changes: new values of top-level keys.
+        goes_on: whether the run may be trained further, so that its logger is needed. A shipped one
+            is taken by its name, see `coil_rl.config.trust`; another one must be trusted as any
+            part, and is left out where the run is only evaluated.
+
+    Raises:
+        UserError: for a configuration that cannot be read, could run code, or is of a run that was
+            made from parts.
+    """
+    path = folder / CONFIG
+    if not (is_begun(folder) and path.is_file()):
+        raise UserError(f"{key}={folder} is not the folder of a run: it has no config.yaml")
+    try:
+        values = read_yaml(path)
+        if values is None:
+            raise UserError(f"{path} is not the configuration of a run (it is empty)")
+        if not isinstance(values, dict):
+            raise UserError(f"{path} is not the configuration of a run, but a list")
+        if values.get("made_from_parts"):
+            raise UserError(
+                f"{key}={folder} was made in Python from parts, which no file names; "
+                "make the same coil_rl.Run there, and call its methods"
+            )
+        logger = shipped_logger(values.get("logger"))
+        if logger is not None or not goes_on:
+            values["logger"] = None
+        saved = OmegaConf.create(renamed(with_todays_keys(values), path))
+        check_config(saved, path)
+        if logger is not None:
+            saved["logger"] = logger
+        for name, value in (changes or {}).items():
+            saved[name] = value
+        config: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), saved)
+        complete_measures(config)
+        OmegaConf.to_container(config, throw_on_missing=True)
+    except (OmegaConfBaseException, yaml.YAMLError, ValueError, OSError) as error:
+        raise UserError(f"{path} is not the configuration of a run ({sentence(error)})") from error
+    return config
+
+
+def holds(folder: Path, config: DictConfig) -> bool:
+    """Return whether a folder holds a run; a `UserError` if that has another configuration."""
+    if not is_begun(folder):
+        return False
+    saved = read_config(folder, "run_dir")
+    remedy = "choose another folder, or remove that one"
+    check_same(identity(saved), identity(config), f"{folder} holds a run", remedy)
+    return True
+
+
+def identity(config: DictConfig) -> dict[str, Any]:
+    """Return the values on which the numbers of a run depend, by their full keys.
+
+    Args:
+        config: composed, or read from a folder; it stays as it is.
+    """
+    measures: Any = OmegaConf.select(config, "evaluation.measures")
+    if not all(is_complete(measures, name) for name in measures or ()):
+        config = copy.deepcopy(config)  # which takes longer than all else here
+        complete_measures(config)
+    values: Any = OmegaConf.to_container(config, resolve=True)
+    if values.get("recording") is None:  # of all envs but one
+        values.pop("recording", None)
+    flat = _flat(values)
+    ignored = set(IGNORED_KEYS)
+    return {
+        key: value
+        for key, value in flat.items()
+        if key not in ignored and key.split(".")[0] not in ignored
+    }
+
+
+def _flat(node: Any, name: str = "") -> dict[str, Any]:
+    """Return the values of nested mappings by their full keys."""
+    if not isinstance(node, Mapping) or not node:
+        return {name: node}
+    result: dict[str, Any] = {}
+    for key, value in node.items():
+        result |= _flat(value, f"{name}.{key}" if name else str(key))
+    return result
+
+
+PREFIX = "pretrained:"
+CHECKSUMS, CARD = "checksums.json", "card.md"
+LARGEST = 200_000  # bytes of a file of a shipped policy
+
+
+def pretrained_names() -> list[str]:
+    """Return the names of the shipped policies."""
+    return sorted(_checksums())
+
+
+def pretrained_card(name: str) -> str:
+    """Return the card of a shipped policy: what it was trained for, and how well it does.
+
+    Args:
+        name: of the policy.
+
+    Raises:
+        UserError: for a name that does not exist, and for files that are not those that were
+            shipped.
+    """
+    return read_text(folder_of(name) / CARD, LARGEST)
+
+
+def run_folder(text: str | Path) -> Path:
+    """Return the folder that a text names: that of a shipped policy for `pretrained:NAME`.
+
+    Args:
+        text: of the user.
+
+    Raises:
+        UserError: for a name that does not exist, and for files that are not those that were
+            shipped.
+    """
+    if str(text).startswith(PREFIX):
+        return folder_of(str(text).removeprefix(PREFIX))
+    return Path(text).expanduser()
+
+
+def folder_of(name: str) -> Path:
+    """Return the folder of a shipped policy, whose files have been checked.
+
+    Args:
+        name: of the policy.
+
+    Raises:
+        UserError: for a name that does not exist, and for files that are not those that were
+            shipped.
+    """
+    known = _checksums()
+    if name not in known:
+        raise UserError(
+            f"{PREFIX}{name} does not exist; there are {', '.join(sorted(known))}"
+            f"{did_you_mean(name, known)}"
+        )
+    folder = _place() / name
+    for file, digest in known[name].items():
+        path = folder / file
+        content = read_file(path, LARGEST) if path.is_file() else b""
+        if hashlib.sha256(content).hexdigest() != digest:
+            raise UserError(
+                f"{path} is not the file that was shipped: its SHA-256 is not {digest}; install "
+                "coil-rl again"
+            )
+    return folder
+
+
+def _place() -> Path:
+    return Path(str(resources.files("coil_rl.policies")))
+
+
+def _checksums() -> Mapping[str, Mapping[str, str]]:
+    """Return the SHA-256 of each file by policy."""
+    found: Mapping[str, Mapping[str, str]] = json.loads(
+        read_text(_place() / CHECKSUMS, LARGEST_NUMBERS)
+    )
+    return found

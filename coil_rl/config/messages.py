@@ -1,0 +1,383 @@
+"""One sentence for an error of the user, of Hydra or of OmegaConf."""
+
+import errno
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+from hydra.errors import (
+    ConfigCompositionException,
+    MissingConfigException,
+    OverrideParseException,
+)
+from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    InterpolationKeyError,
+    OmegaConfBaseException,
+)
+
+from coil_rl import conf
+from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean, is_outside
+from coil_rl.run.folder import is_begun
+
+# Launchers of Hydra, and the extra of the package that installs each.
+LAUNCHERS = {
+    "joblib": "joblib",
+    "submitit_slurm": "slurm",
+    "submitit_local": "slurm",
+    "ray": "ray",
+}
+
+
+TYPED = re.compile(r"Could not override '([^']+)'")
+MERGED = re.compile(r"Error merging override (.+)")
+NO_GROUP = re.compile(r"(?:In '([^']+)': )?Could not override '([\w/]+)'\. No match")
+NO_CHOICE = "Config group override must be a string or a list"
+NO_INTEGER = re.compile(
+    r"override ([\w.]+)=.*Value '([\d.eE+]+)' of type 'float' could not be converted to Integer",
+    re.DOTALL,
+)
+
+
+def is_no_bug(error: BaseException) -> bool:
+    """Return whether an error has a cause outside of the program.
+
+    That is the input, the configuration, an env or controller of somebody else, or the disk.
+    """
+    outside = is_outside(error) or isinstance(error, OmegaConfBaseException)
+    return outside or getattr(error, "errno", None) in (*NO_SPACE, *IN_THE_WAY)
+
+
+def refuse(name: str, error: BaseException) -> NoReturn:
+    """End a program with one sentence and exit code 2.
+
+    Args:
+        name: of the program.
+        error: with a cause outside of it.
+    """
+    print(f"{name}: {sentence(error)}", file=sys.stderr)
+    sys.exit(2)
+
+
+def sentence(error: BaseException) -> str:
+    """Return the message of an error of the user, of Hydra or of OmegaConf on one line."""
+    return " ".join(_message(error).split())
+
+
+def _message(error: BaseException) -> str:
+    """Return the message of an error, which may have several lines."""
+    if isinstance(error, UserError):
+        return str(error)
+    if isinstance(error, MissingConfigException):  # an OSError, too
+        return _unknown_file(error)
+    if isinstance(error, OSError):
+        return _unusable_file(error)
+    # Hydra raises these for a choice of a group that is no text.
+    if isinstance(error, (AssertionError, TypeError)):
+        return (
+            "the command line cannot be composed; give each group a name, GROUP=CHOICE (see --help)"
+        )
+    if str(error).startswith(NO_CHOICE):  # it does not say which group
+        return (
+            "a group takes the name of a file, not null or a number; write GROUP=NAME, "
+            "logger=none, disturb=[] or degrade=[], or leave it out"
+        )
+    if isinstance(error, OverrideParseException):
+        return _unreadable_override(error)
+    return _not_composed(error)
+
+
+def _not_composed(error: BaseException) -> str:
+    """Return the message for keys and values that do not fit the schema."""
+    if isinstance(error, ConfigCompositionException):
+        without_package = file_without_package(str(error))
+        if without_package:
+            return without_package
+    group = NO_GROUP.match(str(error))
+    if group is not None and group[2] in OF_CONES:
+        return _group_of_cones(group[1], group[2])
+    for key_error in (error, error.__cause__):
+        if isinstance(key_error, (ConfigAttributeError, ConfigKeyError)):
+            return _unknown_key(key_error, TYPED.search(str(error)))
+    merged = MERGED.match(str(error))
+    if merged is not None:
+        problem = _wrong_kind(merged[1], f"{error} {error.__cause__}")
+        if problem:
+            return problem
+    if isinstance(error, OmegaConfBaseException) and error.full_key:
+        return _wrong_value(error, error.full_key)
+    if isinstance(error.__cause__, OmegaConfBaseException):
+        return f"{_first_paragraph(error)}: {_first_paragraph(error.__cause__)}"
+    return _first_paragraph(error)
+
+
+def _wrong_kind(override: str, cause: str) -> str:
+    """Return the message for a value of another kind than its key has, or an empty string.
+
+    Args:
+        override: as typed.
+        cause: what OmegaConf says.
+    """
+    key, _, value = override.partition("=")
+    number = NO_INTEGER.search(cause)
+    if number is not None and float(number[2]).is_integer():
+        return (
+            f"{number[1]}={number[2]} must be a whole number; "
+            f"write {number[1]}={int(float(number[2])):_}"
+        )
+    if "could not be converted to Integer" in cause:
+        return f"{override} must be a whole number"
+    if "could not be converted to Float" in cause:
+        return f"{override} must be a number"
+    if "is not a valid bool" in cause or "could not be converted to Boolean" in cause:
+        return f"{override} must be true or false"
+    if "is not a ListConfig" in cause:
+        return f"{override} must be a list; write {key}=[{value}]"
+    if "does not support deletion" in cause:
+        return f"{override}: {key.lstrip('~')} cannot be left out; give it another value"
+    return ""
+
+
+def _group_of_cones(file: str | None, group: str) -> str:
+    """Return the message for a group that only the cone world has, and another env is chosen.
+
+    Args:
+        file: in whose defaults list it is overridden, without its suffix; None: the command line.
+        group: such as "track".
+    """
+    has = f"only the cone world (env=cone_track) has the group {group}"
+    if file is None:
+        return f"{group}= cannot be given for this env: {has}; leave it out"
+    return (
+        f"{file}.yaml overrides /{group}, but {has}: leave env= out, or write in the file, instead "
+        f"of that line, override /env: NAME, of an env file that does it (as "
+        "env/cone_track_unseen.yaml), so that another env replaces it"
+    )
+
+
+def _unreadable_override(error: OverrideParseException) -> str:
+    """Return the message for an argument that is no KEY=VALUE."""
+    if is_begun(Path(error.override)):
+        return f"{error.override!r} is the folder of a run; write run={error.override} (see --help)"
+    return (
+        f"{error.override!r} cannot be parsed; "
+        "write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"
+    )
+
+
+def _unusable_file(error: OSError) -> str:
+    """Return the message for a file that cannot be read or written."""
+    name = error.filename or "the output"
+    if error.errno == errno.ENAMETOOLONG:
+        longest = max(Path(name).parts, key=len)  # the last one may be that of a file in it
+        return f"{longest[:60]}... cannot be used ({error.strerror}); choose a shorter name"
+    if error.errno in IN_THE_WAY:
+        return (
+            f"{name} cannot be used ({error.strerror}); "
+            "put the right file or folder there, with the right to use it"
+        )
+    return (
+        f"{name} cannot be used ({error.strerror}); choose another folder with hydra.run.dir=FOLDER"
+    )
+
+
+def _unknown_file(error: MissingConfigException) -> str:
+    """Return the message for a choice of a group that has no YAML file."""
+    group, _, name = (error.missing_cfg_file or "").rpartition("/")
+    if not group:
+        return _first_paragraph(error)
+    if group == "hydra/launcher" and name in LAUNCHERS:
+        return (
+            f"hydra/launcher={name} is not installed: "
+            f"python -m pip install 'coil-rl[{LAUNCHERS[name]}]'"
+        )
+    options = sorted(error.options or [])
+    if not options:
+        return f"there is no {group}={name}{choice(group, name, options)}"
+    return (
+        f"there is no {group}={name}; "
+        f"{group} can be {', '.join(options)}{choice(group, name, options)}"
+    )
+
+
+def _unknown_key(error: OmegaConfBaseException, typed: re.Match[str] | None) -> str:
+    """Return the message for a key that the configuration does not have.
+
+    `typed` is what was typed, where the key is only its first part.
+    """
+    key, parent = str(error.full_key or error.key), error.parent_node
+    names = parent if isinstance(parent, DictConfig) else []
+    known = [str(name) for name in names if name not in ("hydra", "defaults")]
+    node = key.rpartition(".")[0] or "the configuration"
+    other_file = unchosen(key, typed[1] if typed else key)
+    if other_file:
+        return f"there is no key {key}{other_file}"
+    hint = similar(str(error.key), known)
+    if not hint and parent is not None:
+        hint = where(typed[1] if typed else key, parent._get_root())
+    # The arguments of a part are all in its node.
+    takes_any = parent is not None and OmegaConf.get_type(parent) is dict
+    add = f"; +{key}=VALUE adds it" if takes_any and "_target_" not in names else ""
+    return f"there is no key {key}; {node} has {', '.join(known) or 'none'}{add}{hint}"
+
+
+def _wrong_value(error: OmegaConfBaseException, key: str) -> str:
+    """Return the message for the value of a key that is missing or cannot be used."""
+    if isinstance(error, MissingMandatoryValue):
+        return f"{key} must be given: write {key}=VALUE"
+    if isinstance(error, InterpolationKeyError):
+        missing, group = str(error).split("'")[1], key.partition(".")[0]
+        return (
+            f"{key} refers to {missing}, which does not exist; "
+            f"choose another {group}, or give {key}=VALUE"
+        )
+    return f"{key}: {_first_paragraph(error)}"
+
+
+def _first_paragraph(error: BaseException) -> str:
+    """Return the first paragraph of an error's text, without what only developers can use."""
+    kept = []
+    for line in str(error).partition("\n\n")[0].splitlines():
+        # Indented lines hold OmegaConf's internals.
+        if line.strip() and not line.startswith((" ", "\t", "See http")):
+            kept.append(line.strip())
+    return " ".join(kept) or type(error).__name__
+
+
+OF_CONES = ("track", "preset")  # groups of the cone world
+# Names of hyper-parameters elsewhere (Stable-Baselines3, CleanRL, rsl_rl), and ours.
+OTHER_NAMES = {
+    "lr": "learning_rate",
+    "total_timesteps": "frames",
+    "timesteps": "frames",
+    "n_steps": "steps",
+    "num_steps": "steps",
+    "n_envs": "num_envs",
+    "n_epochs": "epochs",
+    "update_epochs": "epochs",
+    "num_minibatches": "minibatches",
+    "clip_range": "clip",
+    "clip_coef": "clip",
+    "ent_coef": "entropy",
+    "entropy_coef": "entropy",
+    "vf_coef": "critic",
+    "discount": "gamma",
+    "lam": "gae_lambda",
+    "lmbda": "gae_lambda",
+    "net_arch": "hidden",
+    "hidden_sizes": "hidden",
+    "buffer_size": "capacity",
+    "learning_starts": "starts",
+    "env_id": "id",
+}
+SEVERAL = ("guide", "disturb", "degrade")  # groups whose files are nodes by their names
+OF_ENVS = {"env.id": "gym", "env.of": "torchrl", "env.options": "gym", "env.wrappers": "gym"}
+MOST = 2  # places that a hint names
+
+
+def similar(given: str, known: Iterable[str]) -> str:
+    """Return `; did you mean X?` for a name among some known ones, or an empty string.
+
+    Args:
+        given: the unknown name.
+        known: the names that exist.
+    """
+    if given == "run":
+        return "; to go on with a run write resume=FOLDER"
+    known = list(known)
+    other = OTHER_NAMES.get(given)
+    return f"; did you mean {other}?" if other in known else did_you_mean(given, known)
+
+
+def where(key: str, root: Any) -> str:
+    """Return `; did you mean KEY?` for a key that is in another place of the configuration.
+
+    A key that exists is in its place already: only what it is to hold does not fit.
+
+    Args:
+        key: the full key that was typed.
+        root: the whole configuration.
+    """
+    if not isinstance(root, DictConfig):
+        return ""
+    group, _, last = key.rpartition(".")
+    wanted = {last, OTHER_NAMES.get(last, last)}
+    found = [full for full in _keys(root) if full.rpartition(".")[2] in wanted]
+    if key in found:
+        return ""
+    # A key of the group that was typed is more likely than one of another.
+    first = group.partition(".")[0]
+    found.sort(key=lambda full: (full.partition(".")[0] != first, full.count(".")))
+    return f"; did you mean {' or '.join(found[:MOST])}?" if found else ""
+
+
+def _keys(root: DictConfig) -> Iterator[str]:
+    """Yield the full keys of a configuration, but those of Hydra and of proxies."""
+    values: Any = OmegaConf.to_container(root, resolve=False)
+    for key, value in values.items():
+        if key not in ("hydra", "defaults", "proxy", "preset"):
+            yield from _keys_of(str(key), value)
+
+
+def _keys_of(name: str, node: Any) -> Iterator[str]:
+    yield name
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            yield from _keys_of(f"{name}.{key}", value)
+
+
+def unchosen(key: str, typed: str) -> str:
+    """Return `; ...` for the key of a file that exists and was not chosen, or an empty string.
+
+    Args:
+        key: that does not exist, such as "guide.controller".
+        typed: the key that was typed, such as "guide.controller.of".
+    """
+    env = OF_ENVS.get(key)
+    if env is not None:
+        return f"; it belongs to env={env}: write env={env} {typed}=VALUE"
+    group, _, name = key.partition(".")
+    if not re.fullmatch(r"\w+\.\w+", key) or group not in SEVERAL:
+        return ""
+    if not Path(conf.__file__).with_name(group).joinpath(f"{name}.yaml").is_file():
+        return ""
+    chosen = name if group == "guide" else f"[{name}]"
+    return f"; it belongs to {group}={name}: write {group}={chosen} {typed}=VALUE"
+
+
+def choice(group: str, name: str, options: Iterable[str]) -> str:
+    """Return `; ...` with what to write instead of a choice of a group that has no file.
+
+    Args:
+        group: such as "env".
+        name: the choice.
+        options: the names of its files.
+    """
+    if group == "env" and re.search(r":|-v\d+$", name):
+        return f"; for an env of Gymnasium write env=gym env.id={name}"
+    if group == "guide" and ":" in name:
+        return f"; for a controller of your own write guide=controller guide.controller.of={name}"
+    if group.startswith("guide") and (Path(group[6:], name) / "config.yaml").is_file():
+        folder = Path(group[6:], name)
+        return f"; for the policy of a run write guide=learned guide.learned.run={folder}"
+    return similar(name, options)
+
+
+def file_without_package(message: str) -> str:
+    """Return the sentence for a YAML file that lacks its package line, or an empty string.
+
+    Args:
+        message: of Hydra, for a file whose keys do not fit.
+    """
+    found = re.search(r"In '([\w/]+)/([^'/]+)'.*Key '(\w+)' not in '(\w+)'", message, re.DOTALL)
+    if found is None:
+        return ""
+    group, name, key, _ = found.groups()
+    return (
+        f"{group}/{name}.yaml: Hydra puts its keys under {group}, which has no key {key}; begin "
+        "the file with the line # @package _global_"
+    )

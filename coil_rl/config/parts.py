@@ -1,0 +1,399 @@
+"""The parts that a configuration describes: its envs, guides, learner and evaluation."""
+
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import get_object
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase, Transform
+
+from coil_rl.config import given
+from coil_rl.config.nodes import build, build_all, find_target
+from coil_rl.config.own_run import own_run
+from coil_rl.errors import UserError
+from coil_rl.learners.learner import Learner
+from coil_rl.measures import MEAN_CASE, measures_of
+from coil_rl.report import Returns
+from coil_rl.report.pictures import Picture
+from coil_rl.run.evaluation import EvaluationResult
+from coil_rl.run.judge import Evaluation, evaluate_guides
+from coil_rl.run.parts import TEST, TESTS, TRAIN, EnvMaker
+from coil_rl.transforms import GuideActions
+from coil_rl.transforms.action_space import nested_key
+
+
+def build_evaluation(
+    config: DictConfig, record: Mapping[str, NestedKey] | None = None
+) -> Evaluation:
+    """Return the cases and measures of a configuration.
+
+    `record` names entries of every step that are kept.
+
+    Raises:
+        UserError: if the configuration names no cases, or one like the row of their means.
+    """
+    cases = config.evaluation.cases
+    names = build(cases, "evaluation.cases") if isinstance(cases, DictConfig) else cases
+    if isinstance(names, int):
+        names = list(range(names))
+    if not isinstance(names, (list, tuple, ListConfig)) or not names:
+        raise UserError(f"evaluation.cases={cases} must be at least 1, or the names of the cases")
+    titles = list(map(str, names))
+    if MEAN_CASE in titles:
+        raise UserError(
+            f"evaluation.cases: a case cannot be called {MEAN_CASE}, which names the means of all "
+            "cases in evaluation.csv; give it another name"
+        )
+    return Evaluation(titles, measures_of(config.evaluation.measures), record or {})
+
+
+def build_pictures(config: DictConfig) -> list[Picture]:
+    """Return the pictures of a configuration; without any, the returns."""
+    nodes = config.evaluation.pictures.items()
+    pictures = [build(node, f"evaluation.pictures.{name}") for name, node in nodes if node]
+    return pictures or [Returns()]
+
+
+def recorded(pictures: list[Picture]) -> dict[str, NestedKey]:
+    """Return the entries that pictures need, by name."""
+    entries: dict[str, NestedKey] = {}
+    for picture in pictures:
+        entries |= picture.record
+    return entries
+
+
+def advises(config: DictConfig) -> bool:
+    """Return whether a method adds the advice of guides to the env."""
+    return GuideActions in _added(config)
+
+
+def advises_only(config: DictConfig) -> bool:
+    """Return whether all that a method adds to the env of its guides is their advice."""
+    return _added(config) == {GuideActions} and not config.degrade and not config.action
+
+
+def _added(config: DictConfig) -> set[Any]:
+    """Return the classes of the transforms of a method."""
+    return {get_object(node["_target_"]) for node in config.method.transforms.values()}
+
+
+def guide_results(
+    config: DictConfig, evaluation: Evaluation, pictures: Sequence[Picture] = ()
+) -> Mapping[str, EvaluationResult]:
+    """Evaluate each guide of a configuration alone, in the cases of the evaluation.
+
+    The runs of a sweep share the results, unless there are `pictures` that watch the guides, or a
+    part is an object of this process: its name tells nothing about its state.
+    """
+    nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
+    nodes["disturb"] = disturbances(config, TEST)
+    nodes["guide"] = driving_guides(config)
+    if not nodes["guide"]:
+        return {}
+    node = env_node(config, config.evaluation.env)
+    if "cases" in config.evaluation.env:
+        node["cases"] = len(evaluation.cases)  # which may be another number than that of the run
+    text = OmegaConf.to_yaml({"env": node, **nodes})
+    if pictures or given.TARGET in text:
+        return _new_guide_results(text, evaluation, pictures)
+    return dict(_guide_results(text, evaluation))
+
+
+@lru_cache(maxsize=64)
+def _guide_results(nodes: str, evaluation: Evaluation) -> dict[str, EvaluationResult]:
+    return _new_guide_results(nodes, evaluation, [])
+
+
+def _new_guide_results(
+    nodes: str, evaluation: Evaluation, pictures: Sequence[Picture]
+) -> dict[str, EvaluationResult]:
+    config: Any = OmegaConf.create(nodes)
+
+    def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
+        return build_bare_env(config, {"num_envs": rows})
+
+    make_env = EnvMaker(
+        bare,
+        disturb=lambda cases: build_all(config.disturb, "disturb"),
+        degrade=partial(build_all, config.degrade, "degrade"),
+    )
+    return evaluate_guides(make_env, evaluation, build_guides(config), pictures=pictures)
+
+
+def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
+    """Return the maker of the envs of a configuration.
+
+    Args:
+        config: of `coil-train`, composed or read from a folder.
+        folder: of the run, which may have found other numbers for its guide.
+    """
+
+    def transforms(advice: str) -> list[Transform]:
+        own = None if folder is None else own_run(config)
+        found = config if own is None or folder is None else own.found(config, folder)
+        return build_transforms(found, advice)
+
+    def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
+        return build_bare_env(config, cases_node(config, rows, cases, count))
+
+    def of_agent(rows: int | None, cases: str, count: int | None) -> EnvBase:
+        unread = unread_controllers(config, _all_transforms(config))
+        return build_bare_env(config, cases_node(config, rows, cases, count), unread)
+
+    def alone(rows: int | None, cases: str, count: int | None) -> EnvBase:
+        controllers = OmegaConf.select(config, "env.controllers") or ()
+        return build_bare_env(config, cases_node(config, rows, cases, count), set(controllers))
+
+    curve = config.evaluation.curve
+    return EnvMaker(
+        bare,
+        of_agent=of_agent,
+        alone=alone,
+        disturb=partial(build_disturbances, config),
+        transforms=transforms,
+        guides=lambda: build_nodes_of_guides(driving_guides(config)),
+        degrade=partial(build_all, config.degrade, "degrade"),
+        sizes={str(cases): curve.num_envs for cases in curve.cases},
+    )
+
+
+def cases_node(
+    config: DictConfig, rows: int | None, cases: str, count: int | None
+) -> dict[str, Any]:
+    """Return the overrides of `env` for a set of cases.
+
+    Args:
+        config: with `env`, `training` and `evaluation`.
+        rows: number of rows; None for that of the training.
+        cases: name of the set: TRAIN, TESTS, TEST, or one of `evaluation.curve.cases`.
+        count: number of different cases, instead of that of the set.
+    """
+    own = {} if rows is None else {"num_envs": rows}
+    if cases == TRAIN:
+        return {**config.training.env, **own}
+    if cases == TESTS:
+        return {**config.training.env, **config.training.tests, **own}
+    if cases == TEST:
+        number = {} if count is None else {"cases": count}
+        return {**config.evaluation.env, **number, **own}
+    curve = config.evaluation.curve
+    number = {curve.count_key: count or curve.num_envs}
+    return {**curve.env, **number, **curve.cases[cases], **own}
+
+
+def build_bare_env(
+    config: DictConfig,
+    overrides: Mapping[str, Any] | None = None,
+    without: Collection[str] = (),
+) -> EnvBase:
+    """Return the env of a configuration without transforms, and `without` some controllers."""
+    node = env_node(config, overrides)
+    if without:
+        beside = node["controllers"].items()
+        node["controllers"] = {name: thing for name, thing in beside if name not in without}
+    env: EnvBase = build(node, "env", EnvBase)
+    return env
+
+
+def _all_transforms(config: DictConfig) -> list[Transform]:
+    """Return the transforms of all envs of an agent, if there are controllers beside the env."""
+    if not OmegaConf.select(config, "env.controllers"):
+        return []
+    kinds = ("", *config.evaluation.advice)
+    return [part for advice in kinds for part in build_transforms(config, advice)]
+
+
+def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the node `env` with overrides and all references resolved."""
+    overrides = overrides or {}
+    if "_target_" in overrides:  # another env, such as that of the test of a policy
+        return {key: _resolved(value) for key, value in overrides.items()}
+    with open_dict(config):  # `build` checks the keys
+        node = OmegaConf.merge(config.env, dict(overrides))
+        for key, value in overrides.items():
+            # The arguments of another target replace those of the first one.
+            if isinstance(value, (Mapping, DictConfig)) and "_target_" in value:
+                OmegaConf.update(node, key, value, merge=False)
+    return dict(_resolved(node))
+
+
+def _resolved(value: Any) -> Any:
+    """Return a value of a configuration with all references resolved."""
+    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+
+
+def build_disturbances(config: DictConfig, cases: str) -> list[Transform]:
+    """Return the transforms that disturb the env of a configuration in a set of cases."""
+    return build_all(disturbances(config, cases), "disturb")
+
+
+def disturbances(config: DictConfig, cases: str) -> dict[str, Any]:
+    """Return the nodes of the delays and noise of the env in a set of cases, by name.
+
+    They are `disturb` with the overrides of the training or of the evaluation; null leaves one out.
+    """
+    part = config.training if cases in (TRAIN, TESTS) else config.evaluation
+    with open_dict(config):  # `build` checks the keys
+        merged = OmegaConf.merge(config.disturb, part.disturb)
+    nodes: Any = OmegaConf.to_container(merged, resolve=True)
+    return {name: node for name, node in nodes.items() if node is not None}
+
+
+def build_transforms(config: DictConfig, advice: str = "") -> list[Transform]:
+    """Return the transforms of an env.
+
+    They are those of the method, `degrade` if they have advice, `advice`, `action` and network.
+    """
+    transforms = build_all(config.method.transforms, "method.transforms")
+    if any(isinstance(part, GuideActions) for part in transforms):
+        transforms += build_all(config.degrade, "degrade")
+    if advice:
+        node = config.evaluation.advice[advice]
+        transforms.append(build(node, f"evaluation.advice.{advice}", Transform))
+    if config.action:
+        transforms.append(build(config.action, "action", Transform))
+    network = OmegaConf.select(config, "learner.network")
+    if network:  # one with a memory needs an env that carries it
+        transforms += getattr(build(network, "learner.network"), "env_transforms", list)()
+    return transforms
+
+
+def build_learner(
+    config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None
+) -> Learner:
+    """Return the learner of a configuration for an env.
+
+    It observes the entries `observes` and `method.observes`.
+
+    `guides` are for a learner that trains guides.
+    """
+    arguments: dict[str, Any] = {"guides": dict(guides or {})} if trains_guides(config) else {}
+    keys = observed_keys(config)
+    learner: Learner = build(config.learner, "learner", Learner, env=env, in_keys=keys, **arguments)
+    return learner
+
+
+def observed_keys(config: DictConfig) -> list[NestedKey]:
+    """Return the keys of the entries that the agent of a configuration observes."""
+    return [nested_key(key) for key in (*config.observes, *(config.method.observes or ()))]
+
+
+def learner_kind(config: DictConfig) -> str:
+    """Return the attribute `kind` of the learner class: `agent`, `imitation` or `guides`.
+
+    It is `none` for a method that has no learner.
+    """
+    if config.method.learner == "none":
+        return "none"
+    target = find_target(config.learner.get("_target_"), "learner")
+    if isinstance(target, type) and issubclass(target, Learner):
+        return target.kind
+    return "agent"
+
+
+def trains_guides(config: DictConfig) -> bool:
+    """Return whether the learner of a configuration trains guides besides the agent."""
+    return config.method.observes is not None and learner_kind(config) == "guides"
+
+
+def what_guides_see(config: DictConfig) -> dict[str, str]:
+    """Return by name the attribute `sees` of the guides that may know more than an agent."""
+    seen = {}
+    for name, node in config.guide.items():
+        sees = getattr(find_target(node.get("_target_"), name), "sees", "")
+        if sees:
+            seen[str(name)] = sees
+    return seen
+
+
+def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:
+    """Return the guides of a configuration by name.
+
+    Errors are those of `build`, also for no guide, or one without a name.
+    """
+    if "_target_" in config.guide:
+        raise UserError(
+            "guide: a guide needs a name, because there may be several: begin its file with "
+            "# @package guide.NAME, or give +guide.NAME._target_"
+        )
+    if not config.guide:
+        raise UserError(
+            f"guide: there is none, but method={config.method.name} needs one; give guide=NAME, or "
+            "method=ppo"
+        )
+    return build_nodes_of_guides(config.guide)
+
+
+def build_nodes_of_guides(nodes: Mapping[str, Any]) -> dict[str, TensorDictModuleBase]:
+    """Return guides by name."""
+    guides = {}
+    for name, node in nodes.items():
+        guides[str(name)] = build(node, f"guide.{name}", TensorDictModuleBase)
+    return guides
+
+
+def demonstrations(config: DictConfig) -> list[str]:
+    """Return the names of the guides that demonstrate: what they do was recorded.
+
+    They have the attribute `demonstrates`, and no advice in the env in which a policy is tested.
+    """
+    names = []
+    for name, node in config.guide.items():
+        if getattr(find_target(node.get("_target_"), f"guide.{name}"), "demonstrates", False):
+            names.append(str(name))
+    return names
+
+
+def driving_guides(config: DictConfig) -> dict[str, Any]:
+    """Return the nodes of the guides that can drive, by name."""
+    if "_target_" in config.guide:  # `build_guides` says what is wrong
+        return {}
+    nodes: Any = OmegaConf.to_container(config.guide, resolve=True)
+    left_out = demonstrations(config)
+    return {name: node for name, node in nodes.items() if name not in left_out}
+
+
+# Parts of a configuration that name entries of the env of a method; its guides are parts of
+# `method.transforms`.
+READERS = ("observes", "method", "watch", "learner", "degrade", "action", "evaluation")
+
+
+def unread_controllers(config: DictConfig, transforms: Iterable[Transform]) -> set[str]:
+    """Return the names of the controllers beside an env that its agent does without.
+
+    They are those that neither a transform reads nor any part of the configuration names: the
+    observation, the method, what is logged, measures and pictures.
+
+    Args:
+        config: of a run.
+        transforms: of the env.
+    """
+    names = set(OmegaConf.select(config, "env.controllers") or ())
+    keys = [key for part in transforms for key in (part.in_keys or ())]
+    named = set(_texts(keys))
+    for reader in READERS:
+        node = OmegaConf.select(config, reader)
+        named |= set(_texts(OmegaConf.to_container(node) if OmegaConf.is_config(node) else node))
+    return {name for name in names if not any(_mentions(text, name) for text in named)}
+
+
+def _mentions(text: str, name: str) -> bool:
+    """Return whether a text has a name as a whole word."""
+    return re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) is not None
+
+
+def _texts(node: Any) -> Iterator[str]:
+    """Yield the texts in nested lists and mappings, but not the keys of mappings."""
+    if isinstance(node, str):
+        yield node
+    elif isinstance(node, dict):
+        for value in node.values():
+            yield from _texts(value)
+    elif isinstance(node, (list, tuple)):
+        for value in node:
+            yield from _texts(value)

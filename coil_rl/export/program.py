@@ -1,0 +1,76 @@
+"""`coil-export`: write the policy of a run as ONNX and torch.export, with its contract."""
+
+from __future__ import annotations
+
+import shlex
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from coil_rl.programs import app
+
+
+def export(config: DictConfig) -> None:
+    """Export the policy of a run, and print what to type next."""
+    import torch
+
+    from coil_rl.config.python import open_run
+    from coil_rl.export import export_policy
+
+    torch.set_num_threads(config.threads)
+    meanings: Any = OmegaConf.to_container(config.meanings, resolve=True)
+    exported = export_policy(
+        open_run(config.run, device=config.device),
+        config.run_dir,
+        which=config.policy,
+        observations=config.observations,
+        seed=config.seed,
+        meanings=meanings,
+    )
+    guide = exported.contract["guide"]["place"]
+    size = exported.contract["files"][exported.file.name]["bytes"] / 1000
+    print(f"export: {exported.file} has {size:.0f} kB; guide {guide}; see {config.run_dir}")
+    print(f"Next: {next_step(str(config.run), str(config.run_dir), guide)}")
+
+
+def next_step(run: str, folder: str, guide: str) -> str:
+    """Return what to type after an export.
+
+    Args:
+        run: that was exported.
+        folder: of the files.
+        guide: its place, "inside", "outside" or "absent".
+    """
+    if guide == "outside":
+        return f"coil_rl.ExportedPolicy({folder!r}).act(observation, guide_action) in Python"
+    return f"coil-evaluate run={shlex.quote(run)} exported={shlex.quote(folder)}"
+
+
+def check(config: DictConfig) -> None:
+    """Raise a `UserError` for the first mistake in the configuration.
+
+    Otherwise make the folder of the results.
+    """
+    from coil_rl.config.check import make_folder
+    from coil_rl.config.values import check_values
+    from coil_rl.envs.meanings import meaning
+    from coil_rl.errors import UserError
+    from coil_rl.extras import require
+
+    check_values(config)
+    require("an exported policy", "export", "onnx", "onnxscript", "onnxruntime")
+    values: Any = OmegaConf.to_container(config.meanings, resolve=True)
+    try:
+        for name, value in values.items():
+            meaning(str(name), value)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    make_folder(Path(config.run_dir))
+
+
+main = partial(app.run_program, export, "export", check)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,134 @@
+"""Plants side by side, in one process or in several."""
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coil_rl.foreign.codec import Codec
+from coil_rl.foreign.plant import GymnasiumPlant, Plant
+
+Entries = dict[str | tuple[str, ...], NDArray[Any]]
+AnyPlant = TypeVar("AnyPlant", bound=Plant)
+
+
+class Shard(Protocol):
+    """The rows of one process, or of several."""
+
+    def begin(
+        self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]
+    ) -> list[Entries]:
+        """Begin episodes, take some actions in each, and return the entries of each process.
+
+        Args:
+            seeds: by row.
+            actions: by row, as the env takes them; a row that is missing takes none.
+        """
+
+    def step(self, actions: Any) -> list[Entries]:
+        """Take a step in all rows, and return the entries of each process.
+
+        Args:
+            actions: of all rows, as the env takes them.
+        """
+
+
+class Rows(Generic[AnyPlant]):
+    """Plants that are stepped one after the other in one process.
+
+    Args:
+        plants: one a row.
+    """
+
+    def __init__(self, plants: Iterable[AnyPlant] = ()) -> None:
+        self.plants = list(plants)
+
+    def begin(
+        self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]
+    ) -> list[Entries]:
+        """Begin episodes, see `Shard`."""
+        for row, seed in seeds.items():
+            self.plants[row].begin(seed)
+            for action in actions.get(row, ()):
+                self.plants[row].step(action)
+        return [self.entries()]
+
+    def step(self, actions: Any) -> list[Entries]:
+        """Take a step in all rows, see `Shard`."""
+        for plant, action in zip(self.plants, actions, strict=True):
+            plant.step(action)
+        return [self.entries()]
+
+    def entries(self) -> Entries:
+        """Return the entries of all rows, [rows, ...], if they are arrays."""
+        return {}
+
+
+class GymnasiumRows(Rows[GymnasiumPlant]):
+    """Gymnasium envs that are stepped one after the other in one process.
+
+    Args:
+        codec: of their spaces.
+        info: names of numbers in Gymnasium's info.
+    """
+
+    def __init__(self, codec: Codec, info: Sequence[str]) -> None:
+        super().__init__()
+        self.codec, self.info, self.unseen = codec, tuple(info), set(info)
+
+    def extend(self, plants: Iterable[GymnasiumPlant]) -> "GymnasiumRows":
+        """Take further plants, and return all; a `ValueError` for one with other spaces."""
+        for plant in plants:
+            self.codec.check_same(plant.env, plant.row)
+            plant.codec = self.codec
+            self.plants.append(plant)
+        return self
+
+    def entries(self) -> Entries:
+        """Return the entries of all rows, [rows, ...], and their rewards."""
+        plants, floats = self.plants, self.codec.floats
+        terminated = np.array([[plant.terminated] for plant in plants])
+        truncated = np.array([[plant.truncated] for plant in plants])
+        found: Entries = {
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+            "reward": np.array([[plant.reward] for plant in plants], dtype=floats),
+        }
+        for index, entry in enumerate(self.codec.entries):
+            joined = np.concatenate([plant.values[index] for plant in plants])
+            key = entry.key if len(entry.key) > 1 else entry.key[0]
+            found[key] = joined.reshape(len(plants), *entry.given)
+        if self.unseen:
+            self._look_for_info()
+        for name in self.info:
+            numbers = np.array([plant.number_of(name) for plant in plants], dtype=floats)
+            found["info", name] = numbers.reshape(-1, 1)
+        for name in plants[0].controllers:
+            found["controller", name] = np.array([plant.advice[name] for plant in plants])
+        return found
+
+    def _look_for_info(self) -> None:
+        """Warn of a name that no info has had when the first episode is over."""
+        self.unseen.difference_update(*(plant.info for plant in self.plants))
+        if self.unseen and any(plant.terminated or plant.truncated for plant in self.plants):
+            missing = ", ".join(sorted(self.unseen))
+            known = sorted({str(name) for plant in self.plants for name in plant.info})
+            warnings.warn(
+                f"the env {self.codec.name} had no {missing} in the info of an episode, so it is "
+                "NaN there, a number without a value; at its end info has "
+                f"{', '.join(known) or 'nothing'}",
+                stacklevel=2,
+            )
+            self.unseen.clear()
+
+    def picture(self, row: int) -> NDArray[np.uint8]:
+        """Return a picture of a row."""
+        return self.plants[row].render()
+
+    def close(self) -> None:
+        """Close all envs."""
+        for plant in self.plants:
+            plant.close()

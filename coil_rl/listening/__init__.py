@@ -1,8 +1,0 @@
-"""Analysis of how much a trained agent uses the advice of each guide, and where."""
-
-from coil_rl.listening.sections import LEFT as LEFT
-from coil_rl.listening.sections import RIGHT as RIGHT
-from coil_rl.listening.sections import TrackSections as TrackSections
-from coil_rl.listening.sections import WholeEpisode as WholeEpisode
-from coil_rl.listening.sections import classify as classify
-from coil_rl.listening.sections import smooth_line as smooth_line

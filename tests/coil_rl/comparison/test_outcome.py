@@ -1,0 +1,24 @@
+"""The results of a comparison: what a table says beside the returns."""
+
+import json
+
+from coil_rl.comparison.outcome import tuned_numbers
+from coil_rl.report.runs import Run
+from coil_rl.tune.run import TUNED
+
+
+def run_with(folder, seed, **numbers):
+    place = folder / f"tune_seed{seed}"
+    place.mkdir()
+    if numbers:
+        (place / TUNED.name).write_text(json.dumps(numbers))
+    return Run(place, "tune", seed, needs_guide=True, settings={})
+
+
+def test_tuned_numbers_are_said_for_each_seed(tmp_path):
+    runs = [run_with(tmp_path, 0, kp=74.26, ki=0.35), run_with(tmp_path, 1, kp=78.2, ki=0.0987)]
+    assert tuned_numbers(runs) == "kp 74.3 / 78.2, ki 0.35 / 0.0987"
+
+
+def test_runs_that_tune_nothing_have_no_numbers(tmp_path):
+    assert tuned_numbers([run_with(tmp_path, 0), run_with(tmp_path, 1)]) == ""

@@ -1,0 +1,63 @@
+"""The page of a comparison: its sentences, and the command to go on with."""
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coil_rl.comparison.entry import Entry
+from coil_rl.comparison.page import command_of, delayed_sentence, few_cases
+from coil_rl.comparison.verdict import Verdict
+from coil_rl.config.compose import compose_train
+from coil_rl.config.python import Named
+from coil_rl.report.runs import Run
+
+
+def entry(mean):
+    return Entry("guide", mean + np.linspace(-1, 1, 5)[None])
+
+
+def test_delay_says_what_is_kept_of_the_distance_from_random_actions():
+    said = delayed_sentence(entry(100.0), entry(75.0), entry(0.0))
+    assert said.endswith("it keeps 75% of its distance from random actions.")
+
+
+@pytest.mark.parametrize("own", [-382.0, -200.0])
+def test_delay_says_nothing_of_a_distance_that_there_is_not(own):
+    said = delayed_sentence(entry(own), entry(-400.0), entry(-200.0))
+    assert "keeps" not in said
+    assert said.endswith(").")
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        f"+env.options.mode={value}"
+        for value in ("'null'", "'3'", "'1e3'", "'true'", "'inf'", "'a'", "'a b'", "'a:b'", "null")
+    ],
+)
+def test_printed_command_has_the_values_of_the_comparison(word):
+    words = ["env=gym", "env.id='Pendulum-v1'", word]
+    command = command_of(Named(words, {}), Verdict("ppo", "ppo", 1.0, False))
+    program, *printed = shlex.split(command)
+    assert (program, printed[1]) == ("coil-train", "env.id=Pendulum-v1")
+    place = ["method=ppo", "run_dir=unused"]
+    expected = compose_train([*words, *place]).env.options.mode
+    found = compose_train([*printed, "run_dir=unused"]).env.options.mode
+    assert (type(found), found) == (type(expected), expected)
+
+
+def anchored(seed, **first):
+    curve = ({"frames": 400.0} | {f"start/{name}": value for name, value in first.items()},)
+    return Run(Path("run"), "coil_anchored", seed, needs_guide=True, settings={}, curve=curve)
+
+
+def test_start_test_of_few_cases_that_held_no_guide_is_said():
+    weak = anchored(0, cases=2.0, weight=0.0)
+    strong = anchored(1, cases=2.0, weight=1.0), anchored(2, cases=4.0, weight=0.0), anchored(3)
+    assert few_cases(strong) == few_cases(()) == ""
+    sentence = few_cases((*strong, weak))
+    assert (
+        "had only 2 cases in the frames of a training here, and held none in 1 of 4 s" in sentence
+    )

@@ -1,0 +1,284 @@
+"""`coil-compare` and `coil_rl.compare`: a pendulum, in the smallest trainings there are."""
+
+import csv
+import json
+import shlex
+import sys
+import time
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from programs import called
+
+import coil_rl
+from coil_rl.comparison import jobs, timing
+from coil_rl.report.runs import read_runs
+from coil_rl.run.folder import locked
+
+pytest.importorskip("gymnasium.envs.classic_control")
+SMALL = ["env.max_steps=20", "budget={frames: 2000, num_envs: 2, steps: 16, minibatches: 2}"]
+SMALL += ["evaluation.cases=3", "evaluation.curve.num_envs=2", "evaluation.curve.points=2"]
+PENDULUM = ["env=pendulum", *SMALL, "minutes=0.01"]
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compare") / "a b,c=[d]{\u00e9}"
+    done = called("compare", *PENDULUM, "tune={gain: [0.1, 10, log]}", f"folder={folder}")
+    return folder, done
+
+
+def test_table_has_everything_that_acts(compared):
+    folder, _ = compared
+    rows = {row["policy"]: row for row in rows_of(folder / "compare.csv")}
+    without = ["guide", "opposite", "zero", "random", "first network"]
+    learned = ["tune", "ppo", "coil_anchored", "residual"]
+    assert [name for name in rows if name != "sac"] == [*without, *learned]
+    assert all(rows[name]["seeds"] == "2" for name in learned)
+    assert all(float(rows[name]["frames"]) == 0 for name in without)
+    assert [float(rows[name]["frames"]) for name in ("ppo", "residual")] == [128, 128]
+    assert float(rows["ppo"]["calls"]) == 0 < float(rows["residual"]["calls"])
+    assert float(rows["guide"]["worst"]) <= float(rows["guide"]["return"])
+
+
+def test_it_says_before_what_it_runs_and_how_to_go_on(compared):
+    folder, done = compared
+    assert "trainings of 128 frames each" in done.stderr
+    assert "go on with: coil-compare env=pendulum" in done.stderr
+    assert "minutes=0.01 is not enough" in done.stderr
+    assert shlex.quote(f"folder={folder}") in done.stderr
+
+
+def test_verdict_is_a_file_for_programs(compared):
+    folder, _ = compared
+    found = json.loads((folder / "verdict.json").read_text())
+    assert found["sentences"] == [
+        line[3:] for line in (folder / "compare.md").read_text().splitlines()[:3]
+    ]
+    assert found["use"] in {row["policy"] for row in rows_of(folder / "compare.csv")} | {"nothing"}
+    assert found["command"].startswith("coil-train env=pendulum")
+
+
+def test_page_has_three_sentences_and_a_command_that_composes(compared):
+    folder, done = compared
+    page = (folder / "compare.md").read_text()
+    assert page in done.stdout
+    assert [line[:3] for line in page.splitlines()[:3]] == ["1. ", "2. ", "3. "]
+    assert "one step of delay on observation and action" in page or "random actions" in page
+    program, *words = shlex.split(page.splitlines()[-1].partition(": ")[2])
+    assert program == "coil-train"
+    assert coil_rl.compose_train([*words, "run_dir=unused"]).env.id == "Pendulum-v1"
+
+
+def test_folder_is_one_for_reports_by_the_printed_command(compared):
+    folder, done = compared
+    assert (folder / "compare.png").stat().st_size > 10_000
+    labels = {run.label for run in read_runs([folder]) if run.finished}
+    assert {"tune", "ppo", "coil_anchored", "residual"} <= labels
+    program, *words = shlex.split(done.stdout.rpartition("; ")[2].removesuffix(" has more.\n"))
+    assert program == "coil-report"
+    page = called("report", *words, cwd=folder.parent).stdout
+    assert "coil_anchored" in page
+
+
+def test_same_command_goes_on_without_repeating_anything(compared, monkeypatch):
+    folder, _ = compared
+    before = (folder / "compare.csv").read_text()
+    (folder / "compare.csv").unlink()
+    monkeypatch.setattr(coil_rl.Run, "train", None)
+    done = called("compare", *PENDULUM, "tune={gain: [0.1, 10, log]}", f"folder={folder}")
+    assert (folder / "compare.csv").read_text() == before
+    assert "goes on" in done.stderr
+
+
+def test_other_arguments_in_the_same_folder_are_refused(compared):
+    folder, _ = compared
+    tune = "tune={gain: [0.1, 10, log]}"
+    words = [*PENDULUM[:-1], "minutes=3", tune, f"folder={folder}"]
+    assert "a comparison with minutes=0.01, not 3" in called("compare", *words, code=2).stderr
+    words = [*PENDULUM, "env.fresh=true", tune, f"folder={folder}"]
+    assert "a comparison with words=" in called("compare", *words, code=2).stderr
+
+
+@pytest.mark.slow
+def test_comparison_that_was_stopped_ends_with_the_same_table(compared, tmp_path, monkeypatch):
+    folder, _ = compared
+    job = jobs._run_job
+    done = []
+
+    def stopped(*given):
+        if len(done) == 3:
+            raise KeyboardInterrupt
+        done.append(given)
+        return job(*given)
+
+    monkeypatch.setattr(jobs, "_run_job", stopped)
+    words = [*PENDULUM, "tune={gain: [0.1, 10, log]}", f"folder={tmp_path / 'it'}"]
+    assert "continue with: coil-compare" in called("compare", *words, code=130).stderr
+    monkeypatch.undo()
+    called("compare", *words)
+    first, second = (rows_of(each / "compare.csv") for each in (folder, tmp_path / "it"))
+    same = ("policy", "return", "worst", "frames", "calls")
+    assert [[row[key] for key in same] for row in first if row["policy"] != "sac"] == [
+        [row[key] for key in same] for row in second if row["policy"] != "sac"
+    ]
+
+
+class Lean:
+    """Pushes to the side to which the pole leans, and takes 1 ms for it."""
+
+    def act(self, observation):
+        time.sleep(0.001)
+        return int(observation[2] > 0)
+
+
+class TwoEntries(gymnasium.Env):
+    """A point goes to a goal; both are entries of a dictionary."""
+
+    observation_space = spaces.Dict(
+        {"place": spaces.Box(-2, 2, (1,)), "goal": spaces.Box(-1, 1, (1,))}
+    )
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps, self.place = 0, np.zeros(1, np.float32)
+        self.goal = self.np_random.uniform(-1, 1, 1).astype(np.float32)
+        return self._seen(), {}
+
+    def step(self, action):
+        self.steps += 1
+        self.place = np.clip(self.place + 0.3 * action, -2, 2).astype(np.float32)
+        reward = -float(abs(self.place - self.goal)[0])
+        return self._seen(), reward, False, self.steps >= 15, {}
+
+    def _seen(self):
+        return {"place": self.place, "goal": self.goal}
+
+
+class Away:
+    """Goes away from the goal: a guide that is the wrong way round."""
+
+    def act(self, place, goal):
+        return np.clip(2 * (place - goal), -1, 1)
+
+
+@pytest.mark.slow
+def test_choices_have_no_residual_and_a_python_object_is_a_guide(tmp_path):
+    found = coil_rl.compare(
+        "CartPole-v1", guide=Lean(), minutes=0.01, folder=tmp_path / "it", overrides=SMALL
+    )
+    assert {"ppo", "coil_anchored"} <= set(found.table["policy"])
+    assert not {"residual", "sac"} & set(found.table["policy"])
+    assert found.command == "" or found.command.startswith("coil_rl.train(env, guide=guide, ")
+
+
+@pytest.mark.slow
+def test_dictionary_and_a_reversed_guide(tmp_path):
+    found = coil_rl.compare(
+        TwoEntries,
+        guide=Away,
+        minutes=0.01,
+        folder=tmp_path / "it",
+        overrides=[
+            *SMALL[:2],
+            "evaluation.cases=10",
+            "observes=[place,goal]",
+            "guide.controller.in_keys=[place,goal]",
+        ],
+    )
+    assert found.verdict.wrong_way_round
+    assert "wrong way round" in found.page
+    assert found.verdict.score < 0
+
+
+class Fragile:
+    """A controller that fails at the hundredth observation of its process."""
+
+    asked = 0
+
+    def act(self, observation):
+        Fragile.asked += 1
+        if Fragile.asked > 2500:
+            raise RuntimeError("no more")
+        return [0.0]
+
+
+@pytest.mark.slow
+def test_failed_training_is_one_failed_training(tmp_path):
+    Fragile.asked = 0
+    words = [f"guide.controller.of={__name__}:Fragile", "guide=controller"]
+    words += ["env=gym", "env.id=Pendulum-v1", *SMALL, "minutes=0.01", f"folder={tmp_path / 'it'}"]
+    sys.path.insert(0, "tests/coil_rl/programs")
+    done = called("compare", *words)
+    rows = {row["policy"]: row for row in rows_of(tmp_path / "it" / "compare.csv")}
+    assert rows["ppo"]["seeds"] == "2"
+    assert "no more" in done.stderr
+    assert "failed: " in rows["residual"]["note"] or "failed: " in rows["coil_anchored"]["note"]
+    assert "no more" in (tmp_path / "it" / "failed_jobs.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["env=pendulum", "guide=none"], "a comparison is about one guide, but there is none"),
+        (["env=pendulum", "guide=[zero,random]"], "but there is zero, random"),
+        (["env=pendulum", "method=ppo"], "method=ppo cannot be given to coil-compare"),
+        (["env=pendulum", "learner=sac"], "learner=sac cannot be given to coil-compare"),
+        (["env=pendulum", "-m"], "-m is no argument of coil-compare"),
+        (["env=pendulum", "--config-dir", "nowhere"], "nowhere is no folder"),
+        (["env=pendulum", "minutes=soon"], "minutes=soon must be a number"),
+        (["env=pendulum", "minutes=0"], "minutes=0 must be above 0"),
+        (["env=pendulum", "minutes"], "minutes: give minutes=VALUE"),
+        (["env=pendulum", "seed=1.5"], "seed=1.5 must be a whole number"),
+        (["env=pendulum", "guide=swing_upp"], "swing_upp"),
+        (["env=pendulum", "learner.gama=1"], "learner.gama"),
+        (["env=pendulum", "tune={gian: [0, 1]}"], "tune.gian is no number of the guide"),
+        (["env=pendulum", "tune={gain: ["], "tune="),
+        (["env=pendulum", "proxy.seed=3"], "proxy.seed=3 has no effect: method=coil_anchored"),
+        (["env=pendulum", "recording=a.mcap"], "nothing in this run reads recording; leave it out"),
+        (["env=cart_pole", "training.noise_correlation=0.5"], "the actions of this env are choic"),
+    ],
+)
+def test_mistake_is_one_sentence_and_writes_nothing(words, sentence, tmp_path):
+    done = called("compare", *words, f"folder={tmp_path / 'it'}", cwd=tmp_path, code=2)
+    assert sentence in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "it").exists()
+
+
+def test_second_process_is_refused_and_leaves_the_folder_of_the_first_one(tmp_path):
+    folder = tmp_path / "it"
+    with locked(folder):
+        done = called("compare", *PENDULUM, f"folder={folder}", code=2)
+        assert "another process is running in" in done.stderr
+        assert (folder / ".lock").exists()
+
+
+def test_comparison_that_wrote_nothing_removes_what_it_made_only(tmp_path, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(timing, "measure", stopped)
+    (tmp_path / "empty").mkdir()
+    for name in ("empty", "new/it"):
+        called("compare", *PENDULUM, f"folder={tmp_path / name}", code=130)
+    assert list(tmp_path.rglob("*")) == [tmp_path / "empty"]
+
+
+def test_folder_that_is_a_file_is_said_to_be_one(tmp_path):
+    (tmp_path / "it").write_text("mine")
+    done = called("compare", *PENDULUM, f"folder={tmp_path / 'it'}", code=2)
+    assert f"folder={tmp_path / 'it'} is a file; give a folder" in done.stderr
+    assert (tmp_path / "it").read_text() == "mine"
+
+
+def test_help_is_printed():
+    assert "is my guide worth it?" in called("compare", "--help").stdout

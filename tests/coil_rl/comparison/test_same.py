@@ -1,0 +1,86 @@
+"""A folder goes on with the same comparison only."""
+
+import importlib
+import json
+import shutil
+import sys
+
+import pytest
+
+from coil_rl.comparison.same import identity_of, keep_plan, known_plan
+from coil_rl.comparison.timing import Plan
+from coil_rl.config.python import Named, composed, named
+from coil_rl.errors import UserError
+
+PLAN = Plan(frames=128, cases=5, arms=["ppo"], seeds=2, seconds=1.0)
+
+
+class Local:
+    """A controller with a gain."""
+
+    def __init__(self, gain):
+        self.gain = gain
+
+    def act(self, observation):
+        return self.gain * observation[:1]
+
+
+def identity(folder, *words, guide="swing_up", env="pendulum"):
+    given = named(env, guide, str(folder))
+    given = Named([*given.words, *words], given.nodes)
+    config = composed(Named([*given.words, "method=ppo"], given.nodes), folder / "ppo")
+    return identity_of(given, config, 2.0, 0)
+
+
+def test_same_object_goes_on_in_a_folder_that_was_moved(tmp_path):
+    keep_plan(tmp_path / "plan.json", identity(tmp_path / "one", guide=Local(1.0)), PLAN)
+    assert known_plan(tmp_path / "plan.json", identity(tmp_path / "two", guide=Local(1.0))) == PLAN
+
+
+def test_other_object_is_refused(tmp_path):
+    keep_plan(tmp_path / "plan.json", identity(tmp_path, guide=Local(1.0)), PLAN)
+    other = identity(tmp_path, guide=Local(-1.0))
+    with pytest.raises(UserError, match=r"a comparison with guide\.controller\.of=.*Local \(state"):
+        known_plan(tmp_path / "plan.json", other)
+
+
+def test_changed_file_of_the_user_is_refused_by_the_value_that_differs(tmp_path):
+    file = tmp_path / "conf" / "experiment" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    words = [f"hydra.searchpath=['file://{tmp_path / 'conf'}']", "+experiment=mine"]
+    file.write_text("# @package _global_\nlearner: {gamma: 0.9}\nenv: {workers: 1}\n")
+    keep_plan(tmp_path / "plan.json", identity(tmp_path, *words), PLAN)
+    file.write_text("# @package _global_\nlearner: {gamma: 0.9}\nenv: {workers: 2}\n")
+    assert known_plan(tmp_path / "plan.json", identity(tmp_path, *words)) == PLAN
+    file.write_text("# @package _global_\nlearner: {gamma: 0.8}\nenv: {workers: 2}\n")
+    with pytest.raises(UserError, match=r"learner\.gamma=0\.9, not 0\.8; give the same arguments"):
+        known_plan(tmp_path / "plan.json", identity(tmp_path, *words))
+
+
+def test_changed_code_of_a_controller_that_is_named_is_refused(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    text = "class Rule:\n    def act(self, observation):\n        return {} * observation[:1]\n"
+    plan = tmp_path / "plan.json"
+
+    def written(gain):
+        sys.modules.pop("rule_of_mine", None)
+        shutil.rmtree(tmp_path / "__pycache__", ignore_errors=True)
+        (tmp_path / "rule_of_mine.py").write_text(text.format(gain))
+        importlib.invalidate_caches()
+        return identity(tmp_path, guide="rule_of_mine:Rule")
+
+    keep_plan(plan, written(1.0), PLAN)
+    assert known_plan(plan, written(1.0)) == PLAN
+    with pytest.raises(UserError, match="holds a comparison with code of env and guide="):
+        known_plan(plan, written(2.0))
+    monkeypatch.delitem(sys.modules, "rule_of_mine")
+
+
+def test_plan_without_a_configuration_is_said_to_be_damaged(tmp_path):
+    known = identity(tmp_path)
+    keep_plan(tmp_path / "plan.json", known, PLAN)
+    saved = json.loads((tmp_path / "plan.json").read_text())
+    del saved["configuration"]
+    (tmp_path / "plan.json").write_text(json.dumps(saved))
+    with pytest.raises(UserError, match="it lacks configuration"):
+        known_plan(tmp_path / "plan.json", known)

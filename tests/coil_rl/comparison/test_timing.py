@@ -1,0 +1,48 @@
+"""How many frames a comparison gives to each training, from measured times."""
+
+import pytest
+from omegaconf import OmegaConf
+
+from coil_rl.comparison.arms import ANCHORED, ARMS, PPO
+from coil_rl.comparison.timing import LEAST_BATCHES, Pace, plan
+
+BATCH = 8 * 256
+CONFIG = OmegaConf.create(
+    {
+        "budget": {"frames": 1_000_000, "num_envs": 8, "steps": 256},
+        "evaluation": {"cases": 20, "curve": {"num_envs": 20, "count_key": "cases"}},
+    }
+)
+ARMS_HERE = [ARMS[PPO], ARMS[ANCHORED]]
+
+
+def planned(minutes, guide=0.0, step=1e-4, config=CONFIG):
+    return plan(config, Pace(step, guide, 2 * step, 200, 1.0), ARMS_HERE, minutes)
+
+
+def test_training_gets_a_tenth_of_the_budget_in_whole_batches_where_time_allows():
+    found = planned(minutes=100)
+    assert found.frames == round(100_000 / BATCH) * BATCH
+    assert (found.cases, found.seeds, found.jobs) == (20, 2, 4)
+
+
+def test_training_gets_what_the_minutes_allow():
+    found = planned(minutes=0.5)
+    assert LEAST_BATCHES * BATCH < found.frames < 100_000
+    assert found.frames % BATCH == 0
+    assert found.seconds <= 30
+
+
+def test_slow_guide_leaves_a_few_batches_and_fewer_cases_and_it_is_said():
+    found = planned(minutes=2, guide=5e-3)
+    assert found.frames == LEAST_BATCHES * BATCH
+    assert found.cases == 5
+    assert found.seconds > 120
+    assert "minutes=2 is not enough" in found.described(2)
+    assert "2 seeds" in found.described(2)
+
+
+@pytest.mark.parametrize("frames", [100, 5000])
+def test_training_is_never_longer_than_the_whole_budget(frames):
+    config = OmegaConf.merge(CONFIG, {"budget": {"frames": frames}})
+    assert planned(minutes=10, config=config).frames <= frames

@@ -1,0 +1,141 @@
+"""Networks as guides: what acts is their `act`, if their class has one, else `forward`."""
+
+from collections import deque
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from coil_rl.guides import ControllerGuide
+from coil_rl.transforms import GuideActions
+
+
+class Actor(nn.Module):
+    """As published ones: `forward` gives raw numbers, and `act` the action."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer, self.drop = nn.Linear(1, 1), nn.Dropout(0.9)
+        nn.init.constant_(self.layer.weight, 1.0)
+        nn.init.constant_(self.layer.bias, 0.0)
+        self.count = 0
+
+    def forward(self, observation):
+        return 100.0 * self.drop(self.layer(observation))
+
+    def act(self, observation):
+        assert observation.shape == (1,)
+        self.count += 1
+        return torch.tanh(self.forward(torch.as_tensor(observation)) / 100.0) + self.count
+
+
+def asked(guide, values, *, first):
+    rows = len(values)
+    entries = {
+        "observation": torch.tensor(values)[:, None],
+        "row": torch.arange(rows)[:, None],
+        "is_init": torch.full((rows, 1), first),
+    }
+    return guide(TensorDict(entries, [rows]))["action"]
+
+
+@pytest.mark.parametrize("given", [Actor, Actor()], ids=["class", "object"])
+def test_network_with_act_is_asked_by_it_row_by_row(given):
+    guide = ControllerGuide(given)
+    for episode in range(2):
+        for step in range(3):
+            values = [0.3 + step, -0.5 * episode]
+            expected = torch.tanh(torch.tensor(values))[:, None] + step + 1
+            found = asked(guide, values, first=step == 0)
+            torch.testing.assert_close(found, expected)  # each episode has a copy of its own
+    if not isinstance(given, type):
+        assert given.count == 0
+        assert given.training
+
+
+def test_rows_share_the_weights_of_a_network():
+    guide = ControllerGuide(Actor)
+    asked(guide, [0.0, 0.0], first=True)
+    one, other = (host.thing for host in guide.guide.hosts.values())
+    assert one is not other
+    assert one.layer.weight is other.layer.weight
+
+
+def test_activation_that_is_called_act_is_no_controller():
+    class Net(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.act, self.layer = nn.ReLU(), nn.Linear(1, 1)
+
+        def forward(self, observation):
+            return -self.act(observation)
+
+    class Shared(nn.Module):
+        act = nn.ReLU()
+
+        def forward(self, observation):
+            return -self.act(observation)
+
+    for given in (Net, Net(), Shared, Shared()):
+        found = ControllerGuide(given)(TensorDict({"observation": torch.tensor([[2.0]])}, [1]))
+        assert found["action"].item() == -2.0
+
+
+def test_act_that_needs_more_is_refused_at_construction():
+    class Needs(nn.Module):
+        def act(self, observation, state):
+            return observation
+
+    for given in (Needs, Needs()):
+        with pytest.raises(
+            ValueError, match=r"Needs.act takes \(observation, state\), but is call"
+        ):
+            ControllerGuide(given)
+
+
+def test_guides_are_in_evaluation_mode_from_the_start():
+    network = nn.Sequential(nn.BatchNorm1d(1), nn.Dropout())
+    assert not GuideActions({"theirs": ControllerGuide(network)}).guides.training
+
+
+class Remembering(nn.Module):
+    """Remembers in a part of its own, in ways that torch does not save."""
+
+    def __init__(self, memory):
+        super().__init__()
+        self.layer, self.part = nn.Linear(1, 1), nn.Identity()
+        self.part.memory, self.settings = memory, SimpleNamespace(gain=2.0)
+        self.register_buffer("sum", torch.zeros(1), persistent=False)
+
+    def act(self, observation):
+        self.sum += torch.as_tensor(observation)
+        self.part.memory = self.part.memory + type(self.part.memory)([float(self.sum)])
+        return self.layer(self.sum) + self.settings.gain * sum(self.part.memory)
+
+    def reset(self):
+        self.sum.zero_()
+        self.part.memory = type(self.part.memory)()
+
+
+def test_what_a_network_remembers_in_any_attribute_is_in_the_checkpoint(tmp_path):
+    network = Remembering([])
+    guide = ControllerGuide(network)
+    for step in range(3):
+        asked(guide, [0.5 + step, -1.0], first=step == 0)
+    torch.save(guide.state_dict(), tmp_path / "state.pt")
+    other = ControllerGuide(network)
+    other.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    assert other.guide.continues
+    for step in range(2):
+        expected = asked(guide, [3.0, step], first=False)
+        torch.testing.assert_close(asked(other, [3.0, step], first=False), expected, rtol=0, atol=0)
+
+
+def test_network_that_remembers_what_no_checkpoint_can_hold_begins_new_episodes():
+    guide = ControllerGuide(Remembering(deque()))
+    asked(guide, [0.5, -1.0], first=True)
+    with pytest.warns(UserWarning, match="for all that it remembers, so new episodes begin"):
+        guide.load_state_dict(guide.state_dict())
+    assert not guide.guide.continues

@@ -1,0 +1,173 @@
+"""Imitation of recorded drives by one command, tested in a closed loop."""
+
+import csv
+import math
+
+import odd_recordings as odd
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from programs import called
+
+import coil_rl
+from coil_rl.config.parts import env_maker
+from coil_rl.envs import McapReplayEnv, Perception, SimulatedRobotEnv, record_drives
+from coil_rl.envs import simulated_cone_classifier as classifier
+from coil_rl.envs.splines import least_squares_parabola
+from coil_rl.guides import SplineGuide
+from coil_rl.run import checkpoint
+from coil_rl.run.parts import TEST
+
+SCANS = 33
+# A second of one robot is enough to see that it drives.
+SHORT = [
+    "env=mcap_replay",
+    "learner=linear",
+    "evaluation.cases=1",
+    "+evaluation.env.time_limit=1",
+    "logger=none",
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two drives, and a third one in which commands end and the robot stands."""
+    folder = tmp_path_factory.mktemp("drives")
+    files = [folder / "a.mcap", folder / "b.mcap"]
+    record_drives(SimulatedRobotEnv(num_envs=2, time_limit=SCANS / 5.5), SplineGuide(), files)
+    drive = odd.messages_of(files[0])
+    odd.commands_end_early(drive)  # the twelfth is the last one, and counts for three turns
+    drive.commands[3:6] = [(time, odd.twist(0.0, 0.0)) for time, _ in drive.commands[3:6]]
+    odd.write(folder / "c.mcap", drive)
+    return folder
+
+
+def trained(folder, *arguments, code=0):
+    words = ["method=oil", *SHORT, "hydra.run.dir=run", *arguments]
+    return called("train", *words, cwd=folder, code=code)
+
+
+def table(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_recorded_steering_is_learned_and_the_imitation_drives(folder):
+    done = trained(folder, "recording=[a.mcap,b.mcap,c.mcap]", "hydra.run.dir=three")
+    assert "a.mcap: 33 of 33 scans are learned; left out: 0 without" in done.stdout
+    assert "c.mcap: 12 of 33 scans are learned; left out: 18 without" in done.stdout
+    assert "3 of a robot that stands" in done.stdout
+    assert "3 recordings: 78 of 99 scans are learned." in done.stdout
+    last = table(folder / "three" / "metrics.csv")[-1]
+    assert (float(last["learner/samples"]), float(last["learner/left_out"])) == (78.0, 21.0)
+    assert {row["driver"] for row in table(folder / "three" / "evaluation.csv")} == {"oil"}
+    assert "laps" in (folder / "three" / "evaluation.md").read_text()
+
+    samples = checkpoint.load(folder / "three" / "dataset.pt")
+    env = McapReplayEnv([folder / f"{name}.mcap" for name in "abc"], Perception(classifier()))
+    usable = ~env.stale & ~env.standing
+    # The samples are in the order of the rows, which are the recordings.
+    torch.testing.assert_close(samples["action"].squeeze(-1), env.recorded[usable])
+    tracks = samples["info"]["track"].squeeze(-1)
+    assert torch.bincount(tracks).tolist() == [33, 33, 12]
+
+
+def test_the_test_drives_the_car_of_the_recordings():
+    words = ["method=oil", "env=mcap_replay", "env.speed=0.3", "env.car_length=0.6"]
+    words += ["env.max_steering=40", "env.spline=quadratic", "env.perception.range_max=1.6"]
+    words += ["env.perception.scale=5", "env.perception.bearing_max=90", "run_dir=unused"]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", words)
+    env = env_maker(config).bare(1, TEST, None)
+    assert isinstance(env, SimulatedRobotEnv)
+    assert env.step_length * env.rate == pytest.approx(0.3)
+    assert (env.car_length, env.max_steering) == (0.6, math.radians(40))
+    assert env.memory.fit is least_squares_parabola
+    seen = env.perception
+    assert (seen.range_max, seen.scale, seen.bearing_max, seen.laser_yaw) == (1.6, 5, 90, 0)
+
+
+@pytest.mark.slow
+def test_data_set_is_the_first_round_of_dagger(folder):
+    trained(folder, "recording=[a.mcap,b.mcap]", "hydra.run.dir=two")
+    arguments = ["method=dagger", "env=simulated_robot", "guide=spline", "learner=linear"]
+    arguments += ["env.time_limit=1", "evaluation.curve.points=1", "evaluation.gif=false"]
+    arguments += ["budget.num_envs=2", "budget.steps=5", "budget.frames=20", "logger=none"]
+    arguments += ["learner.dataset=two/dataset.pt", "hydra.run.dir=dagger"]
+    called("train", *arguments, cwd=folder)
+    rows = table(folder / "dagger" / "metrics.csv")
+    assert [float(row["learner/samples"]) for row in rows[1:]] == [76.0, 86.0]
+
+
+def test_a_second_pass_and_further_rows_teach_nothing_new(folder):
+    words = ["recording=[a.mcap,b.mcap]", "budget.num_envs=3", "budget.frames=198"]
+    done = trained(folder, *words, "hydra.run.dir=more")
+    assert "2 recordings: 66 of 66 scans are learned." in done.stdout
+    rows = table(folder / "more" / "metrics.csv")[-2:]
+    assert [float(row["learner/samples"]) for row in rows] == [66.0, 66.0]
+    assert [float(row["learner/left_out"]) for row in rows] == [33.0, 99.0]
+    assert (folder / "more" / "evaluation.md").exists()
+
+
+def test_run_is_evaluated_and_replayed_like_any_other(folder):
+    trained(folder, "recording=[a.mcap,b.mcap]", "hydra.run.dir=again")
+    called("evaluate", "run=again", "hydra.run.dir=evaluated", cwd=folder)
+    assert table(folder / "evaluated" / "evaluation.csv")[0]["driver"] == "oil"
+    arguments = ["recording=a.mcap", "runs=[again]", "hydra.run.dir=replayed"]
+    assert "| oil " in called("replay", *arguments, cwd=folder).stdout
+
+
+def test_python_gives_the_same_run_as_the_command(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    trained(folder, "recording=[a.mcap,b.mcap]", "hydra.run.dir=command")
+    words = [*SHORT[1:], "recording=[a.mcap,b.mcap]"]
+    run = coil_rl.train("mcap_replay", method="oil", overrides=words, folder="python")
+    assert table(run.folder / "metrics.csv") == table(folder / "command" / "metrics.csv")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["recording=null"], "env: recordings is empty"),
+        (["recording=[]"], "env: recordings is empty"),
+        (["recording=nothing.mcap"], "env: nothing.mcap cannot be read"),
+        (["budget.num_envs=1"], "env.num_envs=1 leaves out episodes, of which there are 2"),
+        (["env.num_envs=1"], "env.num_envs=1 leaves out episodes, of which there are 2"),
+        (["budget.frames=20", "budget.steps=10"], "longest has 33, so the others would be"),
+        (["recording=a.mcap"], "there is one episode, which cannot be left out to validate"),
+        (["method=ppo", "learner=ppo"], "method=ppo cannot learn there"),
+        (["method=dagger"], "method=dagger cannot learn there"),
+        (
+            ["method=coil", "env=cone_track", "learner=ppo", "guide=recording"],
+            "guide.recording: it reads info.recorded",
+        ),
+    ],
+)
+def test_mistakes_are_one_sentence(folder, arguments, words):
+    done = trained(folder, "recording=[a.mcap,b.mcap]", *arguments, "hydra.run.dir=no", code=2)
+    sentence = done.stderr.splitlines()[-1]
+    assert sentence.startswith("train: ")
+    assert words in sentence
+    assert not (folder / "no").exists()
+
+
+def test_recordings_without_commands_cannot_be_imitated(folder, tmp_path):
+    drive = odd.messages_of(folder / "a.mcap")
+    drive.commands = []
+    odd.write(tmp_path / "silent.mcap", drive)
+    arguments = ["recording=silent.mcap", "learner.group_key=null"]
+    done = trained(tmp_path, *arguments, code=2)
+    assert "no scan has recorded steering to learn" in done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_imitation_of_three_drives_completes_its_laps(tmp_path):
+    files = [tmp_path / f"{name}.mcap" for name in "abc"]
+    env = SimulatedRobotEnv(num_envs=3, laps=2, time_limit=100.0, seed=11)
+    record_drives(env, SplineGuide(), files)
+    arguments = ["method=oil", "env=mcap_replay", "recording=[a.mcap,b.mcap,c.mcap]"]
+    called("train", *arguments, "logger=none", "hydra.run.dir=run", cwd=tmp_path)
+    drives = table(tmp_path / "run" / "episodes.csv")
+    assert len(drives) == 6
+    assert sum(float(row["laps"]) for row in drives) >= 10

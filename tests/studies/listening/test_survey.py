@@ -1,0 +1,173 @@
+import numpy as np
+import pytest
+import torch
+from ovals import oval_track
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv
+from worlds import driving_measures
+
+from coil_rl.envs import ConeTrackEnv, SimulatedRobotEnv
+from coil_rl.guides import RandomGuide, SplineGuide
+from coil_rl.run.judge import Evaluation
+from coil_rl.transforms import GuideActions
+from coil_studies.listening.sections import SECTIONS, TrackSections, WholeEpisode
+from coil_studies.listening.survey import (
+    Ablation,
+    ablations,
+    drive_ablated,
+    survey,
+    table_by_section,
+)
+
+TRACKS = [oval_track("to the left"), oval_track("to the right", clockwise=True)]
+TRACK_SECTIONS = TrackSections(TRACKS)
+EVALUATION = Evaluation(
+    [track.name for track in TRACKS], driving_measures(), {"pose": ("info", "pose")}
+)
+FOLLOW = TensorDictModule(
+    lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"]
+)
+
+
+def cars(count, seconds=60):
+    return ConeTrackEnv(TRACKS, count, rate=6, laps=1, time_limit=seconds, assignment="cyclic")
+
+
+def guided(env):
+    return TransformedEnv(env, GuideActions({"spline": SplineGuide(), "random": RandomGuide()}))
+
+
+def make_env(count, seconds=60):
+    return guided(cars(count, seconds))
+
+
+@pytest.fixture(scope="module")
+def found():
+    return survey(make_env(4), FOLLOW, TRACK_SECTIONS, EVALUATION, donors=4)
+
+
+@pytest.fixture(scope="module")
+def rows(found):
+    removed = ablations(2, len(SECTIONS))
+    env = make_env(2 * len(removed))
+    episodes = drive_ablated(env, FOLLOW, TRACK_SECTIONS, EVALUATION, removed, found.advice.mean(0))
+    return table_by_section(
+        found, TRACK_SECTIONS, EVALUATION, dict(zip(removed, episodes, strict=True))
+    )
+
+
+def test_every_state_of_every_episode_is_measured(found):
+    assert found.guides == ["spline", "random"]
+    assert all(episode["completed"] for episode in found.result.episodes)
+    assert [episode["case"] for episode in found.result.episodes] == [
+        track.name for track in TRACKS
+    ] * 2
+    steps = np.array([episode["steps"] for episode in found.result.episodes])
+    assert np.bincount(found.step).tolist() == [(steps > step).sum() for step in range(max(steps))]
+    count = steps.sum()
+    assert found.advice.shape == (count, 2, 1)
+    assert all(values.shape == (count, 2) for values in found.measures.values())
+    assert found.measures["agreement"].mean(0)[0] == 0
+    assert found.measures["intervention"].mean(0)[1] == 0
+    for index, line in enumerate(TRACK_SECTIONS.lines):
+        on_track = found.place["track"] == index
+        points = found.place["point"][on_track]
+        assert len(set(points)) > 0.7 * len(line)
+        assert (found.section[on_track] == TRACK_SECTIONS.sections[index][points]).all()
+
+
+def test_removing_an_unused_guide_costs_nothing_and_the_followed_one_the_lap(rows):
+    for row in rows:
+        if row["guide"] == "random":
+            assert row["lost"] == pytest.approx(0, abs=1e-3)
+            assert row["completed"] == 1
+    assert (rows[0]["guide"], rows[0]["section"], rows[0]["completed"]) == (
+        "spline",
+        "everywhere",
+        0,
+    )
+    assert rows[0]["lost"] > 100
+
+
+def test_advice_is_replaced_in_its_section_only():
+    history = []
+
+    def act(advice, pose, track):
+        place = TRACK_SECTIONS.locate(
+            TensorDict({"info": {"track": track, "pose": pose}}, pose.shape[:1])
+        )
+        history.append((TRACK_SECTIONS.section(place), advice[:, 0, 0]))
+        return advice[:, 1]
+
+    keys = ["guide_action", ("info", "pose"), ("info", "track")]
+    agent = TensorDictModule(act, in_keys=keys, out_keys=["action"])
+    env = ConeTrackEnv(TRACKS, 4, rate=6, laps=1, time_limit=15, assignment="cyclic")
+    env = TransformedEnv(
+        env, GuideActions({"noise": RandomGuide(0.5, 1.0), "spline": SplineGuide()})
+    )
+    left, replacement = SECTIONS.index("left"), torch.tensor([[0.25], [0.0]])
+    drive_ablated(
+        env, agent, TRACK_SECTIONS, EVALUATION, [Ablation(0, left), Ablation(0)], replacement
+    )
+    section, advice = (torch.stack(column) for column in zip(*history, strict=True))
+    assert ((advice[:, :2] == 0.25) == (section[:, :2] == left)).all()
+    assert (section[:, :2] == left).any()
+    assert (advice[:, 2:] == 0.25).all()
+
+
+def test_rows_by_section_add_up_to_the_first_one(found, rows):
+    for guide in found.guides:
+        everywhere, *parts = [row for row in rows if row["guide"] == guide]
+        assert everywhere["section"] == "everywhere"
+        assert sum(row["share"] for row in parts) == pytest.approx(1)
+        for measure in found.measures:
+            assert sum(row["share"] * row[measure] for row in parts) == pytest.approx(
+                everywhere[measure], abs=1e-6
+            )
+
+
+def test_rows_along_the_track_contain_every_state_once(found):
+    sections = TrackSections(TRACKS, bin=2.0)
+    rows = sections.table(found)
+    for slot, guide in enumerate(found.guides):
+        of_guide = [row for row in rows if row["guide"] == guide]
+        assert sum(row["states"] for row in of_guide) == len(found.section)
+        for measure in found.measures:
+            total = sum(row["states"] * row[measure] for row in of_guide)
+            assert total == pytest.approx(float(found.measures[measure][:, slot].sum()), rel=1e-4)
+    lines, values = sections.measure_on_lines(found, rows, "agreement")
+    assert [len(line) for line in lines] == [len(row) for row in values["random"]]
+    assert set(values["random"][0].tolist()) <= {
+        row["agreement"] for row in rows if row["guide"] == "random"
+    }
+
+
+def test_rows_must_be_a_multiple_of_the_ablations_and_have_advice():
+    with pytest.raises(ValueError, match="4 rows cannot be divided among 3 ablations"):
+        drive_ablated(
+            make_env(4), FOLLOW, TRACK_SECTIONS, EVALUATION, ablations(2, 5)[:3], torch.zeros(2, 1)
+        )
+    with pytest.raises(ValueError, match="nothing writes guide_action"):
+        survey(ConeTrackEnv(TRACKS, 2), FOLLOW, TRACK_SECTIONS, EVALUATION)
+
+
+def robots(count):
+    return SimulatedRobotEnv(num_envs=count, assignment="cyclic", laps=1, time_limit=20)
+
+
+@pytest.mark.parametrize(("bare", "slot"), [(cars, 1), (robots, 0)], ids=["cars", "robots"])
+def test_removal_of_a_guide_that_is_not_followed_loses_nothing(bare, slot):
+    """All draws, of a random guide and of a LiDAR, are the same with and without the removal."""
+    follow = TensorDictModule(
+        lambda advice: advice[:, slot], in_keys=["guide_action"], out_keys=["action"]
+    )
+    evaluation, sections = Evaluation(["the track"]), WholeEpisode()
+    intact = survey(guided(bare(3)), follow, sections, evaluation, donors=1)
+    returns = [episode["reward"] for episode in intact.result.episodes]
+    removed, zero = [Ablation(1 - slot), Ablation(slot)], torch.zeros(2, 1)
+    env = guided(bare(6))
+    unused, used = drive_ablated(env, follow, sections, evaluation, removed, zero)
+    assert len(set(returns)) == 3
+    assert [episode["reward"] for episode in unused] == pytest.approx(returns, rel=1e-6)
+    assert [episode["reward"] for episode in used] != pytest.approx(returns, rel=1e-6)

@@ -1,0 +1,167 @@
+import copy
+import re
+
+import pytest
+import torch
+import worlds
+from torchrl.envs import PendulumEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from coil_rl.run.policy_batch import policy_batch
+from coil_rl.run.rollout import Rollout
+from coil_studies import IBRL
+
+RANDOM, DETERMINISTIC = ExplorationType.RANDOM, ExplorationType.DETERMINISTIC
+
+
+def make(**options):
+    torch.manual_seed(0)
+    env = worlds.pendulum()
+    given = {
+        "in_keys": ["th", "thdot"],
+        "hidden": [16],
+        "starts": 0,
+        "batch_size": 16,
+        "ratio": 1,
+        "action_gain": 1.0,
+    }
+    ibrl = IBRL(env, **given | options)
+    with torch.no_grad():  # critics and target networks must differ
+        for value in ibrl.loss.qvalue_network_params.values(True, True):
+            value.add_(torch.randn_like(value), alpha=0.5)
+    return ibrl, Rollout(env, ibrl.policy, 64, ibrl.keys)
+
+
+def target_values(ibrl, states, action):
+    """Smallest value of an action by the target networks, [N]."""
+    data, values = states.select("th", "thdot").set("action", action), []
+    for one in ibrl.loss.target_qvalue_network_params.unbind(0):
+        with one.to_module(ibrl.loss.qvalue_network):
+            values.append(ibrl.loss.qvalue_network(data.copy())["state_action_value"].squeeze(-1))
+    return torch.stack(values).amin(0)
+
+
+def own_action(ibrl, states):
+    return ibrl.loss.proposals.actor(states.select("th", "thdot"))["action"]
+
+
+def test_better_proposal_of_guide_and_policy_is_executed():
+    ibrl, rollout = make(critics=3)
+    batch = rollout.collect()
+    guide = batch["guide_action"][:, 0]
+    with set_exploration_type(DETERMINISTIC):
+        own, chosen = (
+            own_action(ibrl, batch),
+            ibrl.policy(batch.select("th", "thdot", "guide_action"))["action"],
+        )
+    better = target_values(ibrl, batch, guide) >= target_values(ibrl, batch, own)
+    assert 5 < better.sum() < 60
+    assert torch.equal(chosen, torch.where(better.unsqueeze(-1), guide, own))
+
+
+@pytest.mark.parametrize("sharpness", [None, 0.0, 2.0])
+def test_critics_learn_the_value_of_the_choice_in_the_next_state(sharpness):
+    """y = r + gamma * max of min Q', or mean over softmax(sharpness * min Q'), without entropy."""
+    ibrl, rollout = make(gamma=0.9, sharpness=sharpness, temperature=5.0)
+    data = rollout.collect().select(*ibrl.keys)
+    data["next", "terminated"][::3] = True
+    after = data["next"]
+    torch.manual_seed(1)
+    with torch.no_grad(), set_exploration_type(RANDOM):
+        own = own_action(ibrl, after)
+        values = torch.stack(
+            [target_values(ibrl, after, a) for a in (after["guide_action"][:, 0], own)]
+        )
+    value = (
+        values.amax(0) if sharpness is None else ((sharpness * values).softmax(0) * values).sum(0)
+    )
+    expected = after["reward"] + 0.9 * ~after["terminated"] * value.unsqueeze(-1)
+    torch.manual_seed(1)
+    torch.testing.assert_close(ibrl.loss._compute_target_v2(data), expected.squeeze(-1))
+
+
+def test_proposals_are_drawn_by_the_sharpness_of_the_choice_in_training_only():
+    ibrl, rollout = make(sharpness=0.0)
+    batch = rollout.collect()
+    guide = batch["guide_action"][:, 0]
+    with set_exploration_type(RANDOM):
+        drawn = torch.cat(
+            [(ibrl.policy(batch.copy())["action"] == guide).squeeze(-1) for _ in range(20)]
+        )
+    assert abs(drawn.float().mean() - 0.5) < 0.05
+    assert ibrl.update(rollout.collect())["guide_share"] == pytest.approx(0.5)
+    with set_exploration_type(DETERMINISTIC):
+        first, second = (ibrl.policy(batch.copy())["action"] for _ in range(2))
+    assert torch.equal(first, second)
+
+
+def test_edited_action_stays_near_the_guide_and_learns_to_have_a_larger_value():
+    ibrl, rollout = make(edit=0.25, temperature=1e-3, learning_rate=3e-3, tau=0.0)
+    batch = rollout.collect()
+    guide, proposals = batch["guide_action"][:, 0], ibrl.loss.proposals
+
+    def edited():
+        with torch.no_grad(), set_exploration_type(DETERMINISTIC):
+            return proposals.rate(batch)[0][2]
+
+    assert ((edited() - guide).abs() <= 0.25 * 2 + 1e-6).all()  # the torque is within 2
+    before = [parameter.clone() for parameter in proposals.editor.parameters()]
+    fixed = ibrl.loss.qvalue_network_params.detach().clone()
+    optimiser = torch.optim.Adam(proposals.editor.parameters(), 1e-2)
+
+    def gain():
+        ibrl.loss.target_qvalue_network_params.update_(fixed)
+        return (target_values(ibrl, batch, edited()) - target_values(ibrl, batch, guide)).mean()
+
+    first = gain()
+    for _ in range(60):
+        optimiser.zero_grad()
+        ibrl.loss.actor_loss(batch.copy())[0].backward()
+        optimiser.step()
+    assert gain() > first + 0.01
+    assert any(
+        parameter in set(ibrl.gradient.parameters) for parameter in proposals.editor.parameters()
+    )
+    assert not all(map(torch.equal, before, proposals.editor.parameters()))
+
+
+@pytest.mark.parametrize(
+    "options", [{"edit": 0.2}, {"normalise": True}], ids=["edit", "normalised"]
+)
+def test_state_of_the_policy_is_complete(options):
+    first, rollout = make(**options)
+    first.update(rollout.collect())
+    batch = rollout.collect()
+    policies = policy_batch(first.policy, [first.policy.state_dict()] * 2)
+    second, _ = make(**options)
+    second.policy.load_state_dict(copy.deepcopy(first.policy.state_dict()))
+    with set_exploration_type(DETERMINISTIC):
+        chosen = [
+            each(batch.select("th", "thdot", "guide_action"))["action"]
+            for each in (first.policy, second.policy)
+        ]
+        chosen.append(policies(batch.select("th", "thdot", "guide_action"))["action"])
+    assert torch.equal(chosen[0], chosen[1])
+    torch.testing.assert_close(chosen[0], chosen[2])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"target_critics": 1},
+            "IBRL compares all critics; leave target_critics and uncertainty out",
+        ),
+        ({"uncertainty": True}, "IBRL compares all critics"),
+        ({"edit": -0.1}, "edit=-0.1 must be"),
+        ({"sharpness": -1}, "sharpness=-1 must be"),
+    ],
+)
+def test_invalid_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make(**options)
+
+
+def test_env_without_advice_is_refused():
+    with pytest.raises(KeyError, match="the env has no guide_action"):
+        IBRL(PendulumEnv(), ["th"])
