@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar, Literal
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from coil_rl.compiled import Compiled
@@ -15,7 +15,6 @@ from coil_rl.errors import UserError
 from coil_rl.learners.state import Stateful
 from coil_rl.ranges import checked
 
-Rows = TensorDictBase | Mapping[NestedKey, Tensor]  # a minibatch
 ENOUGH = 4_000  # steps of a run, for which compilation pays in the second run of the same sizes
 
 
@@ -84,7 +83,7 @@ class GradientStep(Stateful):
         elif self.compile == "auto" and progress > self.begun:
             self.compile = self.steps * (1 - self.begun) / (progress - self.begun) >= ENOUGH
 
-    def __call__(self, minibatch: Rows, weights: Mapping[str, float]) -> dict[str, Tensor]:
+    def __call__(self, minibatch: Any, weights: Mapping[str, float]) -> dict[str, Tensor]:
         """Take a step on the sum of the losses times `weights`.
 
         Returns what `losses` returns, detached. If `compile` is true and there is no C++ compiler,
@@ -106,12 +105,12 @@ class GradientStep(Stateful):
         self.minimise(sum(weight * losses[name] for name, weight in weights.items()))
         return {name: each.detach() for name, each in losses.items()}
 
-    def _compiled(self, minibatch: Rows, weights: Mapping[str, float]) -> dict[str, Tensor]:
+    def _compiled(self, minibatch: Any, weights: Mapping[str, float]) -> dict[str, Tensor]:
         nested = isinstance(minibatch, TensorDictBase)
-        self.keys = list(minibatch.keys(True, True) if nested else minibatch)  # type: ignore[call-arg]
+        self.keys = list(minibatch.keys(True, True) if nested else minibatch)
         self.weighted = list(weights)
         rates = [group["lr"] for group in self.adam.param_groups]
-        numbers = torch.tensor([*weights.values(), *rates], device=minibatch.device)
+        numbers = torch.tensor([*weights.values(), *rates], device=self.parameters[0].device)
         self.state = self.state or self._state()
         values = self.compiled(numbers, *(minibatch[key] for key in self.keys), *self.state)
         return dict(zip(self.names, values, strict=True))
@@ -155,7 +154,7 @@ class GradientStep(Stateful):
         weights, rates = numbers[:count].unbind(0), numbers[count:].unbind(0)
         losses = self.losses(minibatch)
         self.names = list(losses.keys())
-        total = sum(
+        total: Any = sum(
             weight * losses[name] for name, weight in zip(self.weighted, weights, strict=True)
         )
         with self._traceable(rates):

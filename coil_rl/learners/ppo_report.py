@@ -23,10 +23,10 @@ def report_of(steps: Sequence[Mapping[str, Tensor]], clip: Sequence[float]) -> d
     of_size: dict[int, list[Mapping[str, Tensor]]] = {}
     for step in steps:
         of_size.setdefault(len(step["log_ratio"]), []).append(step)
-    parts = [
-        of_minibatches(*(torch.stack([step[name] for step in group]) for name in SEEN), clip)
-        for group in of_size.values()
-    ]
+    parts = []
+    for group in of_size.values():
+        log_ratio, value, target = (torch.stack([step[name] for step in group]) for name in SEEN)
+        parts.append(of_minibatches(log_ratio, value, target, clip))
     return {name: float(torch.cat([part[name] for part in parts]).mean()) for name in parts[0]}
 
 
