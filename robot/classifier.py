@@ -20,6 +20,9 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC, OneClassSVM
 
+from coil_rl import UserError, write_text
+from coil_rl.envs import ConeClassifier
+from coil_rl.envs.robot import RANGE_MIN, SimulatedDrive
 from coil_rl.envs.robot.clusters import (
     FEATURES,
     Array,
@@ -28,11 +31,7 @@ from coil_rl.envs.robot.clusters import (
     points_of,
     single_linkage,
 )
-from coil_rl.envs.robot.drives import SimulatedDrive
-from coil_rl.envs.robot.lidar import RANGE_MIN
-from coil_rl.envs.robot.perception import ConeClassifier
-from coil_rl.errors import UserError
-from coil_rl.files import LARGEST_NUMBERS, read_text, write_text
+from coil_rl.for_guests import LARGEST_NUMBERS, read_text
 
 Flags = NDArray[np.bool_]
 # Ranges [N, P] m, and their bearings, [P] or [N, P] radians.

@@ -17,8 +17,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from coil_rl.envs.limits import check_range
-from coil_rl.envs.robot.perception import BoundaryMemory, Perception
+from coil_rl import check_range
+from coil_rl.envs import Perception
+from coil_rl.envs.robot import BoundaryMemory
 from coil_robot.watchdog import Limits, Scan, Watchdog
 
 State = Literal["waiting", "driving", "stopped"]

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from coil_rl.envs.recordings.reading import Recording
-from coil_rl.envs.robot.env import SimulatedRobotEnv
-from coil_rl.envs.robot.lidar import RANGE_MAX, RANGE_MIN
+from coil_rl.envs import Recording, SimulatedRobotEnv
+from coil_rl.envs.robot import RANGE_MAX, RANGE_MIN
 from coil_robot.driver import Command, LiveDriver
 from coil_robot.watchdog import Scan
 

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from coil_rl.envs import SAMPLES, SIDES, WIDEST_ANGLE
 from coil_rl.envs.recordings.mcap_files import RecordingWriter, digest, read_messages
 from coil_rl.envs.recordings.messages import TWIST, TWIST_STAMPED, header, twist
-from coil_rl.envs.robot.course import THICK, THIN
-from coil_rl.envs.sight import SAMPLES, WIDEST_ANGLE
-from coil_rl.envs.track import SIDES
+from coil_rl.envs.robot import THICK, THIN
 from coil_rl.report import style
 from coil_robot.replay.open_loop import Floats, OpenLoop
 

@@ -1,6 +1,6 @@
 """Whether a perception fits a recording, and a robot its recorded commands."""
 
-from coil_rl.envs.recordings.views import caution_about_view
+from coil_rl.envs.recordings import caution_about_view
 from coil_robot.replay.open_loop import OpenLoop
 
 BEYOND = 0.1  # share of the commands
