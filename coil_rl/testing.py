@@ -6,7 +6,6 @@ They hold for the parts of this project, and can be used for those of any other 
 import warnings
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -15,8 +14,9 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs, st
 
 from coil_rl.foreign.batch import optional_entries
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.trial import AskedGuide, difference, episodes
 from coil_rl.transforms import GuideActions, set_progress
-from coil_rl.transforms.action_space import first_choices, nested_key, own_shape, space_of
+from coil_rl.transforms.action_space import ActionSpace, nested_key, space_of
 from coil_rl.transforms.guide_actions import unfit_action
 
 
@@ -45,41 +45,27 @@ def check_env(env: EnvBase, steps: int = 10) -> None:
     data = env.rand_action(env.reset())
     copy = data.clone()
     env.step(data)
-    for key, value in copy.items(True, True):
-        if not _same(value, data[key]):
-            raise ValueError(f"a step changed {key} of the data before it; write new tensors")
+    changed = difference(copy, data)
+    if changed is not None:
+        raise ValueError(f"a step changed {changed} of the data before it; write new tensors")
     if env.batch_size and env.batch_size[0] > 1:
         _check_partial_reset(base)
 
 
 def _check_rollouts(env: EnvBase, steps: int) -> None:
     """Compare two rollouts with the same seed."""
-    # Of the transforms, which have no seed.
-    state = env.state_dict() if isinstance(env, TransformedEnv) else None
-    rollouts = []
-    for _ in range(2):
-        if state is not None:
-            env.load_state_dict(state)
-        env.set_seed(0)
-        torch.manual_seed(0)  # of the actions
-        rollouts.append(env.rollout(steps, break_when_any_done=False))
-    rollout, again = rollouts
+    rollout, again = episodes(env, steps)
     optional = {part for key in optional_entries(env) for part in (key, ("next", *key))}
     for key, value in rollout.items(True, True):
         numbers = value.nan_to_num() if key in optional else value
         if value.is_floating_point() and not numbers.isfinite().all():
             raise ValueError(f"{key} holds a number that is not finite")
-        if not _same(value, again[key]):
-            raise ValueError(
-                f"the same seed gives other values of {key}; "
-                "draw random numbers from a seeded generator"
-            )
-
-
-def _same(one: Tensor, other: Tensor) -> bool:
-    """Return whether two tensors have the same shape and numbers, NaN included."""
-    arrays = one.cpu().numpy(), other.cpu().numpy()
-    return np.array_equal(*arrays, equal_nan=one.is_floating_point())
+    changed = difference(rollout, again)
+    if changed is not None:
+        raise ValueError(
+            f"the same seed gives other values of {changed}; "
+            "draw random numbers from a seeded generator"
+        )
 
 
 def _look_at_bounds(env: GymnasiumEnv, steps: int) -> None:
@@ -125,10 +111,9 @@ def _check_partial_reset(env: EnvBase) -> None:
         return env.step(env.rand_action(present))["next"]
 
     plain, seeded, after_reset = second_step(leave_alone), second_step(seed), second_step(reset)
-    if all(_same(value, seeded[key]) for key, value in plain.items(True, True)):
-        for key, value in plain.items(True, True):
-            if not _same(value[1:], after_reset[key][1:]):
-                raise ValueError(f"resetting row 0 changed {key} of other rows in the next step")
+    changed = difference(plain[1:], after_reset[1:])
+    if difference(plain, seeded) is None and changed is not None:
+        raise ValueError(f"resetting row 0 changed {changed} of other rows in the next step")
 
 
 def check_guide(
@@ -177,49 +162,15 @@ def check_guide(
         raise ValueError("the guide's action for a row depends on the other rows")
 
 
-class _Recorded(EnvBase):
-    """Recorded data as an env.
-
-    A reset of all rows begins the data anew; after a reset of some rows they go on in the data.
-
-    Args:
-        env: of which the data is.
-        data: [B, T].
-    """
-
-    def __init__(self, env: EnvBase, data: TensorDictBase) -> None:
-        super().__init__(device=env.device, batch_size=data.batch_size[:1])
-        rows = data.batch_size[0]
-        for name in ("observation_spec", "full_action_spec", "full_reward_spec", "full_done_spec"):
-            spec = getattr(env, name).clone()
-            setattr(self, name, spec if env.batch_size else spec.expand(rows, *spec.shape))
-        self.data, self.step_number = data, 0
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
-        if tensordict is None or "_reset" not in tensordict or tensordict["_reset"].all():
-            self.step_number = 0
-        return self._present()
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.step_number += 1
-        return self._present().update(self.full_reward_spec.zero())
-
-    def _present(self) -> TensorDictBase:
-        observed = self.data[:, self.step_number].select(*self.observation_spec.keys(True, True))
-        return observed.clone().update(self.full_done_spec.zero())
-
-    def _set_seed(self, seed: int | None) -> None:
-        pass
-
-
 def _check_history(
     guide: TensorDictModuleBase, env: EnvBase, action_key: NestedKey, tolerance: float, steps: int
 ) -> None:
     """Check what the advice of a guide depends on over the steps of an episode."""
     recorded = _recorded_rollout(env, steps)
-    asked = _AskedGuide(guide, env, action_key, recorded)
+    asked = AskedGuide(guide, env, recorded, action_key)
+    space = space_of(asked.env.base_env, action_key)
     middle = recorded.shape[1] // 2
-    hook = guide.register_forward_hook(asked.check_action)
+    hook = guide.register_forward_hook(_CheckedAction(space, action_key))
     try:
         first, again, fresh = asked.advice(), asked.advice(), asked.advice(begin=middle)
         try:
@@ -268,34 +219,18 @@ def _recorded_rollout(env: EnvBase, steps: int) -> TensorDictBase:
     return recorded
 
 
-class _AskedGuide:
-    """A guide that is asked along recorded data.
+class _CheckedAction:
+    """A forward hook of a guide that raises a `ValueError` for an invalid action.
 
     Args:
-        guide: the guide.
-        env: of which the data is.
+        space: of the action.
         action_key: of the action.
-        recorded: the data, [B, T].
     """
 
-    def __init__(
-        self,
-        guide: TensorDictModuleBase,
-        env: EnvBase,
-        action_key: NestedKey,
-        recorded: TensorDictBase,
-    ) -> None:
-        self.action_key, self.recorded = action_key, recorded
-        self.env = TransformedEnv(
-            _Recorded(env, recorded), GuideActions({"guide": guide}, action_key)
-        )
-        plant = getattr(env, "base_env", env)
-        self.env.base_env.first_choices = first_choices(plant)
-        self.env.base_env.own_shape = own_shape(plant)
-        self.space = space_of(self.env.base_env, action_key)
+    def __init__(self, space: ActionSpace, action_key: NestedKey) -> None:
+        self.space, self.action_key = space, action_key
 
-    def check_action(self, guide: nn.Module, _: object, written: TensorDictBase) -> None:
-        """Raise a `ValueError` for an invalid action; a forward hook of the guide."""
+    def __call__(self, guide: nn.Module, _: object, written: TensorDictBase) -> None:
         action, batch, space = written[self.action_key], written.batch_size, self.space
         try:
             space.check_advice(action, batch)
@@ -307,29 +242,6 @@ class _AskedGuide:
             )
         if space.bounds is not None and not torch.equal(action, action.clamp(*space.bounds)):
             raise ValueError("the guide's action lies outside the bounds of the env's action")
-
-    def advice(self, begin: int = 0, reset_at: int | None = None) -> Tensor:
-        """Return the advice at each step, [B, T - begin].
-
-        Args:
-            begin: step of the data with which the episodes begin.
-            reset_at: step at which an episode of row 0 begins anew; None for no reset.
-        """
-        data, taken = self.recorded[:, begin:].exclude("next"), []
-        self.env.base_env.data = data
-        present = self.env.reset()
-        for step in range(data.shape[1]):
-            if step == reset_at:
-                mask = torch.zeros(len(data), 1, dtype=torch.bool, device=self.env.device)
-                mask[0] = True
-                present = self.env.reset(present.set("_reset", mask))
-            taken.append(present["guide_action"])
-            if step + 1 < data.shape[1]:
-                action = TensorDict(
-                    {self.action_key: data[self.action_key][:, step]}, present.batch_size
-                )
-                present = self.env.step(present.update(action))["next"]
-        return torch.stack(taken, 1)
 
 
 def check_transform(env: EnvBase, transform: Transform) -> None:

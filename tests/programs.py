@@ -14,11 +14,13 @@ from hydra._internal.hydra import Hydra
 
 import coil_rl.conf
 import coil_robot.conf
+import coil_studies.conf
 from coil_rl.run.stopping import remember_trust
 
 ROOT = Path(__file__).parents[1]
 CONF = Path(coil_rl.conf.__path__[0])  # of the library that is tested, which may be a wheel
-CONFS = (CONF, Path(coil_robot.conf.__path__[0]))
+GUEST_CONFS = (coil_robot.conf, coil_studies.conf)
+CONFS = (CONF, *(Path(each.__path__[0]) for each in GUEST_CONFS))
 
 # Programs of guests, by command.
 GUESTS = {

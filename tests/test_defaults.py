@@ -12,10 +12,11 @@ from programs import CONF
 
 import coil_paper.conf
 import coil_robot.conf
+import coil_studies.conf
 
 PROJECT = ("coil_rl.", "coil_paper.", "coil_robot.", "coil_studies.")
 # Folders in which a file changes the defaults of a class for a method or an experiment.
-VARIATION_FOLDERS = ("experiment", "method", "preset", "paper/experiment")
+VARIATION_FOLDERS = ("experiment", "method", "preset", "paper/experiment", "studies/method")
 # Other deliberate variations, by file. A key stands for all keys that begin with it.
 VARIATIONS = {
     "env/cone_track.yaml": ["env.reward"],  # None in the constructor: the rewards of the paper
@@ -48,6 +49,7 @@ FOLDERS = {
     "": CONF,
     "paper/": Path(coil_paper.conf.__path__[0]),
     "robot/": Path(coil_robot.conf.__path__[0]),
+    "studies/": Path(coil_studies.conf.__path__[0]),
 }
 FILES = {
     f"{prefix}{path.relative_to(conf).as_posix()}": path

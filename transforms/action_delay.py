@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Bounded, TensorSpec, Unbounded
 
 from coil_rl.transforms.action_space import nested_key
-from coil_rl.transforms.disturbance import Delay
+from coil_rl.transforms.disturbance import Delay, Lag
 from coil_rl.transforms.link import State
 
 
@@ -23,14 +23,13 @@ class ActionDelay(Delay):
 
     Args:
         min_lag: smallest delay in steps.
-        max_lag: largest delay in steps, at most 10,000.
+        max_lag: largest delay in steps.
         action_key: entry of the action.
         seed: of the draws.
         memory_key: entry for the lag of each row, and for the actions on their way, oldest first.
 
     Raises:
-        TypeError: for a delay that is not a whole number.
-        ValueError: for a negative or too long delay, and for `min_lag` above `max_lag`.
+        ValueError: for `min_lag` above `max_lag`.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -44,8 +43,8 @@ class ActionDelay(Delay):
 
     def __init__(
         self,
-        min_lag: int = 0,
-        max_lag: int = 2,
+        min_lag: Lag = 0,
+        max_lag: Lag = 2,
         action_key: NestedKey = "action",
         seed: int = 0,
         memory_key: NestedKey = "late_actions",

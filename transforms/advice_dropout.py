@@ -6,10 +6,12 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Binary, TensorSpec
 
+from coil_rl.ranges import Share, checked
 from coil_rl.transforms.guide_transform import GuideTransform, SeededGenerator
 from coil_rl.transforms.link import State
 
 
+@checked
 class AdviceDropout(GuideTransform):
     """Advice that is missing in some episodes of the training.
 
@@ -17,7 +19,7 @@ class AdviceDropout(GuideTransform):
     with its guide and one without: see `in_evaluation`.
 
     Args:
-        probability: of an episode without advice, in training; from 0 to 1, else a `ValueError`.
+        probability: of an episode without advice, in training.
         in_evaluation: whether there is advice in evaluation.
         seed: of the draws.
         action_key: entry of the env's action.
@@ -29,7 +31,7 @@ class AdviceDropout(GuideTransform):
 
     def __init__(
         self,
-        probability: float = 0.5,
+        probability: Share = 0.5,
         in_evaluation: bool = True,
         seed: int = 0,
         *,
@@ -37,8 +39,6 @@ class AdviceDropout(GuideTransform):
         advice_key: NestedKey = "guide_action",
     ) -> None:
         super().__init__(action_key=action_key, advice_key=advice_key)
-        if not 0 <= probability <= 1:
-            raise ValueError(f"probability={probability} must be at least 0 and at most 1")
         self.probability, self.in_evaluation = probability, in_evaluation
         self.rng = SeededGenerator(seed)
 

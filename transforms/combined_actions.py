@@ -9,6 +9,7 @@ learners with replay learn from the executed action where the agent could have c
 """
 
 from collections.abc import Callable, Mapping
+from typing import Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -16,8 +17,14 @@ from tensordict.utils import expand_as_right
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
+from coil_rl.ranges import Share, checked
 from coil_rl.transforms.action_space import ChoicesError
-from coil_rl.transforms.guide_transform import GuideTransform, Schedule, SeededGenerator
+from coil_rl.transforms.guide_transform import (
+    GuideSettings,
+    GuideTransform,
+    Schedule,
+    SeededGenerator,
+)
 from coil_rl.transforms.link import State
 
 EXECUTED, WEIGHT, ACTS, REMAINING = "executed_action", "agent_weight", "agent_acts", "guide_steps"
@@ -29,21 +36,14 @@ class CombinedAction(GuideTransform):
     After a reset that entry is 0.
 
     Args:
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
+        settings: further ones of `GuideTransform`.
     """
 
     written: tuple[str, ...] = (EXECUTED,)
     adds = False  # whether the guide's action is added to the agent's, not put in its place
 
-    def __init__(
-        self,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
-    ) -> None:
-        super().__init__(guide, action_key, advice_key)
+    def __init__(self, **settings: Unpack[GuideSettings]) -> None:
+        super().__init__(**settings)
         # Steps in training, over all rows.
         self.taken: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
@@ -98,9 +98,7 @@ class ResidualAction(CombinedAction):
 
     Args:
         scale: a number or a schedule over the run; with 0 the guide acts alone.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
+        settings: further ones of `GuideTransform`.
     """
 
     mdp_parameter = "scale"
@@ -109,12 +107,9 @@ class ResidualAction(CombinedAction):
     def __init__(
         self,
         scale: float | Schedule = 1.0,
-        *,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(guide, action_key, advice_key)
+        super().__init__(**settings)
         self.scale = scale
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
@@ -122,14 +117,13 @@ class ResidualAction(CombinedAction):
         return self.action_space.added(self.advice(tensordict), action, scale)
 
 
+@checked
 class MixedAction(CombinedAction):
     """Weighted mean: the env action is weight * a + (1 - weight) * g, clamped.
 
     Args:
         weight: of the agent, a number or a schedule over the run; with 1 the agent acts alone.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
+        settings: further ones of `GuideTransform`.
     """
 
     mdp_parameter = "weight"
@@ -137,15 +131,10 @@ class MixedAction(CombinedAction):
 
     def __init__(
         self,
-        weight: float | Schedule,
-        *,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        weight: Share | Schedule,
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(guide, action_key, advice_key)
-        if isinstance(weight, (int, float)) and not 0 <= weight <= 1:
-            raise ValueError(f"weight={weight} must be at least 0 and at most 1")
+        super().__init__(**settings)
         self.weight = weight
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
@@ -171,9 +160,7 @@ class AdaptiveMixedAction(CombinedAction):
             drawn from `low` to `warm_up_high` instead.
         warm_up_high: largest weight of the warm-up, from `low` to `high`.
         seed: of the draws.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
+        settings: further ones of `GuideTransform`.
 
     Raises:
         ValueError: for weights that are not in order within [0, 1], or uncertainties not in order.
@@ -191,12 +178,9 @@ class AdaptiveMixedAction(CombinedAction):
         warm_up: int = 10_000,
         warm_up_high: float = 0.3,
         seed: int = 0,
-        *,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(guide, action_key, advice_key)
+        super().__init__(**settings)
         if not (0 <= low <= warm_up_high <= high <= 1 and 0 <= certain < uncertain):
             raise ValueError(
                 f"low={low}, warm_up_high={warm_up_high} and high={high} must be in this order, "
@@ -253,21 +237,13 @@ class _ActionSwitch(CombinedAction):
 
     Args:
         seed: of the draws.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
+        settings: further ones of `GuideTransform`.
     """
 
     written: tuple[str, ...] = (EXECUTED, ACTS)
 
-    def __init__(
-        self,
-        seed: int = 0,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
-    ) -> None:
-        super().__init__(guide, action_key, advice_key)
+    def __init__(self, seed: int = 0, **settings: Unpack[GuideSettings]) -> None:
+        super().__init__(**settings)
         self.rng = SeededGenerator(seed)
 
     def _draw(self, data: TensorDictBase) -> Tensor:
@@ -308,6 +284,7 @@ class _ActionSwitch(CombinedAction):
         return observation_spec
 
 
+@checked
 class Takeover(_ActionSwitch):
     """Random takeover by the guide in each step.
 
@@ -320,22 +297,18 @@ class Takeover(_ActionSwitch):
         frames: number of steps at the start of the run, over all rows, after which the agent always
             acts, as in RLPD and WSRL; None for no limit.
         seed: of the draws.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
+        settings: further ones of `GuideTransform`.
     """
 
     def __init__(
         self,
-        probability: float | Schedule = 1.0,
+        probability: Share | Schedule = 1.0,
         frames: int | None = None,
         *,
         seed: int = 0,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(seed, guide, action_key, advice_key)
+        super().__init__(seed, **settings)
         self.probability, self.frames = probability, frames
 
     def _agent_acts(self, data: TensorDictBase, state: State) -> Tensor:
@@ -357,9 +330,7 @@ class GradualResidual(Takeover):
         frames: number of steps at the start of the run, over all rows, after which the agent's
             action is always added; None for no limit.
         seed: of the draws.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
+        settings: further ones of `GuideTransform`.
     """
 
     mdp_parameter = "scale"
@@ -369,21 +340,12 @@ class GradualResidual(Takeover):
         self,
         scale: float | Schedule = 0.2,
         *,
-        probability: float | Schedule = 1.0,
+        probability: Share | Schedule = 1.0,
         frames: int | None = None,
         seed: int = 0,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(
-            probability,
-            frames,
-            seed=seed,
-            guide=guide,
-            action_key=action_key,
-            advice_key=advice_key,
-        )
+        super().__init__(probability, frames, seed=seed, **settings)
         self.scale = scale
 
     def _of_agent(self, tensordict: TensorDictBase) -> Tensor:
@@ -402,9 +364,7 @@ class JumpStart(_ActionSwitch):
             curriculum.
         random: draw the horizon of each episode uniformly from 0 to `horizon`.
         seed: of the draws.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
+        settings: further ones of `GuideTransform`.
     """
 
     written = (EXECUTED, ACTS, REMAINING)
@@ -416,11 +376,9 @@ class JumpStart(_ActionSwitch):
         random: bool = False,
         *,
         seed: int = 0,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        super().__init__(seed, guide, action_key, advice_key)
+        super().__init__(seed, **settings)
         self.horizon, self.random = horizon, random
 
     def _agent_acts(self, data: TensorDictBase, state: State) -> Tensor:

@@ -9,13 +9,14 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 
+from coil_rl.ranges import Interval, NonNegative, checked
 from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.link import Link, State
@@ -165,13 +166,14 @@ class ScaledAdvice(DegradedAdvice):
         return advice * self.gain
 
 
+@checked
 class PartialAdvice(DegradedAdvice):
     """Advice to one side only, 0 (the centre of a bounded action) for the other side.
 
     Choices have no sides: they stay as they are, or become zeros, with a warning.
 
     Args:
-        side: "left" keeps positive values, "right" negative values; else a `ValueError`.
+        side: "left" keeps positive values, "right" negative values.
         key: entry of the advice, [*batch, n_guides, A].
     """
 
@@ -179,8 +181,6 @@ class PartialAdvice(DegradedAdvice):
 
     def __init__(self, side: Literal["left", "right"], key: NestedKey = "guide_action") -> None:
         super().__init__(key)
-        if side not in ("left", "right"):
-            raise ValueError(f"side={side!r} must be one of left, right")
         self.side = side
 
     def degrade(self, advice: Tensor) -> Tensor:
@@ -227,21 +227,22 @@ class _DrawnAdvice(DegradedAdvice):
         raise NotImplementedError
 
 
+@checked
 class NoisyAdvice(_DrawnAdvice):
     """Advice with Gaussian noise, independent at every step.
 
     Args:
-        sigma: standard deviation in normalised actions, finite and at least 0.
+        sigma: standard deviation in normalised actions.
         seed: of the draws.
         key: entry of the advice, [*batch, n_guides, A].
     """
 
     sample = staticmethod(torch.randn)
 
-    def __init__(self, sigma: float = 0.3, seed: int = 0, key: NestedKey = "guide_action") -> None:
+    def __init__(
+        self, sigma: NonNegative = 0.3, seed: int = 0, key: NestedKey = "guide_action"
+    ) -> None:
         super().__init__(seed, key)
-        if not 0 <= sigma < math.inf:
-            raise ValueError(f"sigma={sigma} must be a finite number of at least 0")
         self.sigma = sigma
 
     def changed(self, advice: Tensor, draws: Tensor) -> Tensor:
@@ -341,11 +342,12 @@ class ShuffledAdvice(DegradedAdvice):
         return super().transform_observation_spec(observation_spec)
 
 
+@checked
 class DelayedAdvice(DegradedAdvice):
     """Advice of an earlier step; at first the first advice of the episode.
 
     Args:
-        steps: the delay, 0 for none, at most 10,000; else a `ValueError`.
+        steps: the delay, 0 for none.
         key: entry of the advice, [*batch, n_guides, A].
         memory_key: entry for the advice of the last steps, [*batch, steps, n_guides, A], oldest
             first.
@@ -355,12 +357,10 @@ class DelayedAdvice(DegradedAdvice):
 
     def __init__(
         self,
-        steps: int = 12,
+        steps: Annotated[int, Interval(ge=0, le=LONGEST_DELAY)] = 12,
         key: NestedKey = "guide_action",
         memory_key: NestedKey = "delayed_advice",
     ) -> None:
-        if not 0 <= steps <= LONGEST_DELAY:
-            raise ValueError(f"steps={steps} must be at least 0 and at most {LONGEST_DELAY}")
         super().__init__(key, memory_key, steps)
 
     def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:

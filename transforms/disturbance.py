@@ -8,6 +8,7 @@ has its own delays.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -15,11 +16,13 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import EnvBase
 
+from coil_rl.ranges import Interval, checked
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.link import Link
 
-LONGEST_LAG = 10_000  # steps, each of which is kept for every row
+# Steps, each of which is kept for every row.
+Lag = Annotated[int, Interval(ge=0, le=10_000)]
 
 
 class Disturbance(Link):
@@ -44,6 +47,7 @@ def undisturbed(env: EnvBase) -> EnvBase:
     return env
 
 
+@checked
 class Delay(Disturbance):
     """Base class of delays by a number of steps that each row draws anew for each episode.
 
@@ -56,18 +60,12 @@ class Delay(Disturbance):
         memory_key: entry for the lag of each row, [*batch, 1], and for its past.
 
     Raises:
-        TypeError: for a delay that is not a whole number.
-        ValueError: for a negative or too long delay, and for `min_lag` above `max_lag`.
+        ValueError: for `min_lag` above `max_lag`.
     """
 
     needs_past = True
 
-    def __init__(self, min_lag: int, max_lag: int, seed: int, memory_key: NestedKey) -> None:
-        for name, lag in (("min_lag", min_lag), ("max_lag", max_lag)):
-            if isinstance(lag, bool) or not isinstance(lag, int):
-                raise TypeError(f"{name}={lag} must be a whole number of steps, such as 2")
-            if not 0 <= lag <= LONGEST_LAG:
-                raise ValueError(f"{name}={lag} must be at least 0 and at most {LONGEST_LAG} steps")
+    def __init__(self, min_lag: Lag, max_lag: Lag, seed: int, memory_key: NestedKey) -> None:
         if min_lag > max_lag:
             raise ValueError(
                 f"min_lag={min_lag} must be at most max_lag={max_lag}; for a fixed delay give both "

@@ -28,6 +28,7 @@ from coil_rl.transforms.action_space import (
     space_of,
 )
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
+from coil_rl.transforms.hosted import HostedGuide, ToldGuide
 from coil_rl.transforms.link import State
 from coil_rl.transforms.normalised_action import ActionUnits
 
@@ -52,8 +53,7 @@ def unfit_action(
 ) -> Exception:
     """Return the error for the action of a guide that does not fit the env.
 
-    A guide with a method `unfit(action, batch, space, problem)` returns its own error, so that a
-    controller is told what it returned itself, which has no batch.
+    That of a controller tells what it returned itself, which has no batch.
 
     Args:
         name: of the guide.
@@ -63,10 +63,10 @@ def unfit_action(
         space: of its actions.
         problem: says why, as the end of a sentence.
     """
-    if hasattr(guide, "unfit"):
-        error: Exception = guide.unfit(action, batch, space, problem)  # type: ignore[operator]
-        return error
-    return UnfitActionError(name, problem)
+    own = None
+    if isinstance(guide, HostedGuide):
+        own = guide.unfit(action, batch, space, problem)
+    return own or UnfitActionError(name, problem)
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,6 @@ class Ended:
 
 class Guides(TensorDictModuleBase):
     """Several guides as one module that writes their actions side by side.
-
-    A guide with the attribute `by_row = True` has one object for each row. It is not asked after
-    the end of an episode: rows that have ended keep their last advice.
 
     Args:
         guides: name to guide, in the order of the rows of the advice.
@@ -172,8 +169,7 @@ class Guides(TensorDictModuleBase):
         """
         rows = []
         for number, (name, guide) in enumerate(self.guides.items()):
-            by_row = getattr(guide, "by_row", False)
-            if ended is None or not by_row or not ended.rows.any():
+            if ended is None or not _is_by_row(guide) or not ended.rows.any():
                 rows.append(self._asked(name, tensordict, convert, memory))
                 continue
             advice = ended.advice.select(-2, number)
@@ -210,18 +206,13 @@ class Guides(TensorDictModuleBase):
     def tell(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Tell the guides that ask for it about their env.
 
-        A guide asks by a method `in_space`, which actions there are, or `reads_choices`, how to
-        read choices as the env gives them.
-
         Args:
             space: of the actions of the guides.
             choices: what converts one-hot entries to the numbering of the env, by entry.
         """
         for guide in self.guides.values():
-            if hasattr(guide, "in_space"):
-                guide.in_space(space)  # type: ignore[operator]
-            if hasattr(guide, "reads_choices"):
-                guide.reads_choices(choices)  # type: ignore[operator]
+            if isinstance(guide, ToldGuide):
+                guide.meet(space, choices)
 
     def match_dtypes(self, tensordict: TensorDictBase) -> None:
         """Convert from here on what a guide reads to the dtype of its parameters.
@@ -235,6 +226,10 @@ class Guides(TensorDictModuleBase):
             of_entries = {each.dtype for each in read if each.is_floating_point()}
             if len(of_guide) == 1 and of_entries - of_guide:
                 self._input_dtype[name] = of_guide.pop()
+
+
+def _is_by_row(guide: nn.Module) -> bool:
+    return isinstance(guide, HostedGuide) and guide.by_row
 
 
 def _check_guide(name: str, guide: TensorDictModuleBase, action_key: NestedKey) -> None:
@@ -344,7 +339,7 @@ class GuideActions(ActionTransform):
         self.needs_past = bool(self.supplied or module.memories)
         pure = all(getattr(guide, "pure", False) for guide in guides.values())
         self._cache = GuideCache() if pure and not self.needs_past else None
-        if any(getattr(guide, "by_row", False) for guide in guides.values()):
+        if any(map(_is_by_row, guides.values())):
             self.passed = (self.out_keys[0],)
         self._checked: set[str] = set()
         self.calls = 0  # number of actions that guides were asked for
@@ -501,15 +496,14 @@ class GuideActions(ActionTransform):
     def _fitted(self, name: str, action: Tensor, batch: torch.Size) -> Tensor:
         """Return the action of a guide within the bounds.
 
-        It is checked in the first step; that of a guide with the attribute `foreign`, the code of
-        somebody else, in every step.
+        It is checked in the first step; that of a `HostedGuide` in every step.
         """
         guide = self.guides.guides[name]
         try:
             # An exported function can neither count nor raise.
             if not torch.compiler.is_exporting():
                 self.calls += batch.numel()
-                if name not in self._checked or getattr(guide, "foreign", False):
+                if name not in self._checked or isinstance(guide, HostedGuide):
                     self.guide_space.check_advice(action, batch)
                     self._checked.add(name)
             advice = self.guide_space.advice(action, batch)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TypedDict
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -10,11 +11,21 @@ from torch import Tensor, nn
 from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
+from coil_rl.ranges import Index, checked
 from coil_rl.transforms.action_space import ActionTransform, nested_key
 
 Schedule = Callable[[float], float]
 
 
+class GuideSettings(TypedDict, total=False):
+    """Arguments that every transform that uses advice takes as `GuideTransform` does."""
+
+    guide: Index
+    action_key: NestedKey
+    advice_key: NestedKey
+
+
+@checked
 class GuideTransform(ActionTransform):
     """Base class of transforms that use the advice observed by the agent.
 
@@ -23,7 +34,7 @@ class GuideTransform(ActionTransform):
     only are off. In training, `set_progress` moves the schedules.
 
     Args:
-        guide: row of the advice, the index of the guide; at least 0, else a `ValueError`.
+        guide: row of the advice, the index of the guide.
         action_key: entry of the env's action.
         advice_key: entry of the advice, [*batch, n_guides, A].
     """
@@ -35,12 +46,10 @@ class GuideTransform(ActionTransform):
 
     def __init__(
         self,
-        guide: int = 0,
+        guide: Index = 0,
         action_key: NestedKey = "action",
         advice_key: NestedKey = "guide_action",
     ) -> None:
-        if guide < 0:
-            raise ValueError(f"guide={guide} must be at least 0: it is a row of the advice")
         self.action_key, self.advice_key = nested_key(action_key), nested_key(advice_key)
         super().__init__(in_keys=[self.advice_key], out_keys=list(self.written))
         self.guide = guide

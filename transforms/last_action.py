@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import TensorSpec, Unbounded
 
+from coil_rl.ranges import Interval, checked
 from coil_rl.transforms.action_space import ActionTransform, nested_key
 from coil_rl.transforms.link import State
 
 
+@checked
 class LastAction(ActionTransform):
     """Writes the actions that the agent chose in the steps before, newest first.
 
@@ -24,9 +27,6 @@ class LastAction(ActionTransform):
         action_key: entry of the action.
         out_key: entry for the actions as numbers, [*batch, steps * A], one-hot for choices; with an
             action for each of several agents [*batch, n_agents, steps * A]. 0 for no action yet.
-
-    Raises:
-        ValueError: for a number of steps outside its range.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -41,12 +41,10 @@ class LastAction(ActionTransform):
 
     def __init__(
         self,
-        steps: int = 1,
+        steps: Annotated[int, Interval(ge=1, le=1000)] = 1,
         action_key: NestedKey = "action",
         out_key: NestedKey = "last_action",
     ) -> None:
-        if not 1 <= steps <= 1000:
-            raise ValueError(f"steps={steps} must be at least 1 and at most 1000 actions")
         out_key = nested_key(out_key)
         super().__init__(in_keys=[], out_keys=[out_key])
         self.steps, self.action_key, self.out_key = steps, nested_key(action_key), out_key

@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, NonTensor, TensorSpec
 
 from coil_rl.transforms.action_space import nested_key
-from coil_rl.transforms.disturbance import Delay
+from coil_rl.transforms.disturbance import Delay, Lag
 from coil_rl.transforms.link import State
 
 EVALUATION_ONLY = "info"  # entries that nobody acts on
@@ -25,16 +25,15 @@ class ObservationDelay(Delay):
 
     Args:
         min_lag: smallest delay in steps.
-        max_lag: largest delay in steps, at most 10,000.
+        max_lag: largest delay in steps.
         in_keys: entries that are late; None for all numbers that the env itself writes, but for
             those under `info`.
         seed: of the draws.
         memory_key: entry for the lag of each row and for its past observations, oldest first.
 
     Raises:
-        TypeError: for a delay that is not a whole number.
-        ValueError: for a negative or too long delay, and for `min_lag` above `max_lag`; in an env
-            also for an entry that does not exist or has no numbers.
+        ValueError: for `min_lag` above `max_lag`; in an env also for an entry that does not
+            exist or has no numbers.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -47,8 +46,8 @@ class ObservationDelay(Delay):
 
     def __init__(
         self,
-        min_lag: int = 0,
-        max_lag: int = 2,
+        min_lag: Lag = 0,
+        max_lag: Lag = 2,
         in_keys: Sequence[NestedKey] | None = None,
         seed: int = 0,
         memory_key: NestedKey = "late_observations",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -12,12 +11,14 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase, Transform
 
+from coil_rl.ranges import NonNegative, checked
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.disturbance import Disturbance
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.link import State
 
 
+@checked
 class ObservationNoise(Disturbance):
     """Observations with Gaussian noise, independent at every step, within the bounds of the entry.
 
@@ -28,13 +29,13 @@ class ObservationNoise(Disturbance):
     it only the agent does.
 
     Args:
-        sigma: standard deviation in the unit of the entries, finite and at least 0.
+        sigma: standard deviation in the unit of the entries.
         in_keys: entries of real numbers.
         seed: of the draws.
 
     Raises:
-        ValueError: for a `sigma` outside its range and without entries; in an env also for an entry
-            that does not exist or is not of real numbers.
+        ValueError: without entries; in an env also for one that does not exist or is not of real
+            numbers.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -46,10 +47,11 @@ class ObservationNoise(Disturbance):
     """
 
     def __init__(
-        self, sigma: float = 0.1, in_keys: Sequence[NestedKey] = ("observation",), seed: int = 0
+        self,
+        sigma: NonNegative = 0.1,
+        in_keys: Sequence[NestedKey] = ("observation",),
+        seed: int = 0,
     ) -> None:
-        if not 0 <= sigma < math.inf:
-            raise ValueError(f"sigma={sigma} must be a finite number of at least 0")
         if not in_keys:
             raise ValueError("in_keys is empty; give the entries that are noisy")
         keys = [nested_key(key) for key in in_keys]

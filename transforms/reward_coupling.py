@@ -6,17 +6,19 @@ pays to act like the guide.
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Literal
+from typing import Literal, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import TensorSpec, Unbounded
 
-from coil_rl.transforms.guide_transform import GuideTransform, Schedule
+from coil_rl.ranges import checked
+from coil_rl.transforms.guide_transform import GuideSettings, GuideTransform, Schedule
 
 NORMS = {"l1": 1.0, "l2": 2.0, "linf": float("inf")}
 
 
+@checked
 class RewardCoupling(GuideTransform):
     """Reward R - beta ||a - g||, where g is the advice that the agent observed before action a.
 
@@ -27,11 +29,9 @@ class RewardCoupling(GuideTransform):
 
     Args:
         beta: weight of the distance, a number or a schedule over the run.
-        norm: of the distance, "l1", "l2" or "linf"; another is a `ValueError`. Discrete actions are
+        norm: of the distance, "l1", "l2" or "linf". Discrete actions are
             one-hot: l1 is 0 or 2, l2 is 0 or the root of 2.
-        guide: row of the advice, the index of the guide.
-        action_key: entry of the env's action.
-        advice_key: entry of the advice, [*batch, n_guides, A].
+        settings: further ones of `GuideTransform`.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -51,14 +51,9 @@ class RewardCoupling(GuideTransform):
         self,
         beta: float | Schedule,
         norm: Literal["l1", "l2", "linf"] = "l2",
-        *,
-        guide: int = 0,
-        action_key: NestedKey = "action",
-        advice_key: NestedKey = "guide_action",
+        **settings: Unpack[GuideSettings],
     ) -> None:
-        if norm not in NORMS:
-            raise ValueError(f"norm={norm!r} must be one of {', '.join(NORMS)}")
-        super().__init__(guide, action_key, advice_key)
+        super().__init__(**settings)
         self.beta, self.order = beta, NORMS[norm]
 
     @cached_property

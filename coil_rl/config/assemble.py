@@ -13,6 +13,7 @@ from coil_rl.config.own_run import own_run
 from coil_rl.config.parts import (
     advises,
     advises_only,
+    build_beside,
     build_evaluation,
     build_guides,
     build_learner,
@@ -80,7 +81,7 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         init=run_folder(config.init) if config.init else None,
         delivery=config.delivery,
         which=config.evaluation.policy,
-        fallback=config.evaluation.fallback,
+        beside=build_beside(config),
         compiled=config.compile,
         device=config.device,
         threads=config.threads,

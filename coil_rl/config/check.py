@@ -38,7 +38,7 @@ from coil_rl.config.values import check_values
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.batch import SeededRows, optional_entries
 from coil_rl.foreign.faults import ForeignError
-from coil_rl.foreign.trial import Tried, tried
+from coil_rl.foreign.trial import Tried, tried, unrepeated
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.off_policy import OffPolicy
@@ -46,7 +46,6 @@ from coil_rl.measures import measures_of
 from coil_rl.output import say
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
-from coil_rl.run.fallback import check_cases_of_guide, critic_beside_guide, no_effect
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
 from coil_rl.run.training import INIT
@@ -152,8 +151,11 @@ def _check_delivery(config: DictConfig, *, has_agent: bool) -> None:
     So it is for values that need a policy, where none is trained.
     """
     trains_policy = has_agent and not config.method.run
-    if config.evaluation.fallback and not trains_policy:
-        raise UserError(no_effect(Path(config.run_dir), "there is no agent"))
+    if config.evaluation.beside and not trains_policy:
+        raise UserError(
+            f"beside={','.join(config.evaluation.beside)} has no effect: "
+            f"method={config.method.name} trains no policy; leave it out"
+        )
     if config.init and not trains_policy:
         raise UserError(
             f"init={config.init} has no effect: method={config.method.name} trains no policy; "
@@ -225,7 +227,7 @@ def _check_repeats(env: EnvBase) -> None:
     """
     if not isinstance(env, SeededRows):
         return
-    key = env.unrepeated()
+    key = unrepeated(env)
     if key is not None:
         warnings.warn(
             f"the env does not obey its seed: {_dotted(key)} differs when an episode is repeated, "
@@ -410,9 +412,8 @@ def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
     _check_frames_of_proxies(config, replaced)
     untrained = guides_with_untrained_proxies(config) if guides else None
     learner = parts.build_learner(config, env, untrained)
-    if config.evaluation.fallback:
-        check_cases_of_guide(make_env, Path(config.run_dir))
-        critic_beside_guide(env, learner, Path(config.run_dir))
+    for each in parts.build_beside(config):
+        each.check(make_env, learner, Path(config.run_dir))
     _check_init(config, learner)
     _check_batch(config, learner)
     _check_validation(config, learner)

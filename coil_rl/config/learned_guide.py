@@ -9,7 +9,6 @@ from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Unbounded
 from torchrl.envs import ExplorationType, TensorDictPrimer, set_exploration_type
 
@@ -18,15 +17,16 @@ from coil_rl.config.folder import read_config, run_folder
 from coil_rl.errors import UserError
 from coil_rl.run.parts import TRAIN
 from coil_rl.transforms import GuideActions
-from coil_rl.transforms.action_space import ActionSpace, space_of
+from coil_rl.transforms.action_space import ActionSpace, OwnChoices, space_of
 from coil_rl.transforms.chain import Chain, links_of
+from coil_rl.transforms.hosted import HostedGuide
 
 LONGEST_CHAIN = 4  # learned guides of learned guides
 # Runs that are being loaded, each of which is a guide of the one before.
 _LOADING: ContextVar[tuple[Path, ...]] = ContextVar("loading", default=())
 
 
-class LearnedGuide(TensorDictModuleBase):
+class LearnedGuide(HostedGuide):
     """Deterministic action of a trained policy, with the guides and action transforms of its run.
 
     All rows act at once. What the policy, its guides and its transforms remember is the memory of
@@ -65,7 +65,7 @@ class LearnedGuide(TensorDictModuleBase):
         self.space = space_of(env.base_env, env.base_env.action_key)
         guides = [each for each in self.chain.links if isinstance(each, GuideActions)]
         inner = [guide for each in guides for guide in each.guides.guides.values()]
-        self.by_row = any(getattr(guide, "by_row", False) for guide in inner)
+        self.by_row = any(isinstance(guide, HostedGuide) and guide.by_row for guide in inner)
         first = self.chain.first(TensorDict({}, [1], device=env.device))
         self.memory = {f"learned_{n}": at for n, at in enumerate(self.chain.remembered(first))}
         self.start = {name: first[n][key][0] for name, (n, key) in self.memory.items()}
@@ -75,11 +75,8 @@ class LearnedGuide(TensorDictModuleBase):
         self.requires_grad_(False)
         self.eval()
 
-    def in_space(self, space: ActionSpace) -> None:
+    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Check the action of an env.
-
-        Args:
-            space: of the actions of the env.
 
         Raises:
             UserError: if the policy has another number of choices or other bounds, which may be in

@@ -44,13 +44,19 @@ def renamed(node: Any, path: Path) -> Any:
 
 
 def with_todays_keys(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a configuration with today's keys: `method.run` was called `method.search`.
+    """Return a configuration with today's keys.
+
+    `method.run` was called `method.search`, and `evaluation.fallback` was a driver beside.
 
     Args:
         values: as read from a folder.
     """
-    method = values.get("method")
-    if not isinstance(method, Mapping):
-        return dict(values)
-    keys = {key: "run" if key == "search" else key for key in method}
-    return {**values, "method": {keys[key]: value for key, value in method.items()}}
+    found = dict(values)
+    if isinstance(method := found.get("method"), Mapping) and "search" in method:
+        others = {key: value for key, value in method.items() if key != "search"}
+        found["method"] = others | {"run": method["search"]}
+    if isinstance(evaluation := found.get("evaluation"), Mapping) and "fallback" in evaluation:
+        others = {key: value for key, value in evaluation.items() if key != "fallback"}
+        driver = {"fallback": {"_target_": "coil_studies.Fallback"}}
+        found["evaluation"] = others | {"beside": driver if evaluation["fallback"] else {}}
+    return found

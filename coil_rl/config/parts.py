@@ -20,6 +20,7 @@ from coil_rl.learners.learner import Learner
 from coil_rl.measures import MEAN_CASE, measures_of
 from coil_rl.report import Returns
 from coil_rl.report.pictures import Picture
+from coil_rl.run.beside import Beside
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.judge import Evaluation, evaluate_guides
 from coil_rl.run.parts import TEST, TESTS, TRAIN, EnvMaker
@@ -57,6 +58,12 @@ def build_pictures(config: DictConfig) -> list[Picture]:
     nodes = config.evaluation.pictures.items()
     pictures = [build(node, f"evaluation.pictures.{name}") for name, node in nodes if node]
     return pictures or [Returns()]
+
+
+def build_beside(config: DictConfig) -> list[Beside]:
+    """Return what makes the further drivers of the evaluation table."""
+    nodes = config.evaluation.beside.items()
+    return [build(node, f"evaluation.beside.{name}", Beside) for name, node in nodes]
 
 
 def recorded(pictures: list[Picture]) -> dict[str, NestedKey]:

@@ -155,7 +155,7 @@ class EvaluationConfig(NodeConfig):
     policy: WhichPolicy = "handed_over"
     guides: Annotated[str, one_of("phases", "ends")] = "phases"
     gif: bool = True
-    fallback: bool = False
+    beside: dict[str, Any] = field(default_factory=dict)  # further drivers of the table
 
 
 @dataclass
@@ -251,14 +251,6 @@ class EvaluateConfig(DrivingConfig):
 
     run: str | None = None
     exported: str | None = None
-
-
-@dataclass
-class ListenConfig(DrivingConfig):
-    """Configuration of `coil-listen`."""
-
-    run: str = MISSING
-    donors: Repeats = 16
 
 
 @dataclass
@@ -366,17 +358,16 @@ OmegaConf.register_new_resolver("whole_pass", whole_pass, replace=True)
 _store = ConfigStore.instance().store
 
 
-def _open_to_measures(schema: type[DrivingConfig]) -> DictConfig:
+def open_to_measures(schema: type[DrivingConfig]) -> DictConfig:
     """Return a schema to which the command line may add measures without a plus sign."""
     config = OmegaConf.structured(schema)
     OmegaConf.set_struct(config.evaluation.measures, False)
     return config
 
 
-_store(name="schema", node=_open_to_measures(TrainConfig))
-_store(name="evaluate_schema", node=_open_to_measures(EvaluateConfig))
+_store(name="schema", node=open_to_measures(TrainConfig))
+_store(name="evaluate_schema", node=open_to_measures(EvaluateConfig))
 _store(name="report_schema", node=ReportConfig)
-_store(name="listen_schema", node=_open_to_measures(ListenConfig))
 _store(name="export_schema", node=ExportConfig)
 
 

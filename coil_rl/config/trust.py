@@ -3,8 +3,8 @@
 Somebody else may have written it.
 
 Instantiating a configuration calls whatever its `_target_` keys name, and imports what `of` of a
-controller, the `controllers` of an env and the `id` of a Gymnasium env name as `MODULE:NAME`. So
-each of them must be on a list of full names before anything is imported:
+controller and the `id` of a Gymnasium env name as `MODULE:NAME`. So each of them must be on a list
+of full names before anything is imported:
 
 - what the shipped configuration names in the groups of a run, also as an alternative in a comment:
   a part that has its YAML file is on the list;
@@ -181,10 +181,7 @@ def _import_path(name: str, key: Any, value: Any) -> Any:
     """Return what an entry names to be imported, written with points only, else None."""
     if key == "_target_":
         return value
-    # The text under `controllers` may be at any depth, because keys may contain points.
-    names_code = (
-        key == "of" or re.search(r"\bcontrollers[.\[]", name) or (key == "id" and ":" in str(value))
-    )
+    names_code = key == "of" or (key == "id" and ":" in str(value))
     return value.replace(":", ".", 1) if names_code and isinstance(value, str) else None
 
 
@@ -217,7 +214,7 @@ def _check_target(target: Any, name: str, path: Path) -> None:
     entry_points = metadata.entry_points(group=ENTRY_POINTS).names
     if package not in NEVER_TRUSTED and package in _packages | entry_points:
         # A Gymnasium env is registered by its module, and has no name of its own there.
-        if not name.endswith(".id") or "controllers" in name:
+        if not name.endswith(".id"):
             _check_origin(entry, package)
     elif package in NEVER_TRUSTED:
         similar = did_you_mean(target, allowed) if package == "coil_rl" else ""

@@ -10,17 +10,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from coil_rl.errors import UserError
 from coil_rl.export.policy import ADVICE, ExportedPolicy
-from coil_rl.transforms.action_space import ActionRange, ActionSpace
+from coil_rl.transforms.action_space import ActionRange, ActionSpace, OwnChoices
+from coil_rl.transforms.hosted import ToldGuide
 
 
-class ExportedGuide(TensorDictModuleBase):
+class ExportedGuide(ToldGuide):
     """Deterministic action of a policy in a file, for all rows at once.
 
     What the policy remembers is the memory of the guide, as entries of the data.
@@ -52,11 +52,8 @@ class ExportedGuide(TensorDictModuleBase):
         self.pure = not self.memory
         self.fits = False
 
-    def in_space(self, space: ActionSpace) -> None:
+    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Check the action of an env.
-
-        Args:
-            space: of the actions of the env.
 
         Raises:
             UserError: if the policy acts in another one.

@@ -21,8 +21,9 @@ from coil_rl.export.recording import Recording, record
 from coil_rl.export.step import NotExportableError, PolicyStep, exportable
 from coil_rl.extras import require
 from coil_rl.files import temporary
-from coil_rl.foreign.controllers import EntryGuide, PerRow
-from coil_rl.foreign.functions import FunctionGuide
+from coil_rl.foreign.controllers import PerRow
+from coil_rl.foreign.shared import FunctionGuide
+from coil_rl.guides.simple import EntryGuide
 from coil_rl.output import progress, say
 from coil_rl.run.controller import Controller
 from coil_rl.run.folder import HANDED_OVER

@@ -14,12 +14,9 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.data import Bounded, TensorSpec
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
-from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.foreign.rows import Entries, Shard
 
@@ -45,7 +42,7 @@ class SeededRows(SeededEnv):
         device: of all tensors.
 
     Raises:
-        ValueError: for a seed or number out of range, and for `cases` without `first_seed`.
+        ValueError: for `cases` without `first_seed`.
     """
 
     remedy: ClassVar[str] = ""  # what may help if running episodes cannot be repeated
@@ -60,8 +57,6 @@ class SeededRows(SeededEnv):
         cases: int | None,
         device: torch.device | str,
     ) -> None:
-        check_range(0, LARGEST_SEED, seed=seed, first_seed=first_seed or 0)
-        check_range(1, cases=1 if cases is None else cases)
         if cases is not None and first_seed is None:
             raise ValueError(f"cases={cases} needs first_seed, the seed of the first case")
         super().__init__(device=torch.device(device), batch_size=torch.Size([count]))
@@ -113,34 +108,6 @@ class SeededRows(SeededEnv):
         self.parts[:] = self.shard.step(self._decode(actions))
         return self._output(stepped=True)
 
-    def unrepeated(self, steps: int = 10) -> NestedKey | None:
-        """Return an entry that differs when an episode of one seed is repeated; None if none does.
-
-        Another episode lies between the two. The running episodes of the env are lost.
-
-        Args:
-            steps: of random actions, the same ones in both episodes.
-        """
-        with torch.random.fork_rng():
-            torch.manual_seed(0)
-            actions = [_probe(self.action_spec).cpu().numpy() for _ in range(steps)]
-        episodes = [self._driven(seed, actions) for seed in (0, 1, 0)]
-        self.seeds, self.ages[:] = [], 0
-        for first, again in zip(episodes[0], episodes[-1], strict=True):
-            for key, value in first.items(True, True):
-                if not _same(value, again[key]):
-                    return key
-        return None
-
-    def _driven(self, seed: int, actions: Sequence[NDArray[Any]]) -> list[TensorDict]:
-        """Return the entries of an episode that begins with a seed in every row."""
-        self.begin(dict.fromkeys(range(self.batch_size[0]), seed))
-        data = [self._output(stepped=False).clone()]
-        for action in actions:
-            self.parts[:] = self.shard.step(self._decode(action))
-            data.append(self._output(stepped=True).clone())
-        return data
-
     def _observed(self) -> TensorDictBase:
         return self._output(stepped=False).select(*self.observation_spec.keys(True, True))
 
@@ -179,17 +146,6 @@ class SeededRows(SeededEnv):
                 f"{self.remedy}",
                 stacklevel=2,
             )
-
-
-def _probe(spec: TensorSpec) -> Tensor:
-    """Return a random action; a number without a lower or upper bound is near 0, or its bound."""
-    action: Tensor = spec.rand()
-    if not isinstance(spec, Bounded) or action.isfinite().all():
-        return action
-    near = torch.rand(spec.shape, dtype=spec.dtype, device=spec.device).clamp(
-        spec.space.low, spec.space.high
-    )
-    return torch.where(action.isfinite(), action, near)
 
 
 def _same(one: Any, other: Any) -> bool:

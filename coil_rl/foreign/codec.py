@@ -427,32 +427,28 @@ class Actions:
         typed = typed.reshape(*actions.shape[:-1], *self.space.shape)
         return np.clip(typed, self.space.low, self.space.high)
 
-    def fitted(self, name: str, advice: Any) -> NDArray[Any]:
-        """Return the action of a controller as an array, in the env's own numbering.
+    def fitted(self, action: NDArray[Any], place: str) -> NDArray[Any]:
+        """Return the action of a controller in the shape and numbering of the env.
 
         Args:
-            name: of the controller, for the message.
-            advice: what the controller gave; the bounds of real numbers are not checked.
+            action: what the controller gave; the bounds of real numbers are not checked.
+            place: of the controller, for the message.
 
         Raises:
             ForeignError: for what is no action of the env.
         """
-        try:
-            array = plain_array(advice, "it")
-            if self.whole:
-                typed = array.astype(self.space.dtype)
-                fits = bool((typed == array).all()) and self.space.contains(typed)
-            elif self.real:
-                fits = array.shape == self.space.shape and bool(np.isfinite(array).all())
-            else:
-                fits = bool(self.space.contains(array))
-        except ForeignError:
-            fits = False
+        if action.size == 1 and math.prod(self.space.shape or ()) == 1:
+            action = action.reshape(self.space.shape)
+        if self.whole:
+            typed = action.astype(self.space.dtype)
+            fits = bool((typed == action).all()) and self.space.contains(typed)
+        elif self.real:
+            fits = action.shape == self.space.shape
+        else:
+            fits = bool(self.space.contains(action))
         if not fits:
-            raise ForeignError(
-                f"controller {name} gave {shown(advice)}, not an action of {self.space}"
-            )
-        return np.array(array)
+            raise ForeignError(f"{place}: act returned {shown(action)}, no action of {self.space}")
+        return np.array(action)
 
 
 class Codec:

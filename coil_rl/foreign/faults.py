@@ -6,8 +6,6 @@ and the step, and says what came and what was expected.
 
 from __future__ import annotations
 
-import copy
-import inspect
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -153,62 +151,3 @@ def action_array(value: Any) -> NDArray[Any]:
     if not np.isfinite(array).all():
         raise ForeignError(f"the action is {shown(array)}, which is not finite")
     return array
-
-
-class Predictor:
-    """A trained model of another library as a controller: what has `predict` gets `act`.
-
-    The models of Stable-Baselines3 and its relatives have `predict(observation, state,
-    episode_start, deterministic)`, which returns the action and the state for the next call.
-
-    Args:
-        model: the model. `predict` must take `deterministic`; the others are given if it takes
-            them. A space of its own, `observation_space`, decides how it is given choices.
-    """
-
-    def __init__(self, model: Any) -> None:
-        self.model = model
-        parameters = inspect.signature(model.predict).parameters
-        self.takes = {name for name in ("state", "episode_start") if name in parameters}
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin an episode: forget the state."""
-        self.state, self.first = None, True
-
-    def act(self, observation: Any) -> Any:
-        """Return the deterministic action for an observation.
-
-        Args:
-            observation: of one row.
-        """
-        given = {"state": self.state, "episode_start": np.array([self.first])}
-        known = {name: given[name] for name in self.takes}
-        answer = self.model.predict(observation, deterministic=True, **known)
-        self.first = False
-        if isinstance(answer, tuple) and len(answer) == 2:
-            answer, self.state = answer
-        return answer
-
-
-def predicts(thing: Any) -> bool:
-    """Return whether an object or class is a trained model: no `act`, but a `predict`.
-
-    It takes `deterministic`, as those of Stable-Baselines3 do; those of scikit-learn do not.
-    """
-    predict = getattr(thing, "predict", None)
-    if not callable(predict) or callable(getattr(thing, "act", None)):
-        return False
-    try:
-        return "deterministic" in inspect.signature(predict).parameters
-    except (TypeError, ValueError):  # some functions written in C have no signature
-        return False
-
-
-def acting(thing: Any) -> Any:
-    """Return an object with `act` for one row: a copy of a controller, or a model as a controller.
-
-    Args:
-        thing: has `act`, or is a model, which all rows share.
-    """
-    return Predictor(thing) if predicts(thing) else copy.deepcopy(thing)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
-from coil_rl.envs.limits import check_range
 from coil_rl.foreign.batch import SeededRows
 from coil_rl.foreign.codec import (
     Choices,
@@ -32,14 +31,16 @@ from coil_rl.foreign.makers import (
     metadata_of,
     name_of,
 )
-from coil_rl.foreign.plant import GymnasiumPlant, resolved_controller
+from coil_rl.foreign.plant import GymnasiumPlant
 from coil_rl.foreign.rows import GymnasiumRows
 from coil_rl.foreign.workers import AUTO, Workers, choose, timed
+from coil_rl.ranges import Count, Seed, checked
 
 MOST_WORKERS = 256
 RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "controller", "next")
 
 
+@checked
 class GymnasiumEnv(SeededRows):
     """Gymnasium envs as one env of batch size [num_envs].
 
@@ -73,13 +74,13 @@ class GymnasiumEnv(SeededRows):
         cases: number of different episodes, by default `num_envs`; needs `first_seed`.
         info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], NaN where
             missing.
-        controllers: by name, a controller or its import path "PACKAGE.MODULE:THING". A class gets
-            one object an env, `THING(env)`, with a method `act(observation)` and, if it wants,
-            `reset()`, called at the start of an episode; a function is called as `THING(env,
-            observation)`. Either may be a `functools.partial`. Its action for the present
+        controllers: by name. A class gets one object an env, `THING(env)`, with a method
+            `act(observation)` and, if it wants, `reset()`, called at the start of an episode;
+            without it each episode gets a new object. A function is called as
+            `THING(env, observation)`. Either may be a `functools.partial`. An object with `act`,
+            or a trained model with `predict`, is used as it is. Its action for the present
             observation is written as ("controller", NAME), not clamped, in the env's own
-            numbering; after a termination it is the last one. An object with `act`, or a trained
-            model with `predict`, is used as it is.
+            numbering; after a termination it is the last one.
         fresh: whether every episode has a new env, for those whose reset leaves something of the
             past. BipedalWalker is one: without `fresh`, its episodes depend on the seed and, a
             little, on those before.
@@ -99,7 +100,7 @@ class GymnasiumEnv(SeededRows):
 
     Raises:
         ValueError: if the env cannot be made, has a space that is not supported or an entry with a
-            reserved name or bounds that leave no choice, or if a controller cannot be imported.
+            reserved name or bounds that leave no choice, or if a controller cannot act.
         ForeignError: at a reset or a step, for what the env or a controller raises or returns that
             does not fit; see `coil_rl.foreign.faults`.
 
@@ -115,28 +116,25 @@ class GymnasiumEnv(SeededRows):
     def __init__(
         self,
         id: str | Callable[..., Env],
-        num_envs: int = 1,
+        num_envs: Count = 1,
         *,
         options: Mapping[str, Any] | None = None,
         reset_options: Mapping[str, Any] | None = None,
         wrappers: Sequence[Callable[[Env], Env]] = (),
-        max_steps: int | None = None,
-        seed: int = 0,
-        first_seed: int | None = None,
-        cases: int | None = None,
+        max_steps: Count | None = None,
+        seed: Seed = 0,
+        first_seed: Seed | None = None,
+        cases: Count | None = None,
         info: Sequence[str] = (),
-        controllers: Mapping[str, str | Callable[..., Any]] | None = None,
+        controllers: Mapping[str, Any] | None = None,
         fresh: bool = False,
         render: bool = False,
         workers: int | str = 0,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
         _check_workers(workers)
-        makers = {
-            name: resolved_controller(name, thing) for name, thing in (controllers or {}).items()
-        }
+        makers = dict(controllers or {})
         settings = dict(options or {})
         if max_steps is not None:
             settings["max_episode_steps"] = max_steps

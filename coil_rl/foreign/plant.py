@@ -4,14 +4,11 @@ Arrays are copied, because many envs return one buffer at every step.
 """
 
 import copy
-import inspect
 import math
-import pkgutil
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, suppress
-from functools import partial
 from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
@@ -25,15 +22,14 @@ from torchrl.envs import EnvBase, TransformedEnv
 from coil_rl.foreign.codec import Codec
 from coil_rl.foreign.faults import (
     ForeignError,
-    acting,
     flag,
     foreign,
     largest,
     number,
-    predicts,
     shortened,
     shown,
 )
+from coil_rl.foreign.host import Host, maker_beside
 from coil_rl.foreign.limit import limit_of, warn_of_limit
 from coil_rl.foreign.makers import Env
 
@@ -140,7 +136,8 @@ class GymnasiumPlant(Plant):
             self.alive[id(env.unwrapped)] = env.unwrapped
         self.limit = limit_of(env)
         self.controllers = {
-            name: controller_of(name, maker, env) for name, maker in self.makers.items()
+            name: Host(maker_beside(thing, name, env), name, beside=lambda: self.place)
+            for name, thing in self.makers.items()
         }
 
     def begin(self, seed: int) -> None:
@@ -169,7 +166,7 @@ class GymnasiumPlant(Plant):
             self._look_for_masks()
             self.values = self.codec.read(self.observation)
         self.reward, self.terminated, self.truncated = 0.0, False, False
-        self._reset_controllers()
+        self._begin_controllers()
         self._advise()
 
     def step(self, action: Any) -> None:
@@ -232,7 +229,7 @@ class GymnasiumPlant(Plant):
         except ForeignError as error:
             raise ValueError(f"it does not fit the env {self.name}: {error}") from error
         if first:
-            self._reset_controllers()
+            self._begin_controllers()
         self._advise()
 
     def _look_for_masks(self) -> None:
@@ -258,19 +255,15 @@ class GymnasiumPlant(Plant):
                 f"{self.place}: info entry {name!r} is {shown(value)}, which is not a number"
             ) from error
 
-    def _reset_controllers(self) -> None:
-        for name, (_, reset) in self.controllers.items():
-            with foreign(f"the controller {name}", "reset"):
-                reset()
+    def _begin_controllers(self) -> None:
+        for host in self.controllers.values():
+            host.begin()
 
     def _advise(self) -> None:
-        for name, (act, _) in self.controllers.items():
+        for name, host in self.controllers.items():
             # A copy, as the env may go on with the arrays that it returned.
-            observation = copy.deepcopy(self.observation)
-            with foreign(f"the controller {name} beside {self.place}", "it"):
-                advice = act(observation)
-            with self.placed():
-                self.advice[name] = self.codec.actions.fitted(name, advice)
+            action = host.act(copy.deepcopy(self.observation))
+            self.advice[name] = self.codec.actions.fitted(action, host.place)
 
     def render(self) -> NDArray[np.uint8]:
         """Return a copy of a picture, [height, width] or [height, width, 3 or 4].
@@ -362,47 +355,3 @@ class TorchRLPlant(Plant):
                 ends = after.get(name, None)
                 if ends is not None:
                     after[name] = torch.ones_like(ends)
-
-
-def resolved_controller(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
-    """Return a controller by its import path PACKAGE.MODULE:THING."""
-    if not isinstance(thing, str):
-        return thing
-    try:
-        return pkgutil.resolve_name(thing)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(
-            f"controller {name}: {thing!r} cannot be imported ({error}); write PACKAGE.MODULE:THING"
-        ) from error
-
-
-def controller_of(
-    name: str, maker: Callable[..., Any], env: Env
-) -> tuple[Callable[[Any], Any], Callable[[], Any]]:
-    """Make a controller for an env.
-
-    Args:
-        name: of the controller, for messages.
-        maker: a class, a function or a `functools.partial` of either; or an object with `act` or
-            `predict`.
-        env: beside which the controller acts.
-
-    Returns:
-        What gives the action for an observation, and what to call at the start of an episode.
-    """
-    if not inspect.isclass(getattr(maker, "func", maker)):
-        if not predicts(maker) and not callable(getattr(maker, "act", None)):
-            return partial(maker, env), lambda: None
-        controller = acting(maker)
-        return controller.act, getattr(controller, "reset", lambda: None)
-    try:
-        controller = maker(env)
-    except TypeError as error:
-        raise ValueError(f"controller {name} cannot be made with its env: {error}") from error
-    if predicts(controller):
-        controller = acting(controller)
-    if not callable(getattr(controller, "act", None)):
-        raise ValueError(
-            f"controller {name}: {type(controller).__name__} needs a method act(observation)"
-        )
-    return controller.act, getattr(controller, "reset", lambda: None)

@@ -10,10 +10,10 @@ if TYPE_CHECKING:
     from coil_rl.cones.spline import SplineGuide as SplineGuide
     from coil_rl.cones.spline_memory import SplineMemoryGuide as SplineMemoryGuide
     from coil_rl.foreign.controllers import ControllerGuide as ControllerGuide
-    from coil_rl.foreign.controllers import EntryGuide as EntryGuide
     from coil_rl.foreign.controllers import PerRow as PerRow
-    from coil_rl.foreign.controllers import RecordedGuide as RecordedGuide
+    from coil_rl.guides.recorded import RecordedGuide as RecordedGuide
     from coil_rl.guides.simple import ConstantGuide as ConstantGuide
+    from coil_rl.guides.simple import EntryGuide as EntryGuide
     from coil_rl.guides.simple import FollowAdvice as FollowAdvice
     from coil_rl.guides.simple import RandomGuide as RandomGuide
     from coil_rl.guides.simple import ZeroGuide as ZeroGuide

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
 from typing import Any, SupportsFloat, TypeGuard
 
 import gymnasium
@@ -12,8 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from coil_rl.foreign.codec import Actions
-from coil_rl.foreign.faults import foreign
-from coil_rl.foreign.plant import controller_of, resolved_controller
+from coil_rl.foreign.host import Host, maker_beside
 from coil_rl.transforms.action_space import ActionSpace
 
 ADVICE = "guide_action"  # key of the advice in an observation of several entries
@@ -33,7 +32,7 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
         controller: whose action is the advice, as in `GymnasiumEnv`: a class, made as
             `THING(env)`, with `act(observation)` and, if it wants, `reset()`, called at the start
             of an episode; a function, called as `THING(env, observation)`; an object with `act`,
-            or a trained model with `predict`; or the import path of one.
+            or a trained model with `predict`.
 
     Attributes:
         advice: the present one, [A], as observed; None before the first reset.
@@ -53,14 +52,11 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
         ((6,), [1.0, 0.0])
     """
 
-    def __init__(
-        self, env: gymnasium.Env[Any, Any], controller: str | Callable[..., Any] | Any
-    ) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], controller: Any) -> None:
         super().__init__(env)
         self.actions = Actions(type(env.unwrapped).__name__, env.action_space, torch.float32)
         self.space = ActionSpace(self.actions.spec, 0, self.actions.first)
-        thing = resolved_controller("advice", controller)
-        self.act, self.begin = controller_of("advice", thing, env)
+        self.host = Host(maker_beside(controller, "advice", env), "advice")
         self.advice: NDArray[np.float32] | None = None
         self.observation_space = self._with(env.observation_space, self._advice_space())
 
@@ -98,8 +94,7 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
             options: of the env.
         """
         observation, info = self.env.reset(seed=seed, options=options)
-        with foreign("the controller", "reset"):
-            self.begin()
+        self.host.begin()
         self._advise(observation)
         return self._observed(observation), info
 
@@ -115,9 +110,8 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._observed(observation), reward, terminated, truncated, info
 
     def _advise(self, observation: Any) -> None:
-        with foreign("the controller", "it"):
-            given = self.act(observation)
-        action = torch.as_tensor(self.actions.fitted("advice", given))
+        given = self.host.act(copy.deepcopy(observation))
+        action = torch.as_tensor(self.actions.fitted(given, self.host.place))
         shape = self.space.event or action.shape
         vectors = self.space.advice(action.reshape(shape), torch.Size())
         self.advice = self.space.normalise(vectors).flatten().numpy().astype(np.float32)

@@ -8,13 +8,14 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.limits import check_range
-from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.ranges import Count, checked
+from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
+from coil_rl.transforms.hosted import ToldGuide
 
 
 def _batch_of(tensordict: TensorDictBase, key: NestedKey) -> torch.Size:
@@ -68,7 +69,8 @@ class ConstantGuide(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.value.expand(*batch, -1))
 
 
-class ZeroGuide(TensorDictModuleBase):
+@checked
+class ZeroGuide(ToldGuide):
     """Guide with the neutral action: the centre of a bounded coordinate, the first of some choices.
 
     Args:
@@ -81,19 +83,14 @@ class ZeroGuide(TensorDictModuleBase):
     pure = True
 
     def __init__(
-        self, size: int = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action"
+        self, size: Count = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action"
     ) -> None:
-        check_range(1, size=size)
         self.in_keys, self.out_keys = [in_key], [out_key]
         super().__init__()
         self.value: Tensor = nn.Buffer(torch.zeros(size), persistent=False)
 
-    def in_space(self, space: ActionSpace) -> None:
-        """Take the neutral action of a space.
-
-        Args:
-            space: of the env.
-        """
+    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
+        """Take the neutral action of the env."""
         self.value = space.neutral()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -102,7 +99,8 @@ class ZeroGuide(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.value.expand(*batch, *self.value.shape))
 
 
-class RandomGuide(TensorDictModuleBase):
+@checked
+class RandomGuide(ToldGuide):
     """Guide with random actions, uniform in the actions of the env: numbers or choices.
 
     Of a coordinate without a bound see `ActionSpace.random`. The state of its generator is in
@@ -122,28 +120,38 @@ class RandomGuide(TensorDictModuleBase):
         self,
         low: float | None = None,
         high: float | None = None,
-        size: int = 1,
+        size: Count = 1,
         seed: int = 0,
         in_key: NestedKey = "observation",
         out_key: NestedKey = "action",
     ) -> None:
-        check_range(1, size=size)
         self.in_keys, self.out_keys = [in_key], [out_key]
         super().__init__()
         self.module = _Uniform(low, high, size, seed)
 
-    def in_space(self, space: ActionSpace) -> None:
-        """Draw from a space from here on, unless `low` or `high` is given.
-
-        Args:
-            space: of the env.
-        """
+    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
+        """Draw from the actions of the env from here on, unless `low` or `high` is given."""
         self.module.space = space
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         batch = _batch_of(tensordict, self.in_keys[0])
         return tensordict.set(self.out_keys[0], self.module(batch, tensordict.device))
+
+
+class EntryGuide(TensorDictModule):
+    """The action in an entry of the env, as of a controller inside of it.
+
+    Such a controller may know more than agents observe.
+
+    Args:
+        key: the entry, [*batch, A].
+    """
+
+    sees = "env"
+
+    def __init__(self, key: NestedKey | Sequence[str]) -> None:
+        super().__init__(nn.Identity(), in_keys=[nested_key(key)], out_keys=["action"])
 
 
 class FollowAdvice(TensorDictModuleBase):

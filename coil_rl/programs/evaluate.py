@@ -14,20 +14,15 @@ from coil_rl.errors import UserError
 from coil_rl.programs import app
 
 # Keys that have an effect on the evaluation of a run, and on that of guides alone.
-OF_A_RUN = ("run", "exported", "track", "disturb", "degrade", "evaluation")
-OF_GUIDES = ("preset", "env", "guide", *OF_A_RUN)
-OWN = (
-    "repeats",
-    "policy",
-    "gif",
-    "advice",
-    "fallback",
-)  # keys of `evaluation` of the command, not of the run
+OF_A_RUN = ("run", "exported", "track", "disturb", "degrade", "beside", "evaluation")
+OF_GUIDES = ("preset", "env", "guide", *(key for key in OF_A_RUN if key != "beside"))
+# Keys of `evaluation` of the command, not of the run.
+OWN = ("repeats", "policy", "gif", "advice", "beside")
 OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
 # Keys of `evaluation` that only a training reads, and those that only a policy with actions to
 # sample or advice to listen to has.
 OF_TRAINING = ("curve", "guides")
-OF_AN_AGENT = ("repeats", "policy", "advice", "fallback")
+OF_AN_AGENT = ("repeats", "policy", "advice", "beside")
 
 
 def evaluate(config: DictConfig) -> float:
@@ -53,8 +48,7 @@ def evaluate(config: DictConfig) -> float:
         return report_outcome(results)
     run = assemble(of_run, folder)
     policy = run.policy(run.trial.env(SOME_ROWS))  # not of the training, whose env may be another
-    fallback = run.make_fallback(policy) if run.fallback else None
-    judge(run.trial, policy, results, config.seed, fallback)
+    judge(run.trial, policy, results, config.seed, run.drivers(policy))
     return report_outcome(results)
 
 

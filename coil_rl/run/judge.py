@@ -30,11 +30,10 @@ from coil_rl.measures import (
 from coil_rl.output import decoration, progress, say
 from coil_rl.report import Returns, markdown_table
 from coil_rl.report.pictures import Picture
-from coil_rl.report.runs import FALLBACK
 from coil_rl.report.statistics import difference
 from coil_rl.report.table import AUTO_FORMAT, fitted, return_format
+from coil_rl.run.beside import Driver
 from coil_rl.run.evaluation import EvaluationResult, evaluate_policy
-from coil_rl.run.fallback import Fallback
 from coil_rl.run.parts import TEST, EnvMaker
 from coil_rl.run.policy_batch import PartlySampled, traced
 from coil_rl.run.reasons import SENTENCES
@@ -167,13 +166,13 @@ def judge(
     policy: TensorDictModuleBase | None,
     folder: Path,
     seed: int,
-    fallback: Fallback | None = None,
+    drivers: Sequence[Driver] = (),
 ) -> Judgement:
     """Evaluate a policy beside its guides; write tables and pictures.
 
     Each guide acts once in each case, beside the policy where both have the same env. A policy acts
     once with deterministic actions, `trial.repeats` times with sampled ones if it samples, once
-    with each advice of `trial.advice` instead of its own, and once with a `fallback`.
+    with each advice of `trial.advice` instead of its own. Each of the `drivers` acts once.
 
     The files are `episodes.csv`, `evaluation.md` (means) and `evaluation.csv`, with which a run is
     finished, and then pictures. A picture that fails is a warning.
@@ -183,24 +182,24 @@ def judge(
         policy: of the run; None for the guides alone.
         folder: for the files.
         seed: of the sampled actions.
-        fallback: the policy with a guide to fall back to.
+        drivers: further ones, beside the policy.
     """
     judgement = Judgement(trial.evaluation.measures)
     if policy is None or not trial.together:
         watching = [picture for picture in trial.pictures if picture.watches]
         for name, result in trial.guide_results(trial.evaluation, watching).items():
             judgement.add(result, name)
-    share = None
+    said: list[str] = []
     torch.manual_seed(seed)
     with progress(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
         if policy is not None:
             _evaluate(trial, policy, judgement, bar)
-        if fallback is not None:
-            result = trial.evaluation.run(trial.env(len(trial.evaluation.cases)), fallback)
-            judgement.add(result, f"{trial.label}{FALLBACK}")
-            share = fallback.share(result)
+        for driver in drivers:
+            result = trial.evaluation.run(trial.env(len(trial.evaluation.cases)), driver.policy)
+            judgement.add(result, f"{trial.label} {driver.name}")
+            said += driver.said(result)
     record.EPISODES.write(folder, judgement.episodes)
-    page = _page(trial, judgement, has_policy=policy is not None, share=share)
+    page = _page(trial, judgement, has_policy=policy is not None, said=said)
     record.PAGE.write(folder, page)
     table = with_denominators(judgement.table, judgement.counts)
     record.EVALUATION.write(folder, table)
@@ -260,7 +259,7 @@ def _evaluate_with(
         judgement.add(result[count:own], trial.label, advice, "sampled")
 
 
-def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, share: float | None) -> str:
+def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, said: Sequence[str]) -> str:
     """Return the page for people: a table and sentences."""
     columns = dict(COLUMNS)
     if not trial.advice:
@@ -282,7 +281,7 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, share: float 
             chance, mine = trial.chance(), judgement.shown[trial.label]
             for name in trial.guides:
                 page += not_worse(mine, judgement.shown[name], name, chance)
-    page += SENTENCES.said("fallback", share=share)
+    page += said
     return "\n\n".join([*page, *trial.notes])
 
 
@@ -369,13 +368,13 @@ def _watch(env: EnvBase, pictures: list[Picture], rows: Mapping[str, int], runni
 def report_outcome(folder: Path) -> float:
     """Print the evaluation of a run, and return the mean reward of its deterministic policy.
 
-    Without a policy it is that of the guide; that of a fallback is on the page only. A damaged file
-    is a `UserError`.
+    Without a policy it is that of the guide; those of further drivers are on the page only. A
+    damaged file is a `UserError`.
     """
     rows = record.EVALUATION.need(folder)
     means = [row for row in rows if (row["case"], row["actions"]) == (MEAN_CASE, "deterministic")]
-    with_fallback = {f"{row['driver']}{FALLBACK}" for row in means}
-    own = [row for row in means if not row["advice"] and row["driver"] not in with_fallback]
+    beside = tuple(f"{row['driver']} " for row in means)  # they are called after their policy
+    own = [row for row in means if not row["advice"] and not row["driver"].startswith(beside)]
     if not own:
         raise UserError(f"{folder / record.EVALUATION.name} has no means; evaluate again")
     reward, completed = own[-1]["reward"], own[-1].get("completed", math.nan)

@@ -23,11 +23,11 @@ from coil_rl.output import decoration, say
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.report.runs import EVALUATION, begun_with
 from coil_rl.run import checkpoint
+from coil_rl.run.beside import Beside, Driver
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import Watch
 from coil_rl.run.delivery import guide_of
 from coil_rl.run.experiment import PUT_BACK
-from coil_rl.run.fallback import Fallback, make_fallback
 from coil_rl.run.folder import (
     HANDED_OVER,
     begin,
@@ -102,7 +102,7 @@ class Run:
         delivery: what the run hands over, "last" for the last policy, or "tested" for what is best
             in a test at the end, see `Delivery`.
         which: policy that is evaluated: "handed_over" or "last".
-        fallback: whether to evaluate the policy also with its guide to fall back to.
+        beside: what makes further drivers of the evaluation table.
         compiled: whether to compile the steps of env and guides where they can be.
         device: of everything.
         threads: of torch.
@@ -134,7 +134,7 @@ class Run:
     init: Path | None = None
     delivery: str = "last"
     which: str = HANDED_OVER
-    fallback: bool = False
+    beside: Sequence[Beside] = ()
     compiled: bool = False
     device: str = "cpu"
     threads: int = 1
@@ -218,10 +218,9 @@ class Run:
         if cases is not None:
             trial = trial_with_cases(trial, whole("cases", cases))
         policy = self.policy()
-        fallback = self.make_fallback(policy) if self.fallback else None
         with tempfile.TemporaryDirectory() as temporary:
             place = Path(temporary) if folder is None else Path(folder).expanduser()
-            judgement = judge(trial, policy, place, self.seed, fallback)
+            judgement = judge(trial, policy, place, self.seed, self.drivers(policy))
         return pd.DataFrame(judgement.table)
 
     def controller(self, which: str | None = None) -> Controller:
@@ -323,8 +322,8 @@ class Run:
             if resumed:
                 report_changed_versions(self.folder)
             policy = self.learn(resumed=resumed) if self.has_agent else None
-            fallback = self.make_fallback(policy) if self.fallback else None
-            judge(self._trial_with_reasons(), policy, self.folder, self.seed, fallback)
+            drivers = self.drivers(policy)
+            judge(self._trial_with_reasons(), policy, self.folder, self.seed, drivers)
             reward = report_outcome(self.folder)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"continue with: {resume_command(self.folder)}") from None
@@ -472,12 +471,9 @@ class Run:
         except UserError as error:
             raise UserError(f"run {self.folder}: {error}") from error
 
-    def make_fallback(self, policy: TensorDictModuleBase | None) -> Fallback:
-        """Return the policy of the run with its first guide to fall back to.
-
-        Errors are those of `make_fallback`.
-        """
-        return make_fallback(policy, self.make_env, self.make_learner, self.folder, self.device)
+    def drivers(self, policy: TensorDictModuleBase | None) -> list[Driver]:
+        """Return the further drivers of the evaluation table, given the policy."""
+        return [each.driver(self, policy) for each in self.beside]
 
     def _settings_of_parts(self) -> dict[str, Any]:
         """Return what reports need of a run that was made from parts."""

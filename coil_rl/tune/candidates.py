@@ -8,9 +8,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices
+from coil_rl.transforms.hosted import HostedGuide, ToldGuide
 
 
-class Candidates(TensorDictModuleBase):
+class Candidates(HostedGuide):
     """Guide that acts by one of several guides of one kind in each part of the rows.
 
     The rows are divided evenly: of [B] rows the first B / N are those of the first of N guides.
@@ -24,16 +25,14 @@ class Candidates(TensorDictModuleBase):
         self.in_keys: list[NestedKey] = list(first.in_keys)
         self.out_keys: list[NestedKey] = list(first.out_keys)
         super().__init__()
-        self.foreign = getattr(first, "foreign", False)
-        self.space: ActionSpace | None = None
-        self.choices: OwnChoices = {}
+        self.known: tuple[ActionSpace, OwnChoices] | None = None  # of the env
         self.guides = nn.ModuleList(guides)
         self.share = 0  # number of rows of each guide, known at the start of episodes
 
     @property
-    def by_row(self) -> bool:
+    def by_row(self) -> bool:  # type: ignore[override]
         """Whether there is one object for each row, see `Guides`."""
-        return all(getattr(guide, "by_row", False) for guide in self.guides)
+        return all(isinstance(guide, HostedGuide) and guide.by_row for guide in self.guides)
 
     def replace(self, guides: Sequence[TensorDictModuleBase]) -> None:
         """Act by other guides of the same class from here on, in new episodes.
@@ -42,31 +41,15 @@ class Candidates(TensorDictModuleBase):
             guides: perhaps of another number.
         """
         self.guides = nn.ModuleList(guides)
-        if self.space is not None:
-            self.in_space(self.space)
-        self.reads_choices(self.choices)
+        if self.known is not None:
+            self.meet(*self.known)
 
-    def in_space(self, space: ActionSpace) -> None:
-        """Tell the guides that ask for it which actions there are.
-
-        Args:
-            space: of the env.
-        """
-        self.space = space
+    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
+        """Tell the guides that ask for it about their env."""
+        self.known = space, choices
         for guide in self.guides:
-            if hasattr(guide, "in_space"):
-                guide.in_space(space)  # type: ignore[operator]
-
-    def reads_choices(self, choices: OwnChoices) -> None:
-        """Let the guides that can do so read choices as the env gives them.
-
-        Args:
-            choices: what converts an entry, by entry.
-        """
-        self.choices = choices
-        for guide in self.guides:
-            if hasattr(guide, "reads_choices"):
-                guide.reads_choices(choices)  # type: ignore[operator]
+            if isinstance(guide, ToldGuide):
+                guide.meet(space, choices)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the actions, and what the guides remember for their next step."""

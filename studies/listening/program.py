@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
+import coil_studies.schema  # noqa: F401  registers the root configuration with Hydra
 from coil_rl.errors import UserError
 from coil_rl.programs import app
 from coil_rl.programs.evaluate import OF_TRAINING, configured
@@ -169,7 +170,7 @@ def check(config: DictConfig) -> None:
     app.check_run(config)
 
 
-main = partial(app.run_program, listen, "listen", check)
+main = partial(app.run_program, listen, "listen", check, "pkg://coil_studies.conf")
 
 if __name__ == "__main__":
     main()

@@ -273,7 +273,7 @@ def test_one_hot_choices_are_those_of_an_index():
 )
 def test_random_actions_are_those_of_the_random_guide(spec, low, high):
     env, guide = Copies(spec), RandomGuide()
-    guide.in_space(ActionSpace(spec, 1))
+    guide.meet(ActionSpace(spec, 1), {})
     for actions in (random_action(env, env.reset()), guide(env.reset())):
         drawn = actions["action"]
         assert (drawn >= low).all()

@@ -46,5 +46,5 @@ def test_it_is_a_valid_transform_whose_second_one_has_the_last_word():
 
 
 def test_probability_out_of_range_is_refused():
-    with pytest.raises(ValueError, match=r"probability=1\.5 must be at least 0 and at most 1"):
+    with pytest.raises(ValueError, match=r"probability=1\.5 must be at most 1"):
         AdviceDropout(1.5)

@@ -62,7 +62,7 @@ def followed(env, steps=3):
     policy, carrier = FollowAdvice(env), env.reset()
     for _ in range(steps):
         _, carrier = env.step_and_maybe_reset(policy(carrier))
-    return np.array(env.base_env.rows[0].gate.env.got)
+    return np.array(env.base_env.held.plants[0].env.got)
 
 
 @pytest.mark.parametrize("normalised", [True, False], ids=["normalised", "own unit"])
@@ -182,7 +182,7 @@ def test_box_of_whole_numbers_is_choices():
     assert followed(env).tolist() == [[2, 1]] * 3
     env = GymnasiumEnv(lambda: Seen(space), 8)
     env.rollout(100)
-    got = np.concatenate([row.gate.env.got for row in env.rows])
+    got = np.concatenate([plant.env.got for plant in env.held.plants])
     assert set(got[:, 0].tolist()) == {-2, -1, 0, 1, 2}
     with pytest.raises(ValueError, match="of whole numbers, which are choices, but only up to 32"):
         GymnasiumEnv(lambda: Seen(box([0], [1000], np.int64)))
@@ -220,10 +220,10 @@ def test_residual_and_distance_are_computed_in_normalised_actions(normalised):
     state = env.reset()
     middle = torch.zeros(1, 2) if normalised else torch.tensor([[0.5, 200.0]])
     after = env.step(state.clone().set("action", middle))["next"]
-    np.testing.assert_allclose(env.base_env.rows[0].gate.env.got[-1], [0.25, 140], rtol=1e-6)
+    np.testing.assert_allclose(env.base_env.held.plants[0].env.got[-1], [0.25, 140], rtol=1e-6)
     top = torch.ones(1, 2) if normalised else torch.tensor([[1.0, 300.0]])
     after = env.step(state.clone().set("action", top))["next"]
-    np.testing.assert_allclose(env.base_env.rows[0].gate.env.got[-1], [0.5, 190], rtol=1e-6)
+    np.testing.assert_allclose(env.base_env.held.plants[0].env.got[-1], [0.5, 190], rtol=1e-6)
     assert float(after["guide_distance"]) == pytest.approx(0.5 * 2**0.5, rel=1e-5)
 
 
@@ -262,7 +262,7 @@ def test_guide_acts_exactly_where_float32_is_too_coarse():
     assert np.ravel(got).tolist() == [1e7 + 6.375] * 3
     env = advised(space, ControllerGuide(lambda seen: [1e7 + 6.375]), ResidualAction(0.5))
     env.step(env.reset().set("action", torch.full((1, 1), 0.25)))
-    (got,) = env.base_env.rows[0].gate.env.got[-1] - 1e7
+    (got,) = env.base_env.held.plants[0].env.got[-1] - 1e7
     assert got == pytest.approx(6.375 + 0.5 * 0.25 * 5, abs=1e-6)
 
 
@@ -277,7 +277,7 @@ def test_values_of_choices_are_in_the_unit_of_the_env():
         state = env.reset()
         for choice in range(3):
             env.step(state.clone().set("action", torch.tensor([choice])))
-        got = np.concatenate(env.base_env.rows[0].gate.env.got)
+        got = np.concatenate(env.base_env.held.plants[0].env.got)
         np.testing.assert_allclose(got, expected, atol=1e-6)
     with pytest.raises(ValueError, match=r"must lie between the action's bounds 0.0 and 2.0"):
         advised(box([0], [2]), ConstantGuide([0.4]), DiscreteActions([-0.5, 0.5])).reset()

@@ -17,8 +17,10 @@ def push(env, observation):
 
 BESIDE = [
     "env=cart_pole",
-    f"+env.controllers.leaning={__name__}.push",
-    f"+env.controllers.other={__name__}.push",
+    *(
+        f"+env.controllers.{name}={{_target_: {__name__}.push, _partial_: true}}"
+        for name in ("leaning", "other")
+    ),
     "guide=entry",
     "guide.entry.key=[controller,leaning]",
     "run_dir=unused",
@@ -31,7 +33,7 @@ def composed(*overrides):
 
 
 def beside(env):
-    return list(env.base_env.rows[0].controllers)
+    return list(env.base_env.held.plants[0].controllers)
 
 
 def test_agent_without_a_guide_has_no_controllers():

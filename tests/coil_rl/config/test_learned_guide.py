@@ -149,7 +149,7 @@ def test_policy_that_observes_its_last_actions_acts_as_in_its_own_env(env_id, tm
 def test_env_with_another_action_is_refused(tmp_path):
     run = make_untrained_run(tmp_path / "run", "env=gym", "env.id=Pendulum-v1", "method=ppo")
     guide = LearnedGuide(str(run))
-    guide.in_space(ActionSpace(Bounded(-2, 2, (1, 1)), 1))
+    guide.meet(ActionSpace(Bounded(-2, 2, (1, 1)), 1), {})
     for spec in (Unbounded((1, 1)), Bounded(-1, 1, (1, 1)), Categorical(3, (1,))):
         with pytest.raises(UserError, match=r"acts from \[-2.0\] to \[2.0\], but the action of"):
-            guide.in_space(ActionSpace(spec, 1))
+            guide.meet(ActionSpace(spec, 1), {})

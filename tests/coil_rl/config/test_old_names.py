@@ -23,7 +23,7 @@ def test_part_that_went_is_refused(old):
         renamed({"learner": {"regressor": {"_target_": old}}}, PATH)
 
 
-def test_keys_that_were_renamed_are_found_in_the_method_only():
+def test_keys_that_were_renamed_are_found_in_their_place_only():
     search = {"search": {"cases": 4}}
     found = with_todays_keys({"label": "tune", "method": {"name": "tune", **search}, "env": search})
     assert found == {
@@ -31,3 +31,12 @@ def test_keys_that_were_renamed_are_found_in_the_method_only():
         "method": {"name": "tune", "run": {"cases": 4}},
         "env": search,
     }
+
+
+@pytest.mark.parametrize(
+    ("fallback", "beside"),
+    [(False, {}), (True, {"fallback": {"_target_": "coil_studies.Fallback"}})],
+)
+def test_fallback_of_an_older_run_is_a_driver_beside(fallback, beside):
+    found = with_todays_keys({"evaluation": {"cases": 3, "fallback": fallback}})
+    assert found == {"evaluation": {"cases": 3, "beside": beside}}

@@ -149,7 +149,7 @@ gymnasium.register("Changing-v0", Plant)
     [
         ["env.id=changing:Plant"],
         ["env.id=changing:Changing-v0"],
-        ["env.id=Pendulum-v1", "+env.controllers.mine=changing:Plant"],
+        ["env.id=Pendulum-v1", "+env.controllers.mine={_target_: changing.Plant, _partial_: true}"],
         ["env.id=Pendulum-v1", "env.wrappers=[{_target_: changing.Plant, _partial_: true}]"],
     ],
     ids=["class", "registered", "controller", "wrapper"],

@@ -101,20 +101,16 @@ def test_target_outside_the_list_is_refused_before_any_import(target, saved, tmp
 @pytest.mark.parametrize(
     "path", ["os:system", "posix:system", "os.system", "builtins:eval", "coil_rl.files:os.system"]
 )
-@pytest.mark.parametrize(
-    "key", ["guide.theirs.of", "env.controllers.theirs", "env.of", "evaluation.env.controllers.x.y"]
-)
+@pytest.mark.parametrize("key", ["guide.theirs.of", "env.of"])
 def test_controller_outside_the_list_is_refused_before_any_import(
     key, path, saved, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(hydra.utils, "get_object", no_import)
     monkeypatch.setattr(importlib, "import_module", no_import)
-    for value in (path, {"a.b": path} if "controllers" in key else path):
-        with pytest.raises(
-            UserError,
-            match=rf"{key}[a-b.]* names '.*', which is no part of a run and could run code",
-        ):
-            read(tmp_path, changed(saved, key, value))
+    with pytest.raises(
+        UserError, match=rf"{key} names '.*', which is no part of a run and could run code"
+    ):
+        read(tmp_path, changed(saved, key, path))
 
 
 def test_gymnasium_env_of_a_module_is_refused_like_the_module(package, saved, tmp_path):
@@ -153,9 +149,6 @@ def test_controller_of_a_trusted_package_and_of_the_command_may_be_used(package,
     assert read(tmp_path, theirs).guide.theirs
     with pytest.raises(UserError, match="which is defined elsewhere"):
         read(tmp_path, changed(theirs, "guide.theirs.of", "their_package:os.system"))
-    for name in ("mine", "id"):
-        with pytest.raises(UserError, match="which is defined elsewhere"):
-            read(tmp_path, changed(saved, "env.controllers", {name: "their_package:os.system"}))
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,7 @@ def test_exported_guide_acts_in_its_own_action_only(name, tmp_path):
     for other, (spec, first, _) in SPACES.items():
         space = ActionSpace(spec, 1, first)
         if other == name:
-            guide.in_space(space)
+            guide.meet(space, {})
             continue
         with pytest.raises(UserError, match=r"is a policy for Sum, .*its action goes from"):
-            guide.in_space(space)
+            guide.meet(space, {})

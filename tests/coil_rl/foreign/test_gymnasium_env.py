@@ -557,8 +557,8 @@ def test_controllers_act_beside_their_envs():
 
 
 def test_heuristic_of_gymnasium_lands():
-    path = "gymnasium.envs.box2d.lunar_lander:heuristic"
-    env = build("LunarLander-v3", 4, first_seed=0, controllers={"heuristic": path})
+    heuristic = pytest.importorskip("gymnasium.envs.box2d.lunar_lander").heuristic
+    env = build("LunarLander-v3", 4, first_seed=0, controllers={"heuristic": heuristic})
     carrier, total = env.reset(), torch.zeros(4, 1)
     while not carrier["done"].all():
         carrier = env.step(carrier.set("action", carrier["controller", "heuristic"]))["next"]
@@ -577,7 +577,7 @@ def test_discrete_controller_gives_indices():
 @pytest.mark.parametrize("advice", [[0.0], [0.0, float("nan")], None])
 def test_wrong_advice_names_the_controller(advice):
     env = GymnasiumEnv("Echo-v0", controllers={"broken": lambda env, observation: advice})
-    with pytest.raises(ValueError, match=r"controller broken gave .*, not an action of Box"):
+    with pytest.raises(ValueError, match="the controller broken beside the env Echo-v0 "):
         env.reset()
 
 
@@ -606,10 +606,8 @@ def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
     ("id", "arguments", "message"),
     [
         ("CartPol-v1", {}, "the env CartPol-v1 cannot be made: .*Did you mean: `CartPole`"),
-        ("MyPlant-v0", {}, "write PACKAGE:MyPlant-v0"),
-        ("cart_poles.Cart", {}, "colon between them; write cart_poles:Cart$"),
-        ("outside_package.install.Room", {}, "write outside_package.install:Room$"),
-        ("outside_package.nothing.Room", {}, "write PACKAGE:outside_package.nothing.Room$"),
+        ("MyPlant-v0", {}, "or PACKAGE:MyPlant-v0 if a package registers"),
+        ("cart_poles.Cart", {}, "write MODULE:NAME for an env of a module, or PACKAGE:cart_poles"),
         ("odd_parts:Plan", {}, "registers none of this name; did you mean Plain\\?$"),
         ("gymnasium:CartPol-v1", {}, "; did you mean CartPole-v1\\?$"),
         ("no_such_module:X-v0", {}, "there is no module no_such_module; install its package"),
@@ -620,17 +618,12 @@ def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
         (
             "CartPole-v1",
             {"controllers": {"pid": "math:PID"}},
-            "controller pid: 'math:PID' cannot be imported",
+            r"'math:PID' is a text; write {_target_: math.PID, _partial_: true}",
         ),
         (
             "CartPole-v1",
-            {"controllers": {"pid": "builtins:str"}},
+            {"controllers": {"pid": str}},
             r"controller pid: str needs a method act\(obs",
-        ),
-        (
-            "CartPole-v1",
-            {"controllers": {"pid": "fractions:Fraction"}},
-            "controller pid cannot be made with its env",
         ),
         (
             "Echo-v0",

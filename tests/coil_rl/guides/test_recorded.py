@@ -59,12 +59,15 @@ def test_recording_begins_with_each_episode_and_holds_its_last_action(header, tm
         (None, "actions.csv cannot be read as numbers"),
         (
             "0.1\nleft\n",
-            r"actions.csv cannot be read as numbers with commas \(could not convert string to "
+            r"actions.csv cannot be read as numbers with commas .*\(could not convert string to "
             "float: 'left'",
         ),
         ("", "must hold at least one line of finite numbers"),
         ("a,b\n", "must hold at least one line of finite numbers"),
-        ("0.1\n0.1,0.2\n", r"cannot be read as numbers with commas \(its lines have 1 and 2"),
+        (
+            "0.1\n0.1,0.2\n",
+            "with commas between them, as many in each line",
+        ),
         ("nan\n0.1\n", "must hold at least one line of finite numbers"),
     ],
 )
@@ -82,26 +85,30 @@ def test_file_without_actions_is_refused(text, message, tmp_path):
     [
         ("\ufeff0.1\n0.2\n", [[0.1], [0.2]]),
         ("\ufeffpower\n0.1\n", [[0.1]]),
-        ("\u22120.1,\u20130.2\n", [[-0.1, -0.2]]),
-        ("# of Tuesday\n0.1,0.2 # the first\n\n# end\n", [[0.1, 0.2]]),
-        ("0.1;0.2\n", [[0.1, 0.2]]),
-        ("a;b\n0,1;-0,2\n", [[0.1, -0.2]]),
-        ("0.1 0.2\n0.3\t0.4\n", [[0.1, 0.2], [0.3, 0.4]]),
-        ('"0.1" , "0.2"\r\n', [[0.1, 0.2]]),
-        ("1e-1\n", [[0.1]]),
+        ("left (V),right (V)\r\n1e-1 , 0.2\r\n\n", [[0.1, 0.2]]),
     ],
 )
-def test_actions_of_a_file_in_another_dress(text, actions, tmp_path):
+def test_actions_of_a_plain_file(text, actions, tmp_path):
     file = tmp_path / "actions.csv"
     file.write_bytes(text.encode())
     torch.testing.assert_close(RecordedGuide(file).actions, torch.tensor(actions))
 
 
 @pytest.mark.parametrize(
-    "text", ["0.1,0.2\n0.1;0.2;0.3\n", "a,0.1\n0.1,0.2\n", "0.1,,0.2\n", "\x00"]
+    "text",
+    [
+        "\u22120.1\n0.2\n",  # another minus sign in the first line
+        "# of Tuesday\n0.1\n",
+        "0.1;0.2\n",
+        "0,1;-0,2\n0,3;0,4\n",
+        "0.1 0.2\n",
+        "a,0.1\n0.1,0.2\n",
+        "0.1,,0.2\n",
+        "\x00",
+    ],
 )
-def test_file_that_is_no_table_of_numbers_is_refused(text, tmp_path):
+def test_file_in_another_format_is_refused(text, tmp_path):
     file = tmp_path / "actions.csv"
     file.write_text(text)
-    with pytest.raises(ValueError, match=r"actions.csv (cannot be read|must hold)"):
+    with pytest.raises(ValueError, match=r"actions.csv cannot be read as numbers with commas"):
         RecordedGuide(file)

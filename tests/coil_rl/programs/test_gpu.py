@@ -40,7 +40,7 @@ def test_method_is_trained_and_evaluated(method, tmp_path):
         ["action=choices"],
         ["degrade=[adversarial]"],
         ["disturb=[observation_delay,action_delay,observation_noise]"],
-        ["evaluation.fallback=true"],
+        ["beside=fallback"],
         ["delivery=tested", "training.tests.time_limit=0.5"],
         ["training.normalise=true", "training.scale_rewards=true"],
         ["training.noise_correlation=0.7"],

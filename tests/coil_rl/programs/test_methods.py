@@ -15,6 +15,7 @@ from coil_rl.errors import UserError
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume
 from coil_rl.run import checkpoint
+from coil_studies import Fallback
 
 SKLEARN = ["oil", "dagger"]  # archives of skops contain the time
 
@@ -163,7 +164,7 @@ def test_agent_falls_back_to_its_guide_where_its_critic_values_a_state_low(tmp_p
         f"run={run}",
         "evaluation.repeats=1",
         f"run_dir={tmp_path}",
-        "evaluation.fallback=true",
+        "beside=fallback",
     ]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         evaluate.evaluate(compose("evaluate", overrides))
@@ -172,6 +173,6 @@ def test_agent_falls_back_to_its_guide_where_its_critic_values_a_state_low(tmp_p
     assert "Not worse than guide on these 2 cases: " in text
     assert len(rows(tmp_path, driver="coil or guide")) == 3
     with pytest.raises(
-        UserError, match=r"evaluation.fallback=true has no effect on .*ppo: its agent has no guide"
+        UserError, match=r"beside=fallback has no effect on .*ppo: its agent has no guide"
     ):
-        open_run(plain).make_fallback(torch.nn.Module())
+        Fallback().driver(open_run(plain), torch.nn.Module())

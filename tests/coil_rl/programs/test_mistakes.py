@@ -236,7 +236,7 @@ def refusal(name, *arguments):
         ),
         (
             "degrade=[noisy] degrade.noisy.sigma=-1",
-            "degrade.noisy: sigma=-1 must be a finite number of at least 0",
+            "degrade.noisy.sigma=-1 must be at least 0",
         ),
         (
             "method=coil degrade=[shuffled] track.train.count=2",
@@ -472,7 +472,7 @@ def test_tracks_are_not_changed_where_none_are_chosen(started, run):
     "change",
     [
         "evaluation.policy=last",
-        "evaluation.fallback=true",
+        "beside=fallback",
         "evaluation.repeats=9",
         "+evaluation.advice.x=1",
         "evaluation.curve.points=2",
@@ -493,14 +493,14 @@ def test_refused_program_leaves_no_folder_of_its_own_name(tmp_path, monkeypatch)
     ("change", "reason"),
     [
         ("method=ppo", "its agent has no guide in its env"),
-        ("method=guide", "there is no agent"),
+        ("method=guide", "method=guide trains no policy"),
         ("method=residual", "its env adds the actions of agent and guide"),
         ("method=oil", "its learner has no value function"),
     ],
 )
 def test_fallback_that_cannot_be_is_refused_before_the_training(started, change, reason):
-    sentence = refusal("train", *TINY, "evaluation.fallback=true", change)
-    assert sentence.startswith("evaluation.fallback=true has no effect on ")
+    sentence = refusal("train", *TINY, "beside=fallback", change)
+    assert sentence.startswith("beside=fallback has no effect")
     assert reason in sentence
     assert started == []
 

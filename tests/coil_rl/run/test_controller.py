@@ -41,7 +41,7 @@ def executed(run):
     carrier = env.reset()
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(STEPS):
-            observations.append(plant.rows[0].observation)
+            observations.append(plant.held.plants[0].observation)
             _, carrier = env.step_and_maybe_reset(policy(carrier))
             actions.append(plant.decode(torch.from_numpy(plant.actions[-1])))
     return observations, actions

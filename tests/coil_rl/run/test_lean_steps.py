@@ -19,7 +19,15 @@ from coil_rl.learners import PPO, Anchor, Gru
 from coil_rl.run.evaluation import episodes
 from coil_rl.run.lean_steps import LeanEnv, LeanSteps
 from coil_rl.run.rollout import Rollout
-from coil_rl.transforms import GuideActions, NormalisedAction, Takeover
+from coil_rl.transforms import (
+    DiscreteActions,
+    GuideActions,
+    NoisyAdvice,
+    NormalisedAction,
+    ObservationNoise,
+    ScaledAdvice,
+    Takeover,
+)
 
 ADVISED = ["observation", "guide_action"]
 
@@ -38,8 +46,12 @@ def advised_pendulum():
     return env
 
 
-def cones():
-    return worlds.cones(RewardSum(), cars=5)
+def cones(*transforms):
+    return worlds.cones(RewardSum(), *transforms, cars=5)
+
+
+def choices():
+    return cones(ScaledAdvice(0.5), DiscreteActions(3))
 
 
 def collected(make_env, correlation, lean, options):
@@ -68,6 +80,7 @@ def collected(make_env, correlation, lean, options):
     [
         pytest.param(cones, {"in_keys": ADVISED}, id="advice"),
         pytest.param(cones, {"in_keys": ADVISED, "squash": False}, id="clipped"),
+        pytest.param(choices, {"in_keys": ADVISED}, id="choices"),
         pytest.param(advised_pendulum, {"in_keys": ADVISED, "anchor": Anchor()}, id="anchored"),
         pytest.param(partial(gym, "Pendulum-v1"), {"normalise": True}, id="pendulum"),
         pytest.param(partial(gym, "CartPole-v1"), {"normalise": "auto"}, id="cart pole"),
@@ -135,6 +148,8 @@ def test_what_lean_steps_do_not_know_keeps_the_steps_of_torchrl():
     assert covered(bare(GuideActions({"guide": SplineGuide()})), in_keys=ADVISED)
     assert not covered(bare(GuideActions({"guide": SplineMemoryGuide()})), in_keys=ADVISED)
     assert not covered(bare(GuideActions({"guide": SplineGuide()}), Takeover(0.5)))
+    assert not covered(bare(GuideActions({"guide": SplineGuide()}), NoisyAdvice()))
+    assert not covered(bare(ObservationNoise()))
     gru = Gru(state=4)
     assert not covered(bare(*gru.env_transforms()), network=gru)
     assert not covered(AnyEnv(action=MultiCategorical([2, 3])))

@@ -1,71 +1,20 @@
-"""Networks as guides: those that are asked by `forward`, and those that have an `act`."""
+"""Objects that remember something: one copy for each row, and what a checkpoint holds of them."""
 
 import copy
-import inspect
 import io
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-
-from coil_rl.foreign.shared import SharedCheck
 
 # Key of a saved state with the attributes of a network and its parts that torch does not save.
 PLAIN = "plain attributes"
 OF_TORCH = frozenset(vars(nn.Module()))
+UNSAVED = (pickle.PickleError, TypeError, AttributeError, RuntimeError)
 SAVED = (type(None), bool, int, float, str, Tensor)  # a checkpoint can hold them
-
-
-class NetworkGuide(TensorDictModule):
-    """A network as a guide: entries [B, N] to actions [B, A].
-
-    Args:
-        network: the network.
-        in_keys: entries to read.
-        title: name of the network, for messages.
-
-    Raises:
-        ForeignError: at a call, for a network that gives another action for the same observation,
-            or one that depends on the other rows.
-    """
-
-    def __init__(self, network: nn.Module, in_keys: Sequence[NestedKey], title: str) -> None:
-        super().__init__(network, in_keys=list(in_keys), out_keys=["action"])
-        self.shared = SharedCheck(title)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        forward = super().forward
-
-        def ask(entries: Sequence[Tensor]) -> Tensor:
-            data = TensorDict({}, [], device=tensordict.device)
-            for key, entry in zip(self.in_keys, entries, strict=True):
-                data.set(key, entry)
-            action: Tensor = forward(data)["action"]
-            return action
-
-        entries = [tensordict[key] for key in self.in_keys]
-        return tensordict.set("action", self.shared(ask, entries, tensordict.batch_dims))
-
-
-def acts(thing: Any) -> bool:
-    """Return whether a class or an object has a method `act`.
-
-    Of a network its class must define it: an attribute `act` is often its activation function.
-
-    Args:
-        thing: the class or object.
-    """
-    kind = thing if inspect.isclass(thing) else type(thing)
-    if not issubclass(kind, nn.Module):
-        return callable(getattr(thing, "act", None))
-    own = inspect.getattr_static(kind, "act", None)
-    return inspect.isfunction(own) or isinstance(own, (staticmethod, classmethod))
 
 
 def maker_of_rows(thing: Any) -> partial[Any]:
@@ -134,16 +83,24 @@ def _plain(network: nn.Module) -> Iterator[tuple[tuple[str, str], Any]]:
             yield (part, name), module._buffers[name]
 
 
+def copied(value: Any) -> Any:
+    """Return a value as a checkpoint gives it back; what it cannot hold is an `UnpicklingError`.
+
+    It is loaded without running code from the file.
+    """
+    file = io.BytesIO()
+    torch.save(value, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
 def _can_be_saved(value: Any) -> bool:
-    """Return whether a value can be saved, and loaded again without running code from the file."""
+    """Return whether a checkpoint can hold a value."""
     if type(value) in SAVED:
         return True
-    file = io.BytesIO()
     try:
-        torch.save(value, file)
-        file.seek(0)
-        torch.load(file, weights_only=True)
-    except (pickle.PickleError, TypeError, AttributeError, RuntimeError):
+        copied(value)
+    except UNSAVED:
         return False
     return True
 
@@ -152,5 +109,5 @@ def _is_same(value: Any, other: Any) -> bool:
     """Return whether two values are one, or have the same content."""
     try:
         return value is other or pickle.dumps(value) == pickle.dumps(other)
-    except (pickle.PickleError, TypeError, AttributeError, RuntimeError):
+    except UNSAVED:
         return False

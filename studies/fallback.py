@@ -3,7 +3,6 @@
 That is where it values a state less than those that the guide visits.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -18,14 +17,17 @@ from coil_rl.guides import FollowAdvice
 from coil_rl.learners.learner import Learner
 from coil_rl.report.runs import SELECTION
 from coil_rl.run import checkpoint
+from coil_rl.run.beside import Beside, Driver
 from coil_rl.run.evaluation import EvaluationResult, episodes
 from coil_rl.run.parts import EnvMaker
+from coil_rl.run.run import Run
 from coil_rl.transforms import MixedAction, ResidualAction
 
+NAME = "or guide"  # after the label, in tables
 LEAVE, BACK = 0.01, 0.05  # shares of the guide's states that are worth less than the two limits
 
 
-class Fallback(TensorDictModuleBase):
+class FallbackPolicy(TensorDictModuleBase):
     """Policy that leaves steps to the first guide by the values of a critic.
 
     It has a hysteresis (after CALF, 2025).
@@ -71,6 +73,10 @@ class Fallback(TensorDictModuleBase):
             "action", torch.where(expand_as_right(falls_back, chosen), advised, chosen)
         )
 
+    def said(self, result: EvaluationResult) -> list[str]:
+        """Return the sentence on the share of the steps in which the guide acted."""
+        return [f"With fallback the guide acted in {self.share(result):.1%} of the steps."]
+
     def share(self, result: EvaluationResult) -> float:
         """Return the share of the steps of an evaluation in which the guide acted."""
         acts = torch.stack(self.guide_acts)
@@ -85,46 +91,50 @@ def values_of(critic: TensorDictModuleBase, states: TensorDictBase) -> Tensor:
     return value.reshape(-1)
 
 
-@torch.no_grad()
-def make_fallback(
-    policy: TensorDictModuleBase | None,
-    make_env: EnvMaker,
-    make_learner: Callable[[EnvBase], Learner] | None,
-    folder: Path,
-    device: str = "cpu",
-) -> Fallback:
-    """Return the policy of a run with its first guide to fall back to.
+class Fallback(Beside):
+    """The policy of a run once more, with its first guide to fall back to."""
 
-    The limits are quantiles of the critic's values along the guide's episodes in the cases of
-    selection.
+    def check(self, make_env: EnvMaker, learner: Learner, folder: Path) -> None:
+        """Raise a `UserError` for a run without cases, advice or critic to fall back by.
 
-    Args:
-        policy: of the run; None for a run without an agent.
-        make_env: makes the envs of the run.
-        make_learner: makes the learner of the run for an env; its critic is loaded from the
-            checkpoint.
-        folder: of the run, with its checkpoint.
-        device: of the critic.
+        Args:
+            make_env: makes the envs of the run.
+            learner: of the run.
+            folder: of the run, for the message.
+        """
+        check_cases_of_guide(make_env, folder)
+        critic_beside_guide(make_env(), learner, folder)
 
-    Raises:
-        UserError: for a run without agent, cases, advice or critic, or whose env does not execute
-            the advice as it is.
-    """
-    if policy is None or make_learner is None:
-        raise UserError(no_effect(folder, "there is no agent"))
-    check_cases_of_guide(make_env, folder)
-    env = make_env(make_env.sizes[SELECTION], SELECTION)
-    critic = critic_beside_guide(env, make_learner(env), folder)
-    newest = folder / checkpoint.NEWEST
-    with file_of_a_run(newest, "train again"):
-        critic.load_state_dict(checkpoint.load(newest, device)["learner"]["critic"])
-    guide = FollowAdvice(env)
-    values = [
-        values_of(critic, after)[running.reshape(-1)] for after, running in episodes(env, guide)
-    ]
-    of_guide = torch.cat(values)
-    leave, back = of_guide.quantile(of_guide.new_tensor([LEAVE, BACK])).tolist()
-    return Fallback(policy, critic, guide, leave, back)
+    @torch.no_grad()
+    def driver(self, run: Run, policy: TensorDictModuleBase | None) -> Driver:
+        """Return the policy with its guide.
+
+        The limits are quantiles of the critic's values along the guide's episodes in the cases of
+        selection; the critic is that of the newest checkpoint.
+
+        Args:
+            run: that is evaluated, with its checkpoint.
+            policy: of the run.
+
+        Raises:
+            UserError: for a run that cannot fall back.
+        """
+        if policy is None or run.make_learner is None:
+            raise UserError(no_effect(run.folder, "there is no agent"))
+        check_cases_of_guide(run.make_env, run.folder)
+        env = run.make_env(run.make_env.sizes[SELECTION], SELECTION)
+        critic = critic_beside_guide(env, run.make_learner(env), run.folder)
+        newest = run.folder / checkpoint.NEWEST
+        with file_of_a_run(newest, "train again"):
+            critic.load_state_dict(checkpoint.load(newest, run.device)["learner"]["critic"])
+        guide = FollowAdvice(env)
+        values = [
+            values_of(critic, after)[running.reshape(-1)] for after, running in episodes(env, guide)
+        ]
+        of_guide = torch.cat(values)
+        leave, back = of_guide.quantile(of_guide.new_tensor([LEAVE, BACK])).tolist()
+        acting = FallbackPolicy(policy, critic, guide, leave, back)
+        return Driver(NAME, acting, acting.said)
 
 
 def check_cases_of_guide(make_env: EnvMaker, folder: Path) -> None:
@@ -170,4 +180,4 @@ def critic_beside_guide(env: EnvBase, learner: Learner, folder: Path) -> TensorD
 
 def no_effect(folder: Path, problem: str) -> str:
     """Return the sentence for a run that cannot fall back; `problem` is why."""
-    return f"evaluation.fallback=true has no effect on {folder}: {problem}; leave it out"
+    return f"beside=fallback has no effect on {folder}: {problem}; leave it out"

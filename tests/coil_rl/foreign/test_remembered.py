@@ -58,7 +58,7 @@ def test_network_with_act_is_asked_by_it_row_by_row(given):
 def test_rows_share_the_weights_of_a_network():
     guide = ControllerGuide(Actor)
     asked(guide, [0.0, 0.0], first=True)
-    one, other = guide.guide.objects.values()
+    one, other = (host.thing for host in guide.guide.hosts.values())
     assert one is not other
     assert one.layer.weight is other.layer.weight
 

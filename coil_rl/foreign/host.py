@@ -1,0 +1,286 @@
+"""Whatever acts for one row of an env: an object, a function or a trained model of somebody else.
+
+What it is is decided here only, see `role_of`.
+"""
+
+import copy
+import inspect
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from coil_rl.errors import did_you_mean
+from coil_rl.foreign.faults import ForeignError, action_array, foreign
+
+Role = Literal["guide", "act", "predict", "network", "function", ""]
+
+
+def called(thing: Any) -> Any:
+    """Return the class or function that a `functools.partial` calls; anything else itself."""
+    return thing.func if isinstance(thing, partial) else thing
+
+
+def role_of(thing: Any) -> Role:
+    """Return how a class, or an object, acts.
+
+    It is a TensorDictModule ("guide"), or has a method `act` or, as trained models of other
+    libraries do, a `predict` that takes `deterministic`. Or it is another network, or a function;
+    empty for anything else.
+
+    Args:
+        thing: the class or object, or a `functools.partial` of a class or function.
+    """
+    thing = called(thing)
+    kind = thing if inspect.isclass(thing) else type(thing)
+    if issubclass(kind, TensorDictModuleBase):
+        return "guide"
+    act = getattr(thing, "act", None)
+    if issubclass(kind, nn.Module):
+        # An attribute `act` of a network is often its activation function.
+        own = inspect.getattr_static(kind, "act", None)
+        if inspect.isfunction(own) or isinstance(own, (staticmethod, classmethod)):
+            return "act"
+    elif callable(act):
+        return "act"
+    if not callable(act) and _predicts(thing):
+        return "predict"
+    if issubclass(kind, nn.Module):
+        return "network"
+    return "function" if callable(thing) and not inspect.isclass(thing) else ""
+
+
+def _predicts(thing: Any) -> bool:
+    """Return whether something has a `predict` as the models of Stable-Baselines3 have it.
+
+    Those of scikit-learn do not take `deterministic`.
+    """
+    try:
+        return "deterministic" in inspect.signature(thing.predict).parameters
+    except (AttributeError, TypeError, ValueError):  # some functions written in C have no signature
+        return False
+
+
+class Predictor:
+    """A trained model of another library as a controller: what has `predict` gets `act`.
+
+    The models of Stable-Baselines3 and its relatives have `predict(observation, state,
+    episode_start, deterministic)`, which returns the action and the state for the next call.
+
+    Args:
+        model: the model. `predict` must take `deterministic`; the others are given if it takes
+            them.
+        keys: of the entries that it is given one by one, as its space has them; None for an
+            observation as its env returned it.
+    """
+
+    def __init__(self, model: Any, keys: Sequence[NestedKey] | None = None) -> None:
+        self.model, self.keys = model, keys
+        self.space = getattr(model, "observation_space", None)
+        parameters = inspect.signature(model.predict).parameters
+        self.takes = {name for name in ("state", "episode_start") if name in parameters}
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode: forget the state."""
+        self.state, self.first = None, True
+
+    def act(self, *observed: Any) -> Any:
+        """Return the deterministic action for an observation, or for its entries."""
+        given = {"state": self.state, "episode_start": np.array([self.first])}
+        known = {name: given[name] for name in self.takes}
+        observation = observed[0] if self.keys is None else self._whole(observed)
+        answer = self.model.predict(observation, deterministic=True, **known)
+        self.first = False
+        if isinstance(answer, tuple) and len(answer) == 2:
+            answer, self.state = answer
+        return answer
+
+    def _whole(self, entries: Sequence[NDArray[Any]]) -> Any:
+        """Return the observation of some entries."""
+        parts = getattr(self.space, "spaces", None)
+        if not isinstance(parts, Mapping):
+            return _in_space(entries[0], self.space)
+        named = zip(self.keys or (), entries, strict=True)
+        return {key: _in_space(entry, parts.get(key)) for key, entry in named}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the next actions of the episode depend on."""
+        return {"first": self.first, "state": _mapped(torch.from_numpy, np.ndarray, self.state)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.first = state["first"]
+        self.state = _mapped(torch.Tensor.numpy, torch.Tensor, state["state"])
+
+
+def _mapped(convert: Callable[[Any], Any], kind: type, value: Any) -> Any:
+    """Convert what is of a kind in nested tuples."""
+    if isinstance(value, tuple):
+        return tuple(_mapped(convert, kind, part) for part in value)
+    return convert(value) if isinstance(value, kind) else value
+
+
+def _in_space(entry: NDArray[Any], space: Any) -> Any:
+    """Return an entry as an observation of a Gymnasium space: choices are indices there."""
+    if space is not None and entry.shape == space.shape:
+        return entry
+    if isinstance(space, spaces.Discrete):
+        return int(entry.argmax()) + int(space.start)
+    if isinstance(space, spaces.MultiDiscrete):
+        parts = np.split(entry, np.cumsum(space.nvec.ravel())[:-1])
+        indices = np.array([part.argmax() for part in parts]).reshape(space.nvec.shape)
+        return indices + space.start
+    if isinstance(space, spaces.Box) and entry.size == math.prod(space.shape):
+        return entry.reshape(space.shape)
+    return entry
+
+
+class Function:
+    """A function of one observation as an object with `act`.
+
+    Args:
+        act: the function.
+    """
+
+    def __init__(self, act: Callable[..., Any]) -> None:
+        self.act = act
+
+    def reset(self) -> None:
+        """Begin an episode: a function remembers nothing."""
+
+
+def maker_beside(thing: Any, name: str, env: Any) -> Callable[[], Any]:
+    """Return what makes the object that acts beside an env.
+
+    Args:
+        thing: a class, made as `THING(env)`; a function, called as `THING(env, observation)`; an
+            object with `act`, or a trained model, which do not get the env.
+        name: of the controller, for messages.
+        env: beside which it acts.
+
+    Raises:
+        ValueError: for a text, and for what cannot act.
+    """
+    if isinstance(thing, str):
+        raise ValueError(
+            f"controller {name}: {thing!r} is a text; write {{_target_: "
+            f"{thing.replace(':', '.')}, _partial_: true}}"
+        )
+    role, is_class = role_of(thing), inspect.isclass(called(thing))
+    if role == "act":
+        return partial(thing, env) if is_class else partial(copy.deepcopy, thing)
+    if role == "predict":
+        return partial(_predictor, thing, env) if is_class else partial(Predictor, thing)
+    if role == "function":
+        return partial(Function, partial(thing, env))
+    raise ValueError(
+        f"controller {name}: {getattr(called(thing), '__name__', type(thing).__name__)} needs a "
+        "method act(observation)"
+    )
+
+
+def _predictor(make: Callable[..., Any], env: Any) -> Predictor:
+    return Predictor(make(env))
+
+
+class Host:
+    """The controller of one row: what it returns is checked, and its faults have their place.
+
+    An object without `reset` is made anew for each episode.
+
+    Args:
+        make: makes an object with `act`; called without arguments.
+        title: name of the controller, for messages.
+        row: number of its row, for messages.
+        beside: where the env is beside which it acts; None for a guide, which counts its own steps.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], Any],
+        title: str,
+        row: int = 0,
+        beside: Callable[[], str] | None = None,
+    ) -> None:
+        self.make, self.title, self.row, self.beside = make, title, row, beside
+        self.thing: Any = None
+        self.steps: int | None = None  # of the episode; unknown after a resume
+        self.seconds = math.inf  # the shortest time that an action took
+
+    @property
+    def place(self) -> str:
+        """The controller with its row and step."""
+        if self.beside is not None:
+            return f"the controller {self.title} beside {self.beside()}"
+        step = "" if self.steps is None else f", step {self.steps}"
+        return f"the controller {self.title} (row {self.row}{step})"
+
+    def begin(self) -> None:
+        """Begin an episode."""
+        self.steps = 0
+        if not hasattr(self.thing, "reset"):
+            self._open()
+        if hasattr(self.thing, "reset"):
+            with foreign(self.place, "reset"):
+                self.thing.reset()
+
+    def _open(self) -> None:
+        with foreign(self.place, "the constructor"):
+            self.thing = self.make()
+
+    def act(self, *observed: Any) -> NDArray[Any]:
+        """Return the action for an observation, as an array of at least one dimension.
+
+        Args:
+            observed: what it reads; it may change that.
+
+        Raises:
+            ForeignError: for what the controller raises, or returns that is no array of numbers.
+        """
+        if self.thing is None:
+            self._open()
+        start = time.perf_counter()
+        with foreign(self.place, "act"):
+            answer = self.thing.act(*observed)
+        self.seconds = min(self.seconds, time.perf_counter() - start)
+        try:
+            return action_array(answer)
+        except ForeignError as error:
+            raise ForeignError(f"{self.place}: {error}") from error
+
+
+def check_call(
+    function: Callable[..., Any], title: str, entries: Sequence[Any], options: Mapping[str, Any]
+) -> None:
+    """Raise a `ValueError` if a function cannot be called like this.
+
+    Args:
+        function: the function or class.
+        title: its name, for the message.
+        entries: positional arguments, by the name of what they hold.
+        options: arguments by name.
+    """
+    try:
+        signature = inspect.signature(function)
+    except ValueError:  # some functions written in C have none
+        return
+    try:
+        signature.bind(*entries, **options)
+    except TypeError as error:
+        positional = [str(entry) for entry in entries if entry != "self"]
+        given = ", ".join([*positional, *(f"{key}=" for key in options)])
+        unknown = [key for key in options if key not in signature.parameters]
+        hints = "".join(did_you_mean(key, signature.parameters) for key in unknown)
+        raise ValueError(
+            f"{title} takes {signature}, but is called with ({given}): {error}{hints}"
+        ) from error

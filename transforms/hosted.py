@@ -1,0 +1,45 @@
+"""Guides that are told about their env, among them those that run the code of somebody else."""
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from coil_rl.transforms.action_space import ActionSpace, OwnChoices
+
+
+class ToldGuide(TensorDictModuleBase):
+    """A guide that is told which actions there are, and how its env numbers what it shows."""
+
+    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
+        """Take what an env says about itself.
+
+        Args:
+            space: of the actions of the guides.
+            choices: what converts one-hot entries to the numbering of the env, by entry.
+        """
+
+
+class HostedGuide(ToldGuide):
+    """A guide that runs the code of somebody else, whose actions are checked in every step.
+
+    Attributes:
+        by_row: whether there is one object for each row. It is not asked after the end of an
+            episode: rows that have ended keep their last advice.
+    """
+
+    by_row = False
+
+    def unfit(
+        self, action: Tensor, batch: torch.Size, space: ActionSpace, problem: str
+    ) -> Exception | None:
+        """Return the error for an action that does not fit the env, as it was returned.
+
+        None leaves the sentence to whoever asks the guide.
+
+        Args:
+            action: that the guide wrote.
+            batch: of the action.
+            space: of the actions.
+            problem: says why, as the end of a sentence.
+        """
+        return None
