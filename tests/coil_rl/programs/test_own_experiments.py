@@ -125,6 +125,7 @@ def test_own_file_that_overrides_tracks_is_told_what_to_write(tmp_path):
     assert "track= cannot be given for this env: only the cone world" in refused.stderr
 
 
+@pytest.mark.slow
 def test_sweep_says_its_runs_and_frames_and_then_trains(tmp_path):
     words = ["+experiment=coil_vs_ppo", "guide=controller", *ENV, *TINY]
     words += ["budget.frames=256", "budget.minibatches=4", "evaluation.curve.points=1", "seed=0"]
