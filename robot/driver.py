@@ -173,7 +173,6 @@ class LiveDriver:
         """Return the command after a scan.
 
         Args:
-            scan: the scan.
             now: s of a steady clock, when it came.
         """
         if self.state == "stopped":
@@ -229,7 +228,6 @@ class LiveDriver:
         """Stop the car until `lift`; return the command.
 
         Args:
-            reason: for the log.
             now: s of the same steady clock.
         """
         self.state, self.reason, self.command = "stopped", reason, HALT

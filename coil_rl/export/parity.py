@@ -57,11 +57,6 @@ Rows = list[list[Tensor]]  # by step, the inputs and the state
 def expected(step: PolicyStep, recording: Recording, limit: float) -> Rows:
     """Return the inputs and the state of each recorded step.
 
-    Args:
-        step: the function.
-        recording: of the controller.
-        limit: allowed difference.
-
     Raises:
         NotExportableError: if the function is not what the controller does.
     """
