@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
-from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.foreign.rows import Entries, Shard
 
@@ -43,7 +42,7 @@ class SeededRows(SeededEnv):
         device: of all tensors.
 
     Raises:
-        ValueError: for a seed or number out of range, and for `cases` without `first_seed`.
+        ValueError: for `cases` without `first_seed`.
     """
 
     remedy: ClassVar[str] = ""  # what may help if running episodes cannot be repeated
@@ -58,8 +57,6 @@ class SeededRows(SeededEnv):
         cases: int | None,
         device: torch.device | str,
     ) -> None:
-        check_range(0, LARGEST_SEED, seed=seed, first_seed=first_seed or 0)
-        check_range(1, cases=1 if cases is None else cases)
         if cases is not None and first_seed is None:
             raise ValueError(f"cases={cases} needs first_seed, the seed of the first case")
         super().__init__(device=torch.device(device), batch_size=torch.Size([count]))

@@ -7,7 +7,6 @@ names them, so everything that does not fit is refused at construction, in one s
 import copy
 import importlib
 import inspect
-import io
 import pickle
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +23,7 @@ from torch import nn
 from coil_rl.errors import did_you_mean
 from coil_rl.foreign.faults import ForeignError, foreign, shown
 from coil_rl.foreign.host import Host, Predictor, called, check_call, role_of
-from coil_rl.foreign.remembered import maker_of_rows, restore, state_of
+from coil_rl.foreign.remembered import copied, maker_of_rows, restore, state_of
 from coil_rl.foreign.shared import FunctionGuide, NetworkGuide
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key, written_key
 from coil_rl.transforms.hosted import HostedGuide, ToldGuide
@@ -142,11 +141,8 @@ class PerRow(HostedGuide):
                 states[row] = state_of(host.thing, self.make)
         if None in states.values():
             return None
-        file = io.BytesIO()
-        torch.save(states, file)
-        file.seek(0)
         try:
-            return dict(torch.load(file, weights_only=True))
+            return dict(copied(states))
         except pickle.UnpicklingError as error:
             raise ValueError(
                 f"state_dict() of the controller {self.title} may hold numbers, texts, lists, "

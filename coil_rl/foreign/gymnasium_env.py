@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
-from coil_rl.envs.limits import check_range
 from coil_rl.foreign.batch import SeededRows
 from coil_rl.foreign.codec import (
     Choices,
@@ -35,11 +34,13 @@ from coil_rl.foreign.makers import (
 from coil_rl.foreign.plant import GymnasiumPlant
 from coil_rl.foreign.rows import GymnasiumRows
 from coil_rl.foreign.workers import AUTO, Workers, choose, timed
+from coil_rl.ranges import Count, Seed, checked
 
 MOST_WORKERS = 256
 RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "controller", "next")
 
 
+@checked
 class GymnasiumEnv(SeededRows):
     """Gymnasium envs as one env of batch size [num_envs].
 
@@ -115,15 +116,15 @@ class GymnasiumEnv(SeededRows):
     def __init__(
         self,
         id: str | Callable[..., Env],
-        num_envs: int = 1,
+        num_envs: Count = 1,
         *,
         options: Mapping[str, Any] | None = None,
         reset_options: Mapping[str, Any] | None = None,
         wrappers: Sequence[Callable[[Env], Env]] = (),
-        max_steps: int | None = None,
-        seed: int = 0,
-        first_seed: int | None = None,
-        cases: int | None = None,
+        max_steps: Count | None = None,
+        seed: Seed = 0,
+        first_seed: Seed | None = None,
+        cases: Count | None = None,
         info: Sequence[str] = (),
         controllers: Mapping[str, Any] | None = None,
         fresh: bool = False,
@@ -132,7 +133,6 @@ class GymnasiumEnv(SeededRows):
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
         _check_workers(workers)
         makers = dict(controllers or {})
         settings = dict(options or {})

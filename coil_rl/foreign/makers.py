@@ -1,13 +1,10 @@
 """Makers of Gymnasium envs: how one is found by its name and called, and why it cannot be."""
 
-import difflib
 import importlib
 import inspect
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from importlib.machinery import PathFinder
 from importlib.util import find_spec
 from typing import Any
 
@@ -15,6 +12,7 @@ import gymnasium
 from gymnasium import error as errors
 from gymnasium.envs.registration import load_env_creator
 
+from coil_rl.errors import did_you_mean
 from coil_rl.foreign.faults import shortened, shown
 
 # What an error about a missing package mentions, and the extra of coil-rl that installs it.
@@ -175,42 +173,17 @@ def _reason(id: str, error: BaseException) -> str:
     if not isinstance(error, (errors.NameNotFound, errors.NamespaceNotFound)):
         return first_line or type(error).__name__
     if module:
-        hint = _similar(module, name)
+        things = vars(sys.modules[module]) if module in sys.modules else {}
+        known = [each for each, thing in things.items() if callable(thing)]
+        hint = did_you_mean(name, [*known, *gymnasium.registry])
         return f"{module} has no env {name}, and registers none of this name{hint}"
-    outer, _, last = id.rpartition(".")
-    if outer and last and _is_module(outer):
-        return f"a module and a name in it have a colon between them; write {outer}:{last}"
     # Gymnasium may have a suggestion of its own: "Did you mean ...".
     if "mean" in first_line:
         return first_line
-    return f"{first_line}; if a package registers it, write PACKAGE:{id}"
-
-
-def _similar(module: str, name: str) -> str:
-    """Return `; did you mean X?` with the most similar env of a module, or an empty string.
-
-    Args:
-        module: that was imported.
-        name: which it does not have.
-    """
-    things = vars(sys.modules[module]) if module in sys.modules else {}
-    known = [each for each, thing in things.items() if callable(thing)]
-    similar = difflib.get_close_matches(name, [*known, *gymnasium.registry], n=1)
-    return f"; did you mean {similar[0]}?" if similar else ""
-
-
-def _is_module(name: str) -> bool:
-    """Return whether a module exists, without importing it or its packages."""
-    first, *others = name.split(".")
-    with suppress(ImportError, ValueError):
-        spec = find_spec(first)
-        for count in range(1, len(others) + 1):
-            if spec is None or spec.submodule_search_locations is None:
-                return False
-            full = ".".join([first, *others[:count]])
-            spec = PathFinder.find_spec(full, spec.submodule_search_locations)
-        return spec is not None
-    return False
+    return (
+        f"{first_line}; write MODULE:NAME for an env of a module, or PACKAGE:{id} if a package "
+        "registers it"
+    )
 
 
 def metadata_of(env: Env, key: str, default: Any) -> Any:

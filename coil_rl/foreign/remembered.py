@@ -13,6 +13,7 @@ from torch import Tensor, nn
 # Key of a saved state with the attributes of a network and its parts that torch does not save.
 PLAIN = "plain attributes"
 OF_TORCH = frozenset(vars(nn.Module()))
+UNSAVED = (pickle.PickleError, TypeError, AttributeError, RuntimeError)
 SAVED = (type(None), bool, int, float, str, Tensor)  # a checkpoint can hold them
 
 
@@ -82,16 +83,24 @@ def _plain(network: nn.Module) -> Iterator[tuple[tuple[str, str], Any]]:
             yield (part, name), module._buffers[name]
 
 
+def copied(value: Any) -> Any:
+    """Return a value as a checkpoint gives it back; what it cannot hold is an `UnpicklingError`.
+
+    It is loaded without running code from the file.
+    """
+    file = io.BytesIO()
+    torch.save(value, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
 def _can_be_saved(value: Any) -> bool:
-    """Return whether a value can be saved, and loaded again without running code from the file."""
+    """Return whether a checkpoint can hold a value."""
     if type(value) in SAVED:
         return True
-    file = io.BytesIO()
     try:
-        torch.save(value, file)
-        file.seek(0)
-        torch.load(file, weights_only=True)
-    except (pickle.PickleError, TypeError, AttributeError, RuntimeError):
+        copied(value)
+    except UNSAVED:
         return False
     return True
 
@@ -100,5 +109,5 @@ def _is_same(value: Any, other: Any) -> bool:
     """Return whether two values are one, or have the same content."""
     try:
         return value is other or pickle.dumps(value) == pickle.dumps(other)
-    except (pickle.PickleError, TypeError, AttributeError, RuntimeError):
+    except UNSAVED:
         return False

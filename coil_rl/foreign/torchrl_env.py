@@ -9,12 +9,13 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
-from coil_rl.envs.limits import check_range
 from coil_rl.foreign.batch import SeededRows
 from coil_rl.foreign.plant import TorchRLPlant
 from coil_rl.foreign.rows import Rows
+from coil_rl.ranges import Count, Seed, checked
 
 
+@checked
 class EnvBatch(SeededRows):
     """TorchRL envs without batch as one env of batch size [num_envs], stepped one after the other.
 
@@ -44,14 +45,13 @@ class EnvBatch(SeededRows):
     def __init__(
         self,
         of: Callable[[], EnvBase],
-        num_envs: int = 1,
+        num_envs: Count = 1,
         *,
-        max_steps: int | None = None,
-        seed: int = 0,
-        first_seed: int | None = None,
-        cases: int | None = None,
+        max_steps: Count | None = None,
+        seed: Seed = 0,
+        first_seed: Seed | None = None,
+        cases: Count | None = None,
     ) -> None:
-        check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
         envs = [of() for _ in range(num_envs)]
         if max_steps is not None and isinstance(envs[0], EnvBase):
             envs = [TransformedEnv(env, StepCounter(max_steps)) for env in envs]

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.limits import check_range
+from coil_rl.ranges import Count, checked
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.hosted import ToldGuide
@@ -69,6 +69,7 @@ class ConstantGuide(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.value.expand(*batch, -1))
 
 
+@checked
 class ZeroGuide(ToldGuide):
     """Guide with the neutral action: the centre of a bounded coordinate, the first of some choices.
 
@@ -82,9 +83,8 @@ class ZeroGuide(ToldGuide):
     pure = True
 
     def __init__(
-        self, size: int = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action"
+        self, size: Count = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action"
     ) -> None:
-        check_range(1, size=size)
         self.in_keys, self.out_keys = [in_key], [out_key]
         super().__init__()
         self.value: Tensor = nn.Buffer(torch.zeros(size), persistent=False)
@@ -99,6 +99,7 @@ class ZeroGuide(ToldGuide):
         return tensordict.set(self.out_keys[0], self.value.expand(*batch, *self.value.shape))
 
 
+@checked
 class RandomGuide(ToldGuide):
     """Guide with random actions, uniform in the actions of the env: numbers or choices.
 
@@ -119,12 +120,11 @@ class RandomGuide(ToldGuide):
         self,
         low: float | None = None,
         high: float | None = None,
-        size: int = 1,
+        size: Count = 1,
         seed: int = 0,
         in_key: NestedKey = "observation",
         out_key: NestedKey = "action",
     ) -> None:
-        check_range(1, size=size)
         self.in_keys, self.out_keys = [in_key], [out_key]
         super().__init__()
         self.module = _Uniform(low, high, size, seed)

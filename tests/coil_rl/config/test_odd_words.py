@@ -29,10 +29,10 @@ NAMES = [  # guide.controller.of
 WORDS = [  # of a run of PPO in env=gym env.id=odd_parts:Plain
     ("env.id=odd_parts:Nothing", "odd_parts has no env Nothing, and registers none of this name"),
     ("env.id=", "env.id is empty; write env.id=MODULE:NAME"),
-    ("env.id=no_such-v3", "if a package registers it, write PACKAGE:no_such-v3"),
+    ("env.id=no_such-v3", "or PACKAGE:no_such-v3 if a package registers"),
     ("env.id=7", "env.id=7 must be a valid string or callable"),
     ("+env.options.speed=3", "it raised TypeError: Plain() takes no arguments"),
-    ("env.max_steps=-5", "max_steps=-5 must be at least 1 and finite"),
+    ("env.max_steps=-5", "max_steps=-5 must be at least 1"),
     ("env.info=speed", "env.info='speed' must be a list"),
     ("observes=observation", "observes=observation must be a list; write observes=[observation]"),
     ("observes=[speed]", "the env has no entry speed to observe; it has observation"),
