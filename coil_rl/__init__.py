@@ -4,10 +4,9 @@ The names in `__all__` are the public API. They are imported on first use, so th
 is fast.
 """
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from coil_rl.lazy import lazy_names
 
 if TYPE_CHECKING:
     from coil_rl.comparison.compare import compare as compare
@@ -85,54 +84,5 @@ if TYPE_CHECKING:
     from coil_rl.transforms import ResidualAction as ResidualAction
     from coil_rl.transforms import RewardCoupling as RewardCoupling
     from coil_rl.transforms import set_progress as set_progress
-
-_NAMES = {
-    "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv McapReplayEnv SimulatedRobotEnv Track "
-    "load_track load_tracks random_tracks shipped_tracks",
-    "coil_rl.foreign.gymnasium_env": "GymnasiumEnv",
-    "coil_rl.foreign.torchrl_env": "EnvBatch",
-    "coil_rl.envs.limits": "check_range",
-    "coil_rl.errors": "UserError did_you_mean",
-    "coil_rl.export": "ExportedGuide ExportedPolicy export_policy",
-    "coil_rl.files": "write_text",
-    "coil_rl.guides": "ConstantGuide ControllerGuide EntryGuide PerRow RandomGuide RecordedGuide "
-    "SplineGuide ZeroGuide",
-    "coil_rl.config.learned_guide": "LearnedGuide",
-    "coil_rl.guides.advice_observation": "AdviceObservation",
-    "coil_rl.imitation": "Imitation",
-    "coil_rl.learners": "A2C DQN PPO SAC TRPO DynamicCoil Reinforce",
-    "coil_rl.learners.stepper": "LearnerStepper",
-    "coil_rl.testing": "check_env check_guide check_transform",
-    "coil_rl.run.evaluation": "EvaluationResult evaluate_policy",
-    "coil_rl.run.judge": "Evaluation Trial guide_titles",
-    "coil_rl.config.nodes": "build",
-    "coil_rl.config.folder": "pretrained_card pretrained_names",
-    "coil_rl.config.compose": "compose_train",
-    "coil_rl.config.python": "open_run prepare pretrained train",
-    "coil_rl.config.schema": "NodeConfig ProgramConfig",
-    "coil_rl.config.values": "check_values",
-    "coil_rl.programs.app": "NoSweepError run_program",
-    "coil_rl.run.folder": "versions",
-    "coil_rl.measures": "Measure",
-    "coil_rl.run.rollout": "Rollout",
-    "coil_rl.run.controller": "Controller",
-    "coil_rl.run.parts": "EnvMaker",
-    "coil_rl.run.run": "Budget Run",
-    "coil_rl.config.trust": "trust_packages",
-    "coil_rl.comparison.compare": "compare",
-    "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction NormalisedAction "
-    "ResidualAction RewardCoupling set_progress",
-}
-_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
-
-__all__ = sorted(_MODULES)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
-
-
-def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+else:
+    __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

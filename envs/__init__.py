@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from coil_rl.envs.recordings.reading import read_recording as read_recording
     from coil_rl.envs.recordings.recording import Recording as Recording
     from coil_rl.envs.recordings.replay_env import McapReplayEnv as McapReplayEnv
+    from coil_rl.envs.reward import HISTORY as HISTORY
+    from coil_rl.envs.reward import recent_mean as recent_mean
     from coil_rl.envs.robot.course import robot_track as robot_track
     from coil_rl.envs.robot.course import robot_tracks as robot_tracks
     from coil_rl.envs.robot.drives import record_drives as record_drives
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from coil_rl.envs.sight import HALF_FIELD_OF_VIEW as HALF_FIELD_OF_VIEW
     from coil_rl.envs.sight import SAMPLES as SAMPLES
     from coil_rl.envs.sight import SIGHT as SIGHT
+    from coil_rl.envs.sight import WIDEST_ANGLE as WIDEST_ANGLE
     from coil_rl.envs.sight import Frame as Frame
     from coil_rl.envs.splines import Spline as Spline
     from coil_rl.envs.splines import smoothing_spline as smoothing_spline

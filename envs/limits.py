@@ -30,7 +30,6 @@ def check_choice(choices: tuple[str, ...], **values: str) -> None:
     """Raise a `ValueError` for the first value that is not one of the choices.
 
     Args:
-        choices: the allowed values.
         values: the values to check, by the name that the message gives them.
     """
     for name, value in values.items():

@@ -18,9 +18,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from coil_rl import UserError, compose_train
 
-# Where `coil-train` finds the experiments of the paper, besides those of coil-rl.
-FILES = "hydra.searchpath=[pkg://coil_paper.conf]"
-
 
 @dataclass(frozen=True)
 class Sweep:
@@ -53,7 +50,7 @@ def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> 
     Raises:
         UserError: for a file without a sweep, or an override that does not fit one of its runs.
     """
-    words = [FILES, f"+experiment={experiment}", *overrides]
+    words = [f"+experiment={experiment}", *overrides]
     seeds, folders = list(seeds), []
     for choice in choices(experiment, words):
         config = _composed([*words, *choice])
@@ -87,7 +84,6 @@ def run(sweep: Sweep, launcher: Sequence[str] = ()) -> None:
     """Run a sweep unless all of its runs are finished.
 
     Args:
-        sweep: the runs.
         launcher: overrides of Hydra's launcher.
 
     Raises:

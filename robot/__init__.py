@@ -5,7 +5,7 @@ It is imported as `coil_robot`, and uses the public names of `coil_rl` only.
 
 from typing import TYPE_CHECKING
 
-from coil_rl.lazy import lazy_names
+from coil_rl.for_guests import lazy_names
 
 if TYPE_CHECKING:
     from coil_robot.classifier import LabelledClusters as LabelledClusters

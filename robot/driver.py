@@ -17,8 +17,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from coil_rl.envs.limits import check_range
-from coil_rl.envs.robot.perception import BoundaryMemory, Perception
+from coil_rl import check_range
+from coil_rl.envs import Perception
+from coil_rl.envs.robot import BoundaryMemory
 from coil_robot.watchdog import Limits, Scan, Watchdog
 
 State = Literal["waiting", "driving", "stopped"]
@@ -177,7 +178,6 @@ class LiveDriver:
         """Return the command after a scan.
 
         Args:
-            scan: the scan.
             now: s of a steady clock, when it came.
         """
         if self.state == "stopped":
@@ -233,7 +233,6 @@ class LiveDriver:
         """Stop the car until `lift`; return the command.
 
         Args:
-            reason: for the log.
             now: s of the same steady clock.
         """
         self.state, self.reason, self.command = "stopped", reason, HALT

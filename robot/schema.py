@@ -7,7 +7,8 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 from pydantic import Field
 
-from coil_rl.config.schema import NodeConfig, PolicyConfig, WhichPolicy, one_of, typed_as
+from coil_rl import NodeConfig
+from coil_rl.for_guests import PolicyConfig, WhichPolicy, one_of, typed_as
 
 
 @dataclass

@@ -10,9 +10,14 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from coil_rl.envs import ConeTrackEnv, McapReplayEnv, SimulatedRobotEnv
-from coil_rl.envs.robot.perception import Perception, simulated_cone_classifier
-from coil_rl.envs.sight import HALF_FIELD_OF_VIEW
+from coil_rl.envs import (
+    HALF_FIELD_OF_VIEW,
+    ConeTrackEnv,
+    McapReplayEnv,
+    Perception,
+    SimulatedRobotEnv,
+    simulated_cone_classifier,
+)
 from coil_robot.driver import Car
 
 CLOSE = 1e-4  # relative difference of two lengths that are rounded differently
@@ -45,9 +50,6 @@ class Setup:
         """Return the setup for another car that drives alike, in lengths of itself.
 
         Its view, the cones and its way between two scans are larger by as much as it is longer.
-
-        Args:
-            car: the other car.
         """
         growth = car.car_length / self.car.car_length
         perception = replace(

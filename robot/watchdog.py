@@ -14,7 +14,7 @@ from dataclasses import KW_ONLY, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coil_rl.envs.limits import check_range
+from coil_rl import check_range
 
 INTERVALS = 6  # between scans, of which the median is the rate
 NEAR = 1.5  # m, ranges that change as the car moves

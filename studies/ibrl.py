@@ -43,7 +43,6 @@ class IBRL(SAC):
 
     Args:
         env: the env, with continuous actions and advice.
-        in_keys: entries that policy and critics observe.
         sharpness: a proposal is drawn with probabilities softmax(sharpness * min Q'), and y has its
             mean value, as in PEX; None: the better one. In evaluation it is always the better one.
         edit: largest change of the guide's action by the third proposal, as a fraction of half the

@@ -118,7 +118,6 @@ class BiasedAdvice(DegradedAdvice):
 
     Args:
         offset: in normalised actions, finite.
-        key: entry of the advice, [*batch, n_guides, A].
     """
 
     numbers_only = "biased"
@@ -139,7 +138,6 @@ class ScaledAdvice(DegradedAdvice):
         gain: the constant, finite: 0.5 for an undertuned guide, 0 for neutral advice, -1 for an
             adversary. With a negative one choices are advised in the reverse order; a positive one
             leaves them as they are, with a warning.
-        key: entry of the advice, [*batch, n_guides, A].
     """
 
     def __init__(self, gain: float, key: NestedKey = "guide_action") -> None:
@@ -162,7 +160,6 @@ class PartialAdvice(DegradedAdvice):
 
     Args:
         side: "left" keeps positive values, "right" negative values.
-        key: entry of the advice, [*batch, n_guides, A].
     """
 
     numbers_only = "partial"
@@ -181,7 +178,6 @@ class _DrawnAdvice(DegradedAdvice):
 
     Args:
         seed: of the draws.
-        key: entry of the advice, [*batch, n_guides, A].
     """
 
     sample: Callable[..., Tensor]  # draws numbers of a shape with a generator
@@ -221,8 +217,6 @@ class NoisyAdvice(_DrawnAdvice):
 
     Args:
         sigma: standard deviation in normalised actions.
-        seed: of the draws.
-        key: entry of the advice, [*batch, n_guides, A].
     """
 
     sample = staticmethod(torch.randn)
@@ -244,8 +238,6 @@ class RandomAdvice(_DrawnAdvice):
     Args:
         low: smallest number, in normalised actions, finite.
         high: largest number, in normalised actions, finite and more than `low`.
-        seed: of the draws.
-        key: entry of the advice, [*batch, n_guides, A].
     """
 
     sample = staticmethod(torch.rand)
@@ -274,7 +266,6 @@ class ShuffledAdvice(DegradedAdvice):
 
     Args:
         seed: of the draws.
-        key: entry of the advice, [*batch, n_guides, A].
         memory_key: entry for the original advice, [*batch, 1, n_guides, A].
     """
 
@@ -336,7 +327,6 @@ class DelayedAdvice(DegradedAdvice):
 
     Args:
         steps: the delay, 0 for none.
-        key: entry of the advice, [*batch, n_guides, A].
         memory_key: entry for the advice of the last steps, [*batch, steps, n_guides, A], oldest
             first.
     """
@@ -374,7 +364,6 @@ class RemovedAdvice(DegradedAdvice, ActionTransform):
     It is the action that the agent chose, also where actions take effect later.
 
     Args:
-        key: entry of the advice, [*batch, n_guides, A].
         action_key: entry of the action; a discrete action becomes one-hot.
     """
 
@@ -405,12 +394,7 @@ class RemovedAdvice(DegradedAdvice, ActionTransform):
 
 @cache
 def say_for_numbers(name: str, kind: str) -> None:
-    """Warn once in a process that a degradation of numbers has no meaning for choices.
-
-    Args:
-        name: in conf/degrade.
-        kind: name of its class.
-    """
+    """Warn once in a process that a degradation of numbers has no meaning for choices."""
     warnings.warn(
         f"degrade={name} ({kind}) degrades numbers, but the action of this env is choices: the "
         "advice is the guide's choice all the same, or none at all; take degrade=adversarial, "

@@ -43,9 +43,6 @@ def page_of(verdict: Verdict, outcome: Outcome, delayed: str, measured: int, com
     """Return the page.
 
     Args:
-        verdict: the recommendation.
-        outcome: what was measured.
-        delayed: the sentence about a delay.
         measured: env steps that only measured.
         command: that trains the recommended method to the end; empty for none.
     """
@@ -76,11 +73,7 @@ def page_of(verdict: Verdict, outcome: Outcome, delayed: str, measured: int, com
 
 
 def few_cases(runs: Sequence[Run]) -> str:
-    """Return the sentence about start tests that held no guide after few cases; empty for none.
-
-    Args:
-        runs: of anchored COIL.
-    """
+    """Return the sentence about start tests that held no guide after few cases; empty for none."""
     *_, cases, weight = StartTest.names
     firsts = [run.curve[0] for run in runs if run.curve]
     few = [row[cases] for row in firsts if row.get(cases, np.nan) < FEW and not row[weight]]
@@ -98,9 +91,7 @@ def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> str:
     """Return the sentence about a step of delay on observation and action.
 
     Args:
-        entry: what came out best.
         late: the same with the delay.
-        random: random actions.
     """
     found = difference(late, Entry(entry.name, entry.returns[:1]))
     own = float(entry.returns[0].mean())
@@ -123,7 +114,6 @@ def command_of(given: Named, verdict: Verdict) -> str:
 
     Args:
         given: env, guide and everything else that was given.
-        verdict: the recommendation.
     """
     if not verdict.train:
         return ""
@@ -170,10 +160,7 @@ def draw(outcome: Outcome, lines: Mapping[str, float], cases: int | None, path: 
     """Draw the learning curves of all arms, each seed thin and their mean thick, beside the guide.
 
     Args:
-        outcome: what was measured.
         lines: return of guide and opposite in the cases of the curves, by name.
-        cases: number of these cases.
-        path: of the picture.
     """
     strokes = style.strong_strokes(outcome.runs)
     handles: list[Artist] = []
@@ -199,11 +186,7 @@ def draw(outcome: Outcome, lines: Mapping[str, float], cases: int | None, path: 
 
 
 def guide_lines(outcome: Outcome) -> dict[str, float]:
-    """Return the lines of the picture: the guide in the cases of the curve, if a run knows it.
-
-    Args:
-        outcome: what was measured.
-    """
+    """Return the lines of the picture: the guide in the cases of the curve, if a run knows it."""
     for runs in outcome.runs.values():
         for run in runs:
             if run.guide_returns:

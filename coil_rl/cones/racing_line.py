@@ -29,9 +29,6 @@ class RacingLineGuide(SplineGuide):
         max_steering: steering angle of action 1, degrees, at most 90.
         car_length: distance between the axles, m.
         spline: of the path, "cubic" (smoothing spline) or "quadratic" (least-squares parabola).
-        smoothing: lambda of the cubic smoothing spline, m^3.
-        in_keys: entries of cones, cone count and steering.
-        out_key: entry for the advice.
 
     Raises:
         ValueError: for a value out of range.

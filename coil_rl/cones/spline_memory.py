@@ -46,8 +46,6 @@ class SplineMemoryGuide(SplineGuide):
             steering is kept without one, and passed targets count again out of sight.
         sight: m, range in which a target is visible.
         gain: factor of the advice of equation 103.
-        sharpness: power of the distance in equation 103, at least 0.
-        max_steering: steering angle of action 1, degrees.
 
     Raises:
         ValueError: for a value out of range.

@@ -12,15 +12,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict import NestedKey
-from tensordict.nn import TensorDictModuleBase
-from torchrl.data import Composite
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from coil_rl.config import parts
-from coil_rl.config.choices import about_choices, needs_numbers
+from coil_rl.config.fits import (
+    check_entry,
+    check_guide_in_env,
+    check_measures,
+    check_number,
+    dotted,
+)
 from coil_rl.config.folder import run_folder
 from coil_rl.config.messages import sentence
 from coil_rl.config.nodes import build, build_all, check_node
@@ -36,30 +39,39 @@ from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import check_logger
 from coil_rl.config.values import check_values
 from coil_rl.errors import UserError, did_you_mean
-from coil_rl.foreign.batch import SeededRows, optional_entries
-from coil_rl.foreign.faults import ForeignError
+from coil_rl.foreign.batch import SeededRows
 from coil_rl.foreign.trial import Tried, tried, unrepeated
-from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.off_policy import OffPolicy
-from coil_rl.measures import measures_of
 from coil_rl.output import say
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
 from coil_rl.run.training import INIT
-from coil_rl.transforms import GuideActions
-from coil_rl.transforms.action_space import nested_key
-from coil_rl.transforms.guide_actions import UnfitActionError
+from coil_rl.transforms.action_space import ChoicesError, nested_key
 
+# Methods that take choices as actions, the most useful ones first.
+WITH_CHOICES = (
+    "coil_anchored",
+    "coil",
+    "coil_dropout",
+    "rfc",
+    "coil_rfc",
+    "kickstart",
+    "jump_start",
+    "imitate_then_ppo",
+    "advisor",
+    "dagger",
+    "oil",
+    "ppo",
+)
 # Kind of a learner: description and example.
 KINDS = {
     "agent": ("learns from reward", "ppo"),
     "imitation": ("imitates a guide", "forest"),
     "guides": ("improves its guides", "dynamic_coil"),
 }
-EPISODE_REWARD = "episode_reward"  # written by a transform of every env
 WATCHED = ("episode", "step")  # groups of `watch`
 # What is said of a slow controller is about so many steps of an episode, and a curve of so many
 # policies at least.
@@ -100,7 +112,7 @@ def check_parts(config: DictConfig) -> None:
         except UserError as error:
             if not needs_numbers(error):
                 raise
-            raise UserError(about_choices(config, make_env.bare(1, TEST, None))) from error
+            raise UserError(about_choices(config)) from error
         if config.method.transforms:
             for advice in config.evaluation.advice:
                 _check_cases(cases, partial(make_env, cases, TEST, advice))
@@ -192,9 +204,9 @@ def _check_env(
         )
     check_node(config.env, "env")
     env = make_env.bare(1, TEST, None)
-    check_measures(config, env)
+    check_measures(config.evaluation.measures, env)
     for key in recorded:
-        _check_entry(env, key, "evaluation.pictures")
+        check_entry(env, key, "evaluation.pictures")
     _check_repeats(env)
     advises = config.method.needs_guide or "advice" in config.method.transforms
     if not config.guide and not advises:
@@ -230,7 +242,7 @@ def _check_repeats(env: EnvBase) -> None:
     key = unrepeated(env)
     if key is not None:
         warnings.warn(
-            f"the env does not obey its seed: {_dotted(key)} differs when an episode is repeated, "
+            f"the env does not obey its seed: {dotted(key)} differs when an episode is repeated, "
             "so the cases of an evaluation are not the same for each policy; draw random numbers "
             "from self.np_random, or give env.fresh=true if a reset leaves something of the past",
             stacklevel=2,
@@ -268,116 +280,6 @@ def _say_cost_of_curve(config: DictConfig, found: Tried) -> None:
             f"evaluation.curve.points={curve.points // 4} keeps fewer policies",
             error=True,
         )
-
-
-def check_measures(config: DictConfig, env: EnvBase) -> None:
-    """Raise a `UserError` for a measure of an entry that is missing or not one number per row.
-
-    So it is for a `where` that is neither true or false in each row nor a number of Gymnasium's
-    info.
-    """
-    for name, measure in measures_of(config.evaluation.measures).items():
-        place = f"evaluation.measures.{name}"
-        _check_number(env, nested_key(measure.entry), place)
-        if measure.where is not None:
-            _check_flag(env, nested_key(measure.where), place)
-
-
-def _check_number(env: EnvBase, key: NestedKey, name: str) -> None:
-    """Raise a `UserError` if an entry does not have exactly one number per row, or per agent."""
-    _check_entry(env, key, name)
-    rewards = [env.full_reward_spec[each].shape for each in env.reward_keys]
-    for group in _groups(env, key):
-        spec = group[key]
-        parent = group[key[:-1]] if isinstance(key, tuple) and len(key) > 1 else group
-        shape = spec.shape[len(parent.shape) :]
-        is_one = shape.numel() == 1 or spec.shape in rewards  # of each agent, for some envs
-        if isinstance(spec, Composite) or spec.dtype is None or not is_one:
-            numbers = f"{shape.numel()} numbers" if shape.numel() > 1 else "no number"
-            raise UserError(
-                f"{name}={_dotted(key)} has {numbers} a row, and one is needed; name an entry of "
-                "one number, or let the env write one"
-            )
-
-
-def _check_flag(env: EnvBase, key: NestedKey, name: str) -> None:
-    """Raise a `UserError` if an entry is not a flag with one value per row.
-
-    It is a boolean, or a number of Gymnasium's info, where flags are numbers too.
-    """
-    _check_entry(env, key, name)
-    found = [group[key] for group in _groups(env, key)]
-    rows = env.batch_size.numel()
-    of_info = key in optional_entries(env)
-    if not any(
-        (of_info or spec.dtype == torch.bool) and spec.shape.numel() == rows for spec in found
-    ):
-        raise UserError(
-            f"{name}.where={_dotted(key)} must be a flag, true or false once a row, or a number of "
-            "Gymnasium's info (env.info); name another entry, or leave it out"
-        )
-
-
-def _specs(env: EnvBase) -> list[Composite]:
-    """Return the specs of what an env writes after a step."""
-    return [env.observation_spec, env.full_reward_spec, env.full_done_spec]
-
-
-def _groups(env: EnvBase, key: NestedKey) -> list[Composite]:
-    """Return the specs of an env that have an entry; none for the sum of rewards."""
-    return [group for group in _specs(env) if key in group.keys(True)]
-
-
-def _check_entry(env: EnvBase, key: NestedKey, name: str) -> None:
-    """Raise a `UserError` if an env does not write an entry; `name` is the key that names it."""
-    known = {EPISODE_REWARD}
-    for spec in _specs(env):
-        known |= {_dotted(each) for each in spec.keys(True)}
-    given = _dotted(key)
-    if given not in known:
-        raise UserError(
-            f"{name}={given} is no entry of the env; it has {', '.join(sorted(known))}"
-            f"{did_you_mean(given, known)}"
-        )
-
-
-def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
-    """Check that a guide can act in an env.
-
-    Args:
-        guide: the guide.
-        env: of any number of rows; it is stepped once.
-        name: key of the guide, for the message.
-
-    Raises:
-        UserError: if the env lacks an entry that the guide reads, or its action does not fit.
-    """
-    try:
-        transform = GuideActions({"guide": guide})
-        memory = (key for each in transform.guides.memories.values() for key in each.specs)
-        known = [*env.observation_spec.keys(True), *transform.supplied, *memory]
-        for key in guide.in_keys:
-            if key not in known:
-                has = ", ".join(map(_dotted, env.observation_spec.keys()))
-                remedy = getattr(guide, "remedy", "")  # what gives the entry that it reads
-                raise UserError(
-                    f"{name}: it reads {_dotted(key)}, but the env has only {has}"
-                    f"{remedy and '; '}{remedy}"
-                )
-        advised = TransformedEnv(env, transform)
-        advised.step(FollowAdvice(advised)(advised.reset()))
-        advised.state_dict()  # a state that no checkpoint can hold is refused before the training
-    except UnfitActionError as error:
-        raise UserError(f"{name}: its action {error.problem}") from error
-    except ForeignError as error:  # its sentence says whether the env or the guide is at fault
-        raise UserError(str(error)) from error
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{name}: {error.args[0] if error.args else error}") from error
-    except RuntimeError as error:
-        first = str(error).partition("\n")[0]
-        raise UserError(
-            f"{name}: it cannot act on the observations of this env ({first})"
-        ) from error
 
 
 def _check_cases(cases: int, make: Callable[[], Any]) -> None:
@@ -497,7 +399,7 @@ def _check_watch(config: DictConfig, env: EnvBase) -> None:
         for name, key in keys.items():
             if not isinstance(key, ListConfig):
                 raise UserError(f"watch.{group}.{name}={key} must be a list, such as [info, lap]")
-            _check_number(env, nested_key(key), f"watch.{group}.{name}")
+            check_number(env, nested_key(key), f"watch.{group}.{name}")
 
 
 def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
@@ -520,10 +422,6 @@ def _check_frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> None:
         )
 
 
-def _dotted(key: str | Iterable[Any]) -> str:
-    return key if isinstance(key, str) else ".".join(map(str, key))
-
-
 def make_folder(folder: Path) -> None:
     """Make the folder of a run, or raise a `UserError` if nothing can be written there."""
     try:
@@ -532,3 +430,29 @@ def make_folder(folder: Path) -> None:
             raise PermissionError(errno.EACCES, "Permission denied", str(folder))
     except OSError as error:
         raise UserError(sentence(error)) from error
+
+
+def needs_numbers(error: BaseException | None) -> bool:
+    """Return whether an error, or one of its causes, is about choices where numbers are needed.
+
+    Args:
+        error: or None.
+    """
+    while error is not None and not isinstance(error, ChoicesError):
+        error = error.__cause__
+    return error is not None
+
+
+def about_choices(config: DictConfig) -> str:
+    """Return why a method cannot be used where actions are choices, and which ones can.
+
+    Args:
+        config: composed, of a method that needs numbers.
+    """
+    needs = f"method={config.method.name}"
+    if config.method.name in WITH_CHOICES:  # then it is another learner than the method's own
+        needs = f"learner={config.learner['_target_'].rpartition('.')[2].lower()}"
+    return (
+        f"{needs} needs numbers as actions, but they are choices here; with choices take "
+        f"learner=ppo and method={', '.join(WITH_CHOICES)}"
+    )

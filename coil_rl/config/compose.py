@@ -1,16 +1,14 @@
 """From the words of a command line and YAML files to a configuration: Hydra composes it.
 
-What a person wrote is what runs: values of YAML files, and of the command line.
+What a person wrote is what runs. Hydra composes the groups in a fixed order, env before learner
+before method. So a value of a later group replaces the one that a user wrote in a file of an
+earlier group, `learner: {normalise: true}` in a file of an env for example, and nobody says so.
+Here every value that is written in a file of somebody else than coil-rl is put into its place
+again, unless the command line gives another one.
 
-Hydra composes the groups in a fixed order, env before learner before method. So a value of a later
-group replaces the one that a user wrote in a file of an earlier group, `learner: {normalise: true}`
-in a file of an env for example, and nobody says so. Here every value that is written in a file of
-somebody else than coil-rl is put into its place again, unless the command line gives another one.
-
-The YAML files of guests: packages beside coil-rl that bring envs, guides, experiments, programs.
-
-A guest names the package of its files by an entry point, and Hydra then finds them like those of
-coil-rl, by the names of their folders:
+Guests, packages beside coil-rl, bring YAML files of envs, guides, experiments and programs. A guest
+names the package of its files by an entry point, and Hydra then finds them like those of coil-rl,
+by the names of their folders:
 
     [project.entry-points."coil_rl.conf"]
     my_package = "my_package.conf"
@@ -21,8 +19,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from importlib import metadata
-from typing import Any, NamedTuple
+from importlib import metadata, resources
+from importlib.resources.abc import Traversable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 from hydra import compose, initialize_config_module
 from hydra.core.config_search_path import ConfigSearchPath
@@ -34,10 +35,13 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.messages import sentence
+from coil_rl.config.messages import SEVERAL, sentence
 from coil_rl.errors import UserError
 
 CORE = "coil_rl.conf"  # the package of our own files, and the group of the entry points
+
+
+REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
 
 
 @cache
@@ -74,10 +78,6 @@ class GuestFiles(SearchPathPlugin):
 Plugins.instance().register(GuestFiles)
 
 
-SEVERAL = ("guide", "disturb", "degrade")  # groups of which several files may be chosen
-REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
-
-
 @dataclass(frozen=True)
 class Written:
     """A value in a file of a user.
@@ -95,48 +95,42 @@ class Written:
     files: frozenset[str]
 
 
-class Job(NamedTuple):
-    """A run of a sweep, and all that differ from it by their seed only."""
-
-    words: Sequence[str]  # for the program, also those of the sweep
-    config: DictConfig  # composed
-
-
 def keep_written(
-    config: DictConfig, config_name: str, task: Sequence[str], hydra: Sequence[str] = ()
+    config: DictConfig, hydra: Any, task: Sequence[str], others: Sequence[str] = ()
 ) -> None:
     """Put the values of users' files into their places, after Hydra has composed all files.
 
-    Hydra must be initialised.
+    The order of Hydra's defaults list cannot say it: a method is meant to replace what a shipped
+    env file says of the learner, and not what a user's file of an env says.
 
     Args:
-        config: composed; it is changed in place.
-        config_name: of the program.
+        config: composed by a Hydra that is initialised; it is changed in place.
+        hydra: its node of Hydra.
         task: overrides of the command line for the program.
-        hydra: overrides of the command line for Hydra.
+        others: overrides of the command line for Hydra.
 
     Raises:
         UserError: for a value that two files give differently, or that has no place.
     """
-    overrides = [*task, *hydra]
-    loader: Any = GlobalHydra.instance().config_loader()
-    _, files = loader._parse_overrides_and_create_caching_repo(config_name, overrides)
+    loader = GlobalHydra.instance().config_loader()
+    groups = {str(group).replace("/", ".") for group in hydra.runtime.choices}
+    groups |= set(loader.list_groups(""))  # a choice of several files is not among the first
     for text in task:
         group, value = key_of(text), text.partition("=")[2]
-        if group not in SEVERAL and value.startswith("[") and files.group_exists(group):
+        if group in groups.difference(SEVERAL) and value.startswith("["):
             raise UserError(
                 f"{text} chooses several files of a group that takes one; for a run with each "
                 f"write -m {group}={value.strip('[]')}"
             )
-    with open_dict(config):
-        # To look for files of users takes as long as to compose all files.
-        places = [source.full_path() for source in files.get_sources()]
-        if not all(place.startswith(shipped_places()) for place in places):
-            defaults = loader.compute_defaults_list(config_name, overrides, RunMode.RUN).defaults
-            # A choice of a file, such as method=coil, gives no value.
-            keys = [key_of(text) for text in task]
-            typed = [key for key in keys if not files.group_exists(key.replace(".", "/"))]
-            _keep(config, _written(defaults, files), typed)
+    places = [f"{place.schema}://{place.path}" for place in hydra.runtime.config_sources]
+    # To look for files of users takes as long as to compose all files.
+    if not all(place.startswith(shipped_places()) for place in places):
+        name, words = hydra.job.config_name, [*task, *others]
+        defaults = loader.compute_defaults_list(name, words, RunMode.RUN).defaults
+        # A choice of a file, such as method=coil, gives no value.
+        typed = [key for key in map(key_of, task) if key not in groups]
+        with open_dict(config):
+            _keep(config, _written(defaults, places), typed)
 
 
 def _keep(config: DictConfig, values: Iterable[Written], typed: Sequence[str]) -> None:
@@ -210,19 +204,34 @@ def _lists(one: Written, other: Written) -> bool:
     return one.file in other.files or other.file in one.files
 
 
-def _written(defaults: Iterable[Any], files: Any) -> Iterator[Written]:
-    """Yield the values in the files of users, in the order of composition."""
+def _written(defaults: Iterable[Any], places: Sequence[str]) -> Iterator[Written]:
+    """Yield the values in the files of users, in the order of composition.
+
+    Args:
+        defaults: Hydra's list of all files.
+        places: where Hydra looks for files, the first one that has a file wins.
+    """
     defaults = [default for default in defaults if default.config_path is not None]
     parents = {default.config_path: default.parent for default in defaults}
     for default in defaults:
-        found = files.load_config(default.config_path)
-        if found is None or found.path.startswith(shipped_places()):
+        name = f"{default.config_path}.yaml"
+        found = [(place, file) for place in places if (file := _file(place, name)).is_file()]
+        if not found or found[0][0].startswith(shipped_places()):
             continue
         lists = frozenset(f"{path}.yaml" for path in _ancestors(default, parents))
-        values: Any = OmegaConf.to_container(found.config, resolve=False)
+        content = OmegaConf.create(found[0][1].read_text(encoding="utf-8"))
+        values: Any = OmegaConf.to_container(content, resolve=False)
         for key, value in leaves(values, default.package or ""):
             if key.partition(".")[0] not in ("hydra", "defaults"):
-                yield Written(key, value, f"{default.config_path}.yaml", lists)
+                yield Written(key, value, name, lists)
+
+
+def _file(place: str, name: str) -> Traversable:
+    """Return a file in a folder or a package, such as "pkg://coil_rl.conf"."""
+    kind, _, where = place.partition("://")
+    if kind == "pkg" and find_spec(where.replace("/", ".")) is not None:
+        return resources.files(where.replace("/", ".")) / name
+    return Path(where) / name
 
 
 def _ancestors(default: Any, parents: Mapping[str, str | None]) -> set[str]:
@@ -262,9 +271,12 @@ def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConf
     """
     try:
         with _own_hydra():
-            config = compose("train", list(words), return_hydra_config=with_hydra)
+            config = compose("train", list(words), return_hydra_config=True)
             task = [word for word in words if not word.startswith("hydra.")]
-            keep_written(config, "train", task, [w for w in words if w not in task])
+            keep_written(config, config.hydra, task, [w for w in words if w not in task])
+            if not with_hydra:
+                with open_dict(config):
+                    del config["hydra"]
             return config
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(sentence(error)) from error

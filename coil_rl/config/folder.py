@@ -27,6 +27,10 @@ from coil_rl.files import LARGEST_NUMBERS, read_file, read_text
 from coil_rl.plain_yaml import read_yaml
 from coil_rl.run.folder import CONFIG, check_same, is_begun
 
+PREFIX = "pretrained:"
+CHECKSUMS, CARD = "checksums.json", "card.md"
+LARGEST = 200_000  # bytes of a file of a shipped policy
+
 
 def settings(config: DictConfig) -> dict[str, Any]:
     """Return what is saved of a configuration: plain values, without references."""
@@ -131,11 +135,6 @@ def _flat(node: Any, name: str = "") -> dict[str, Any]:
     for key, value in node.items():
         result |= _flat(value, f"{name}.{key}" if name else str(key))
     return result
-
-
-PREFIX = "pretrained:"
-CHECKSUMS, CARD = "checksums.json", "card.md"
-LARGEST = 200_000  # bytes of a file of a shipped policy
 
 
 def pretrained_names() -> list[str]:

@@ -35,12 +35,29 @@ LAUNCHERS = {
 
 TYPED = re.compile(r"Could not override '([^']+)'")
 MERGED = re.compile(r"Error merging override (.+)")
-NO_GROUP = re.compile(r"(?:In '([^']+)': )?Could not override '([\w/]+)'\. No match")
 NO_CHOICE = "Config group override must be a string or a list"
 NO_INTEGER = re.compile(
     r"override ([\w.]+)=.*Value '([\d.eE+]+)' of type 'float' could not be converted to Integer",
     re.DOTALL,
 )
+
+
+# Names of hyper-parameters elsewhere (Stable-Baselines3, CleanRL, rsl_rl), and ours.
+OTHER_NAMES = {
+    "lr": "learning_rate",
+    "total_timesteps": "frames",
+    "n_steps": "steps",
+    "num_steps": "steps",
+    "n_envs": "num_envs",
+    "n_epochs": "epochs",
+    "clip_range": "clip",
+    "ent_coef": "entropy",
+    "net_arch": "hidden",
+    "env_id": "id",
+}
+SEVERAL = ("guide", "disturb", "degrade")  # groups of which several files may be chosen
+OF_ENVS = {"env.id": "gym", "env.of": "torchrl", "env.options": "gym", "env.wrappers": "gym"}
+MOST = 2  # places that a hint names
 
 
 def is_no_bug(error: BaseException) -> bool:
@@ -97,9 +114,6 @@ def _not_composed(error: BaseException) -> str:
         without_package = file_without_package(str(error))
         if without_package:
             return without_package
-    group = NO_GROUP.match(str(error))
-    if group is not None and group[2] in OF_CONES:
-        return _group_of_cones(group[1], group[2])
     for key_error in (error, error.__cause__):
         if isinstance(key_error, (ConfigAttributeError, ConfigKeyError)):
             return _unknown_key(key_error, TYPED.search(str(error)))
@@ -140,23 +154,6 @@ def _wrong_kind(override: str, cause: str) -> str:
     if "does not support deletion" in cause:
         return f"{override}: {key.lstrip('~')} cannot be left out; give it another value"
     return ""
-
-
-def _group_of_cones(file: str | None, group: str) -> str:
-    """Return the message for a group that only the cone world has, and another env is chosen.
-
-    Args:
-        file: in whose defaults list it is overridden, without its suffix; None: the command line.
-        group: such as "track".
-    """
-    has = f"only the cone world (env=cone_track) has the group {group}"
-    if file is None:
-        return f"{group}= cannot be given for this env: {has}; leave it out"
-    return (
-        f"{file}.yaml overrides /{group}, but {has}: leave env= out, or write in the file, instead "
-        f"of that line, override /env: NAME, of an env file that does it (as "
-        "env/cone_track_unseen.yaml), so that another env replaces it"
-    )
 
 
 def _unreadable_override(error: OverrideParseException) -> str:
@@ -246,37 +243,6 @@ def _first_paragraph(error: BaseException) -> str:
         if line.strip() and not line.startswith((" ", "\t", "See http")):
             kept.append(line.strip())
     return " ".join(kept) or type(error).__name__
-
-
-OF_CONES = ("track", "preset")  # groups of the cone world
-# Names of hyper-parameters elsewhere (Stable-Baselines3, CleanRL, rsl_rl), and ours.
-OTHER_NAMES = {
-    "lr": "learning_rate",
-    "total_timesteps": "frames",
-    "timesteps": "frames",
-    "n_steps": "steps",
-    "num_steps": "steps",
-    "n_envs": "num_envs",
-    "n_epochs": "epochs",
-    "update_epochs": "epochs",
-    "num_minibatches": "minibatches",
-    "clip_range": "clip",
-    "clip_coef": "clip",
-    "ent_coef": "entropy",
-    "entropy_coef": "entropy",
-    "vf_coef": "critic",
-    "discount": "gamma",
-    "lam": "gae_lambda",
-    "lmbda": "gae_lambda",
-    "net_arch": "hidden",
-    "hidden_sizes": "hidden",
-    "buffer_size": "capacity",
-    "learning_starts": "starts",
-    "env_id": "id",
-}
-SEVERAL = ("guide", "disturb", "degrade")  # groups whose files are nodes by their names
-OF_ENVS = {"env.id": "gym", "env.of": "torchrl", "env.options": "gym", "env.wrappers": "gym"}
-MOST = 2  # places that a hint names
 
 
 def similar(given: str, known: Iterable[str]) -> str:

@@ -30,6 +30,11 @@ LARGEST_ARGUMENTS = {
 }
 
 
+PLAIN = (bool, int, float, str, NoneType)
+HOLDERS = (np.ndarray, tuple, list, Sequence)  # of numbers, in annotations
+_TARGET = object()
+
+
 def build(node: Any, name: str, expected: type | None = None, **arguments: Any) -> Any:
     """Instantiate a node of the configuration, and the nodes inside it.
 
@@ -146,10 +151,6 @@ def find_target(path: Any, name: str) -> Callable[..., Any]:
 def build_all(nodes: Mapping[str, Any], name: str) -> list[Transform]:
     """Return transforms in the order of the configuration."""
     return [build(node, f"{name}.{key}", Transform) for key, node in nodes.items()]
-
-
-PLAIN = (bool, int, float, str, NoneType)
-HOLDERS = (np.ndarray, tuple, list, Sequence)  # of numbers, in annotations
 
 
 def check_arguments(
@@ -270,9 +271,6 @@ def _check_type(value: Any, annotation: Any, name: str) -> None:
             raise UserError(validation_message(error, known, name)) from None
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         raise UserError(f"{name}={value} must be an integer of 64 bits")
-
-
-_TARGET = object()
 
 
 def _known(value: Any, sequence: type[list[Any]] | type[tuple[Any, ...]]) -> Any:

@@ -27,6 +27,10 @@ from coil_rl.run.parts import TEST, TESTS, TRAIN, EnvMaker
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
 
+# Parts of a configuration that name entries of the env of a method; its guides are parts of
+# `method.transforms`.
+READERS = ("observes", "method", "watch", "learner", "degrade", "action", "evaluation")
+
 
 def build_evaluation(
     config: DictConfig, record: Mapping[str, NestedKey] | None = None
@@ -363,11 +367,6 @@ def driving_guides(config: DictConfig) -> dict[str, Any]:
     nodes: Any = OmegaConf.to_container(config.guide, resolve=True)
     left_out = demonstrations(config)
     return {name: node for name, node in nodes.items() if name not in left_out}
-
-
-# Parts of a configuration that name entries of the env of a method; its guides are parts of
-# `method.transforms`.
-READERS = ("observes", "method", "watch", "learner", "degrade", "action", "evaluation")
 
 
 def unread_controllers(config: DictConfig, transforms: Iterable[Transform]) -> set[str]:

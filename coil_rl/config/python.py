@@ -29,6 +29,8 @@ from coil_rl.foreign.faults import foreign
 from coil_rl.run.controller import Controller
 from coil_rl.run.run import Run
 
+Words = tuple[list[str], dict[str, Any]]  # of the command line, and nodes for objects by their key
+
 
 def train(
     env: Any,
@@ -217,9 +219,6 @@ def _shipped(group: str) -> set[str]:
     folders = [resources.files(package) / group for package in packages()]
     files = [file for folder in folders if folder.is_dir() for file in folder.iterdir()]
     return {file.name.removesuffix(".yaml") for file in files}
-
-
-Words = tuple[list[str], dict[str, Any]]  # of the command line, and nodes for objects by their key
 
 
 def _env(env: Any, name: str) -> Words:

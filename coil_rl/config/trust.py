@@ -71,6 +71,16 @@ _packages: frozenset[str] = frozenset()  # of the option `trust`
 _own: frozenset[str] = frozenset()  # targets in the configuration of the command
 
 
+# The packages of TorchRL's loggers, which are extras of this one.
+PACKAGES = {
+    "MLFlowLogger": "mlflow",
+    "TensorboardLogger": "tensorboard",
+    "TrackioLogger": "trackio",
+    "WandbLogger": "wandb",
+}
+PLAIN = r"[\w-]+"  # a name that is no path, no address and no reference
+
+
 def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -> None:
     """Let the run folders that this process reads from here on use parts of packages.
 
@@ -256,16 +266,6 @@ def _shipped_targets() -> frozenset[str]:
                     text = file.read_text(encoding="utf-8")
                     found |= set(re.findall(r"_target_: ([\w.]+)", text))
     return frozenset(found)
-
-
-# The packages of TorchRL's loggers, which are extras of this one.
-PACKAGES = {
-    "MLFlowLogger": "mlflow",
-    "TensorboardLogger": "tensorboard",
-    "TrackioLogger": "trackio",
-    "WandbLogger": "wandb",
-}
-PLAIN = r"[\w-]+"  # a name that is no path, no address and no reference
 
 
 def shipped_logger(node: Any) -> dict[str, Any] | None:

@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.compose import REFERENCE, Job, covers, key_of, leaves
+from coil_rl.config.compose import REFERENCE, covers, key_of, leaves
 from coil_rl.config.parts import advises, env_maker, learner_kind, trains_guides
 from coil_rl.errors import UserError
 from coil_rl.report.configurations import is_part
@@ -106,12 +106,12 @@ def _adds_noise(config: DictConfig) -> bool:
     return bool(env.full_action_spec[env.action_key].dtype.is_floating_point)
 
 
-def check_sweep(task: Iterable[str], jobs: Sequence[Job]) -> list[str]:
+def check_sweep(task: Iterable[str], runs: Sequence[DictConfig]) -> list[str]:
     """Refuse a word that no run of a sweep reads.
 
     Args:
         task: words for the program, those of the sweep as they were given.
-        jobs: all runs of the sweep.
+        runs: configurations of all runs; one object for those that differ by their seed only.
 
     Returns:
         a sentence for each word that only some of the runs read.
@@ -120,17 +120,18 @@ def check_sweep(task: Iterable[str], jobs: Sequence[Job]) -> list[str]:
         UserError: for the first word that none of them reads.
     """
     sentences = []
+    different = {id(run): run for run in runs}
     for text in task:
-        ignored = [_ignores(job.config, text) for job in jobs]
-        if jobs and all(ignored):
-            [sentence] = unread(jobs[0].config, [text])
+        ignoring = {key: run for key, run in different.items() if _ignores(run, text)}
+        if runs and len(ignoring) == len(different):
+            [sentence] = unread(runs[0], [text])
             raise UserError(sentence.replace("no effect", "no effect in any run of this sweep"))
-        if any(ignored):
-            ignoring = [job for job, each in zip(jobs, ignored, strict=True) if each]
-            others = [job for job, each in zip(jobs, ignored, strict=True) if not each]
+        if ignoring:
+            count = sum(id(run) in ignoring for run in runs)
+            methods = dict.fromkeys(str(run.method.name) for run in ignoring.values())
             sentences.append(
-                f"{text} has no effect in the runs with {_told_apart(ignoring, others)}; the "
-                "others read it"
+                f"{text} has no effect in {count} of {len(runs)} runs of this sweep "
+                f"(method={', '.join(methods)})"
             )
     return sentences
 
@@ -141,18 +142,3 @@ def _ignores(config: DictConfig, text: str) -> bool:
         return any(True for _ in unread(config, [text]))
     except (UserError, OmegaConfBaseException):
         return False
-
-
-def _told_apart(some: Sequence[Job], others: Sequence[Job]) -> str:
-    """Return the words by which some runs of a sweep differ from the others, in short."""
-    sets, other_sets = [
-        [{key_of(word): word for word in job.words} for job in group] for group in (some, others)
-    ]
-    for key in sets[0]:
-        words = list(dict.fromkeys(each[key] for each in sets))
-        if not {*words} & {each[key] for each in other_sets}:
-            values = [word.partition("=")[2] for word in words]
-            return f"{words[0].partition('=')[0]}={','.join(values)}"
-    common = {*some[0].words}.intersection(*(job.words for job in (*some, *others)))
-    each = [" ".join(word for word in job.words if word not in common) for job in some]
-    return "; ".join(each)

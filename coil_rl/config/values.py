@@ -19,6 +19,10 @@ from coil_rl.ranges import validation_message
 LARGEST_BATCH = 2**28  # frames
 
 
+# Columns that evaluation.csv and episodes.csv have besides the measures.
+TAKEN = ("driver", "advice", "actions", "case", "reward", "steps", "episodes", "seed")
+
+
 def check_values(config: DictConfig) -> None:
     """Check the values of the configuration of any program.
 
@@ -82,10 +86,6 @@ def _unknown_key(config: DictConfig, *path: str) -> str:
         f"there is no key {key}; {name or 'the configuration'} has {', '.join(known)}"
         f"{similar(key, known)}"
     )
-
-
-# Columns that evaluation.csv and episodes.csv have besides the measures.
-TAKEN = ("driver", "advice", "actions", "case", "reward", "steps", "episodes", "seed")
 
 
 def complete_measures(config: DictConfig) -> None:

@@ -57,11 +57,7 @@ class Entry:
         return self.key if isinstance(self.key, str) else ".".join(self.key)
 
     def rows(self, count: int) -> Tensor:
-        """Return a value for some rows: the first one, or zeros.
-
-        Args:
-            count: number of rows.
-        """
+        """Return a value for some rows: the first one, or zeros."""
         first = torch.zeros(self.shape, dtype=self.dtype) if self.first is None else self.first
         return first.expand(count, *self.shape).clone()
 

@@ -47,7 +47,6 @@ from coil_rl.programs.sweeps import Jobs, is_sweep, remove_unused
 from coil_rl.run.stopping import STOP
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
-MOST_PROCESSES = 64  # of joblib, or four for each processor if those are more
 
 
 class NoSweepError(UserError):
@@ -212,7 +211,7 @@ def run_program(
         config_name: of the YAML file; also the name of the program.
         check: raises a `UserError` for a mistake in the configuration, before anything is done.
         config_path: where the YAML file is. One of another package, such as "pkg://my_package.conf",
-            finds the files of coil-rl by its own `hydra: {searchpath: [pkg://coil_rl.conf]}`, and
+            finds the files of coil-rl by an entry point, see `coil_rl.config.guest_files`, and
             gets the help and the clean-up of these programs by the schema `ProgramConfig`.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -272,7 +271,7 @@ def _do(
     _draw_into_files()
     if is_sweep() and "existing" in config:
         config.existing = "resume"  # so that a sweep goes on by the same command
-    keep_written(config, str(HydraConfig.get().job.config_name), *typed())
+    keep_written(config, HydraConfig.get(), *typed())
     trust_packages(config.get("trust", []), config)
     has_folder = bool(config.get("run_dir"))
     made = _missing(Path(config.run_dir).absolute()) if has_folder else []
@@ -370,7 +369,3 @@ def _check_options(config_name: str) -> None:
     for override in parser.parse_args().overrides:
         if override.startswith("="):
             error(f"{override!r} has no key, write KEY=VALUE")
-        jobs = re.fullmatch(r"\+*hydra\.launcher\.n_jobs=(-?\d+)", override)
-        most = max(MOST_PROCESSES, 4 * (os.cpu_count() or 1))
-        if jobs and abs(int(jobs[1])) > most:
-            error(f"{override} must be at most {most} on this machine")

@@ -88,7 +88,7 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
         UserError: for a folder without a run, one without tracks although tracks are given, or an
             env that does not write what is measured.
     """
-    from coil_rl.config.check import check_measures
+    from coil_rl.config.fits import check_measures
     from coil_rl.config.folder import read_config
     from coil_rl.config.parts import env_maker
     from coil_rl.config.values import check_values
@@ -108,7 +108,7 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
         config.evaluation.env["cases"] = config.evaluation.cases
     check_values(config)
     if config.method.observes is not None:
-        check_measures(config, env_maker(config)(SOME_ROWS, TEST))
+        check_measures(config.evaluation.measures, env_maker(config)(SOME_ROWS, TEST))
     return config
 
 

@@ -22,7 +22,7 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.compose import Job, keep_written
+from coil_rl.config.compose import keep_written
 from coil_rl.config.messages import is_no_bug, refuse, sentence
 from coil_rl.errors import RunningError, UserError
 from coil_rl.files import FAILED_JOBS
@@ -52,7 +52,7 @@ class Plan(Callback):
         """Refuse what the runs cannot use, and say how many there are and what some do not read."""
         if "existing" in config:  # the jobs are runs, which go on where they were stopped
             self._check(config)
-            runs: list[Job] = []
+            runs: list[DictConfig] = []
             # Hydra raises the errors of the composition next.
             with contextlib.suppress(HydraException, OmegaConfBaseException, UserError):
                 runs.extend(_planned(config))
@@ -132,21 +132,21 @@ def knows_all_runs(sweeper: DictConfig) -> bool:
     return str(sweeper.get("_target_")).endswith(BasicSweeper.__name__)
 
 
-def _planned(config: DictConfig) -> Iterator[Job]:
-    """Yield each run of a sweep, if Hydra's own sweeper makes it.
+def _planned(config: DictConfig) -> Iterator[DictConfig]:
+    """Yield the configuration of each run of a sweep, if Hydra's own sweeper makes it.
 
-    Runs that differ by their seed only are composed once.
+    Runs that differ by their seed only are composed once, and are the same object.
     """
     if not knows_all_runs(config.hydra.sweeper):
         return
     loader: Any = GlobalHydra.instance().config_loader()
     parser = OverridesParser.create(config_loader=loader)
     [jobs] = BasicSweeper.split_arguments(parser.parse_overrides(_words(config)), None)
-    known: dict[tuple[str, ...], Job] = {}
+    known: dict[tuple[str, ...], DictConfig] = {}
     for job in jobs:
         key = tuple(word for word in job if not word.startswith("seed="))
         if key not in known:
-            known[key] = Job(key, _composed(loader, config, job))
+            known[key] = _composed(loader, config, job)
         yield known[key]
 
 
@@ -159,24 +159,21 @@ def _words(config: DictConfig) -> list[str]:
 def _composed(loader: Any, config: DictConfig, job: Sequence[str]) -> DictConfig:
     """Return the configuration of a job of a sweep."""
     composed: DictConfig = loader.load_sweep_config(config, list(job))
-    name = str(config.hydra.job.config_name)
-    keep_written(composed, name, job, _plain(config, "hydra"))
+    keep_written(composed, composed.hydra, job, _plain(config, "hydra"))
     return composed
 
 
-def _frames_of(job: Job) -> int:
+def _frames_of(run: DictConfig) -> int:
     """Return the frames of training of a run, 0 for a method without an agent."""
-    return 0 if job.config.method.observes is None else int(job.config.budget.frames)
+    return 0 if run.method.observes is None else int(run.budget.frames)
 
 
-def _check_words(config: DictConfig, runs: Sequence[Job]) -> None:
+def _check_words(config: DictConfig, runs: Sequence[DictConfig]) -> None:
     """Refuse a word that no run of a sweep reads, and say which ones only some of them read."""
     from coil_rl.config.unread import check_sweep  # imports torch
 
-    # A run that differs from another one by its seed only is the same object.
-    different = list({id(run): run for run in runs}.values())
     try:
-        sentences = check_sweep(_words(config), different)
+        sentences = check_sweep(_words(config), runs)
     except UserError as error:
         refuse(str(config.hydra.job.name), error)
     for said in sentences:

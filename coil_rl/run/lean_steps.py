@@ -41,9 +41,6 @@ class LeanEnv:
 
         They have if it is one of this project, and if its transforms are a sum of rewards and links
         that remember, record and draw nothing.
-
-        Args:
-            env: with transforms.
         """
         base = env.base_env if isinstance(env, TransformedEnv) else env
         return (
@@ -59,7 +56,6 @@ class LeanEnv:
         """Return the entries after a step.
 
         Args:
-            action: as the transforms get it.
             before: entries before the step, of which the sums of rewards are read.
         """
         # An env of this project reads its action by the key only; a dictionary is made at once.
@@ -109,8 +105,6 @@ class LeanSteps:
         that it observes is written by the env.
 
         Args:
-            env: with transforms.
-            policy: of the env.
             keys: entries that are kept of each step; None: all.
         """
         return (
@@ -157,7 +151,6 @@ class LeanSteps:
 
 
 def _transforms(env: EnvBase) -> list[Transform]:
-    """Return the transforms of an env."""
     if not isinstance(env, TransformedEnv):
         return []
     return list(env.transform) if isinstance(env.transform, Compose) else [env.transform]

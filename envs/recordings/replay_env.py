@@ -293,7 +293,6 @@ def _perceive(
     """Return the cones [N, 2, K, 2] m of all scans of a recording, and their number [N, 2].
 
     Args:
-        recording: the recording.
         perception: called once for all scans with equal bearings.
         kept_cones: K.
     """

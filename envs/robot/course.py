@@ -158,7 +158,6 @@ class RobotCourse:
 
 
 def _squares(x: Tensor, y: Tensor) -> Tensor:
-    """Return x^2 + y^2."""
     return (x * x).add_(y * y)
 
 
@@ -171,7 +170,6 @@ def cones_of(track: Track, *, left: bool = True, right: bool = True) -> tuple[Te
     """Return the cones of a robot's track, thin ones left and thick ones right.
 
     Args:
-        track: the track.
         left: whether to include the cones of the left side.
         right: whether to include those of the right side; neither side is a `ValueError`.
 

@@ -345,7 +345,6 @@ def _write(
     """Write a recording of a simulated robot.
 
     Args:
-        path: of the file.
         rate: scans per second.
         angles: [P] radians, bearings of the beams.
         ranges: [T, P] m, the scans.

@@ -133,7 +133,6 @@ def _nearest(place: Tensor, cone: Tensor, distance: Tensor, size: int) -> tuple[
         place: of each hit, [N].
         cone: of each hit, [N].
         distance: m, of each hit, [N].
-        size: number of places.
     """
     nearest = torch.full((size,), torch.inf, dtype=distance.dtype)
     nearest = nearest.scatter_reduce(0, place, distance, "amin")

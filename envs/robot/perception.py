@@ -311,12 +311,7 @@ class BoundaryMemory(nn.Module):
 
 
 def declare_specs(env: EnvBase, example: TensorDictBase) -> None:
-    """Set the specs of a simulated or replayed robot.
-
-    Args:
-        env: the env.
-        example: the entries of its reset.
-    """
+    """Set the specs of a simulated or replayed robot."""
     batch, device = env.batch_size, env.device
     spec = make_composite_from_td(example, unsqueeze_null_shapes=False)
     for key in ("observation", "steering"):

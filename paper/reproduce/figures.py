@@ -82,7 +82,6 @@ def _lines(
     """Return the options of matplotlib for the line of each series.
 
     Args:
-        names: of all series.
         configured: by name of a series a colour and options; the others get a strong colour.
     """
     lines: dict[str, dict[str, Any]] = {}
@@ -136,7 +135,6 @@ def _term(ppo: PPO, rows: TensorDictBase, advantage: float) -> tuple[float, floa
     """Return the ratio, the value and the slope of the first of two terms of PPO's objective.
 
     Args:
-        ppo: the learner.
         rows: two rows of a batch; the second one has the ratio 1 and the opposite advantage.
         advantage: of the first row, 1 or -1.
     """

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig, OmegaConf
 
 import coil_robot.schema  # noqa: F401  registers the root configurations with Hydra
-from coil_rl.errors import UserError
-from coil_rl.programs import app
+from coil_rl import UserError, run_program
 
 if TYPE_CHECKING:
-    from coil_rl.envs.recordings.reading import Recording
+    from coil_rl.envs import Recording
     from coil_robot import DriveLog, LiveDriver, Setup
     from coil_robot.sources import Drive
 
@@ -33,7 +32,7 @@ def drive(config: DictConfig) -> None:
     """Drive, and write `drive.mcap` and `drive.md`."""
     import torch
 
-    from coil_rl.files import write_text
+    from coil_rl import write_text
     from coil_robot.drive_log import DriveLog
 
     torch.set_num_threads(config.threads)
@@ -57,9 +56,8 @@ def drive(config: DictConfig) -> None:
 
 def _controller(config: DictConfig) -> tuple[Any, Setup]:
     """Return what drives, and what it drives with: as in its training where nothing is given."""
-    from coil_rl.config.nodes import build
-    from coil_rl.config.python import open_run
-    from coil_rl.output import say
+    from coil_rl import build, open_run
+    from coil_rl.for_guests import say
     from coil_robot.setup import Setup, setup_of
 
     if config.run is None:
@@ -84,7 +82,8 @@ def _setup(config: DictConfig, trained: Setup) -> Setup:
 
 def _changed(part: Any, node: Any, name: str) -> Any:
     """Return a dataclass with the values that a node gives, which are those that are not null."""
-    from coil_rl.config.nodes import build, check_arguments
+    from coil_rl import build
+    from coil_rl.for_guests import check_arguments
 
     values: Any = OmegaConf.to_container(node, resolve=True)
     values = {key: each for key, each in values.items() if each not in (None, {"_target_": None})}
@@ -101,12 +100,6 @@ def _changed(part: Any, node: Any, name: str) -> Any:
 
 def _driver(config: DictConfig, controller: Any, setup: Setup, log: DriveLog) -> LiveDriver:
     """Return the driver.
-
-    Args:
-        config: of the program, with the limits.
-        controller: what drives.
-        setup: what it drives with.
-        log: of the drive.
 
     Raises:
         UserError: for a policy that cannot drive a car by the entries of the cone world.
@@ -143,8 +136,7 @@ def _driver(config: DictConfig, controller: Any, setup: Setup, log: DriveLog) ->
 
 def _recording(config: DictConfig) -> Recording | None:
     """Return the recording to drive by, if there is one; a `UserError` if it cannot be read."""
-    from coil_rl.envs.recordings.mcap_files import RecordingError
-    from coil_rl.envs.recordings.reading import read_recording
+    from coil_rl.envs import RecordingError, read_recording
 
     if config.recording is None:
         return None
@@ -216,8 +208,8 @@ def check(config: DictConfig) -> None:
 
     Otherwise make the folder of the results.
     """
-    from coil_rl.config.check import make_folder
-    from coil_rl.config.values import check_values
+    from coil_rl import check_values
+    from coil_rl.for_guests import check_used, make_folder
 
     check_values(config)
     if (config.run is None) == (not config.controller):
@@ -236,11 +228,11 @@ def check(config: DictConfig) -> None:
         )
     what = ("controller",) if config.run is None else ("run", "policy")
     reason = f"nothing reads it with a {what[0]} and where={config.where}"
-    app.check_used((*OF_ALL, *what, *OF_PLACES[config.where]), reason)
+    check_used((*OF_ALL, *what, *OF_PLACES[config.where]), reason)
     make_folder(Path(config.run_dir))
 
 
-main = partial(app.run_program, drive, "drive", check, "pkg://coil_robot.conf")
+main = partial(run_program, drive, "drive", check, "pkg://coil_robot.conf")
 
 if __name__ == "__main__":
     main()

@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig, OmegaConf
 
 import coil_robot.schema  # noqa: F401  registers the root configurations with Hydra
-from coil_rl.errors import UserError
-from coil_rl.programs import app
+from coil_rl import UserError, run_program
 
 if TYPE_CHECKING:
+    from coil_rl import Run
     from coil_rl.envs import McapReplayEnv
     from coil_robot.replay.open_loop import OpenLoop, Policies
 
 # Keys that have an effect without runs, too.
 USED = ("recording", "frame", "strict", "preset", "env", "guide", "runs")
-Runs = Mapping[str, tuple[Path, DictConfig]]  # folder and configuration by name of the policy
+Runs = Mapping[str, "Run"]  # by name of the policy
 
 
 def replay(config: DictConfig) -> None:
@@ -34,10 +34,9 @@ def replay(config: DictConfig) -> None:
     """
     import torch
 
-    from coil_rl.config.nodes import build
+    from coil_rl import build, write_text
     from coil_rl.envs import McapReplayEnv
-    from coil_rl.files import write_text
-    from coil_rl.output import progress
+    from coil_rl.for_guests import progress
     from coil_robot.replay.cautions import caution
     from coil_robot.replay.open_loop import open_loop
     from coil_robot.replay.report import NOTES, describe, outcome
@@ -65,7 +64,7 @@ def replay(config: DictConfig) -> None:
     parts = [describe(result) for result in results]
     cautions = [text for text in (caution(result, env.perception) for result in results) if text]
     parts += [f"Warning: {each}." for each in cautions]
-    parts += [f"{name} is {run} (policy {config.policy})." for name, (run, _) in runs.items()]
+    parts += [f"{name} is {run.folder} (policy {config.policy})." for name, run in runs.items()]
     parts.append(NOTES.format(max_steering=math.degrees(env.max_steering)))
     text = "\n\n".join(parts)
     write_text(folder / "replay.md", text)
@@ -78,32 +77,29 @@ def replay(config: DictConfig) -> None:
 
 def _load_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Policies]:
     """Return the runs and all policies by name, guides first."""
-    from coil_rl.config.assemble import assemble
-    from coil_rl.config.check import check_guide_in_env
-    from coil_rl.config.folder import read_config, run_folder
-    from coil_rl.config.parts import build_guides
+    from coil_rl import open_run
+    from coil_rl.for_guests import build_guides, check_guide_in_env
     from coil_robot.replay.open_loop import RECORDED
 
     guides = build_guides(config) if config.guide else {}
     for name, guide in guides.items():
         check_guide_in_env(guide, env, f"guide.{name}")
-    folders = [run_folder(run) for run in config.runs]
-    _check_unique("runs", folders)
-    configs = [read_config(folder, "runs", {"device": config.device}) for folder in folders]
+    opened = [open_run(run, device=config.device) for run in config.runs]
+    _check_unique("runs", [run.folder for run in opened])
     guide_names = [_topic_name(name) for name in guides]
-    run_names = _run_names([run.label for run in configs], [run.seed for run in configs])
+    run_names = _run_names([run.label for run in opened], [run.seed for run in opened])
     repeated = _first_repeated([RECORDED, *guide_names, *run_names])
     if repeated is not None:
         raise UserError(
             f"two policies would be called {repeated}; "
             "leave one out, or give the guide another name"
         )
-    runs = dict(zip(run_names, zip(folders, configs, strict=True), strict=True))
+    runs = dict(zip(run_names, opened, strict=True))
     policies = {}
     for name, guide in zip(guide_names, guides.values(), strict=True):
         policies[name] = (env, guide)
-    for name, (run, own) in runs.items():
-        policies[name] = assemble(own, run).in_env(env, config.policy)
+    for name, run in runs.items():
+        policies[name] = run.in_env(env, config.policy)
     return runs, policies
 
 
@@ -112,8 +108,7 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
 
     These are `annotated.mcap`, its Foxglove layout, `steering.csv` and `steering.png`.
     """
-    from coil_rl.config.assemble import assemble
-    from coil_rl.files import write_text
+    from coil_rl import write_text
     from coil_rl.report import write_csv
     from coil_robot.replay.annotation import annotate, foxglove_layout
     from coil_robot.replay.report import draw_steering, over_time
@@ -123,10 +118,10 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "run_dir"])
     attachments = {"config.yaml": OmegaConf.to_yaml(settings, resolve=True).encode()}
     inputs = {"config": attachments["config.yaml"]}
-    for name, (run, own) in runs.items():
-        text = (run / "config.yaml").read_bytes()
+    for name, run in runs.items():
+        text = (run.folder / "config.yaml").read_bytes()
         attachments[f"{name}/config.yaml"] = inputs[f"{name}_config"] = text
-        inputs[f"{name}_checkpoint"] = assemble(own, run).weights(config.policy).read_bytes()
+        inputs[f"{name}_checkpoint"] = run.weights(config.policy).read_bytes()
     about = {}
     for name, content in inputs.items():
         about[f"{name}_sha256"] = hashlib.sha256(content).hexdigest()
@@ -194,8 +189,8 @@ def check(config: DictConfig) -> None:
 
     Otherwise make the folder of the results.
     """
-    from coil_rl.config.check import make_folder
-    from coil_rl.config.values import check_values
+    from coil_rl import check_values
+    from coil_rl.for_guests import check_unused, check_used, make_folder
 
     check_values(config)
     if config.recording is None:
@@ -205,15 +200,15 @@ def check(config: DictConfig) -> None:
     if not config.guide and not config.runs:
         raise UserError("there is no policy; give a guide, as in guide=spline, or runs=[FOLDER]")
     if config.runs:
-        app.check_used((*USED, "policy"), "nothing in a replay reads it")
+        check_used((*USED, "policy"), "nothing in a replay reads it")
     else:
-        app.check_used(USED, "nothing in a replay without runs reads it")
-    app.check_unused("env", ("num_envs",), "each recording has a row of its own")
-    app.check_unused("env", ("smooth",), "a replay earns no reward")
+        check_used(USED, "nothing in a replay without runs reads it")
+    check_unused("env", ("num_envs",), "each recording has a row of its own")
+    check_unused("env", ("smooth",), "a replay earns no reward")
     make_folder(Path(config.run_dir))
 
 
-main = partial(app.run_program, replay, "replay", check, "pkg://coil_robot.conf")
+main = partial(run_program, replay, "replay", check, "pkg://coil_robot.conf")
 
 if __name__ == "__main__":
     main()

@@ -1,6 +1,6 @@
 """Whether a perception fits a recording, and a robot its recorded commands."""
 
-from coil_rl.envs.recordings.views import caution_about_view
+from coil_rl.envs.recordings import caution_about_view
 from coil_robot.replay.open_loop import OpenLoop
 
 BEYOND = 0.1  # share of the commands
@@ -10,7 +10,6 @@ def caution(result: OpenLoop, perception: object) -> str:
     """Return a warning if the perception or the commands hardly fit the recording, else nothing.
 
     Args:
-        result: of the recording.
         perception: of the env; only a `Perception` is asked for the clusters.
     """
     view = result.cones, result.count, result.both_valid

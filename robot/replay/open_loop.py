@@ -15,10 +15,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from coil_rl.envs.recordings.recording import Recording
-from coil_rl.envs.recordings.replay_env import McapReplayEnv
-from coil_rl.envs.reward import HISTORY, recent_mean
-from coil_rl.errors import UserError
+from coil_rl import UserError
+from coil_rl.envs import HISTORY, McapReplayEnv, Recording, recent_mean
 
 RECORDED = "recorded"  # name of the recorded commands among the policies
 ROUNDING = 1.001  # of commands at the limit
@@ -156,7 +154,6 @@ def recorded_steering(
     there are.
 
     Args:
-        recording: a recording with commands.
         speed: m/s of the robot, for a recording without speeds.
         car_length: length L of the robot, m.
         max_steering: radians of an action of 1.
@@ -177,7 +174,6 @@ def _share_beyond(
     """Return the share of the recorded commands that no steering of the robot fulfils.
 
     Args:
-        recording: a recording with commands.
         speed: m/s of the robot, for a recording without speeds.
         car_length: length L of the robot, m.
         max_steering: radians of an action of 1.

@@ -1,7 +1,5 @@
-import ast
 import subprocess
 import sys
-from pathlib import Path
 
 import coil_rl
 
@@ -14,18 +12,6 @@ def test_every_public_name_is_importable_and_listed():
         assert part.__name__ == name
         assert part.__doc__
     assert not hasattr(coil_rl, "Nothing")
-
-
-def test_type_checkers_see_the_same_names():
-    (block,) = [
-        node
-        for node in ast.parse(Path(coil_rl.__file__).read_text()).body
-        if isinstance(node, ast.If)
-    ]
-    names = {}
-    for node in block.body:
-        names |= {alias.asname: f"{node.module}.{alias.name}" for alias in node.names}
-    assert names == {name: f"{coil_rl._MODULES[name]}.{name}" for name in coil_rl.__all__}
 
 
 def test_import_of_the_package_is_light():

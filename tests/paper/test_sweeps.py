@@ -75,7 +75,6 @@ def test_sweep_is_started_until_all_its_runs_are_finished(authors, started, monk
         sweeps.run(authors, ["hydra/launcher=joblib"])
     command = [
         "-m",
-        sweeps.FILES,
         "+experiment=paper_authors",
         "budget.frames=64",
         "seed=0,1",
@@ -84,8 +83,7 @@ def test_sweep_is_started_until_all_its_runs_are_finished(authors, started, monk
     assert started == [command]
     assert (
         "paper_authors: 3 of 4 runs are missing\n"
-        "coil-train -m 'hydra.searchpath=[pkg://coil_paper.conf]' +experiment=paper_authors"
-        in capfd.readouterr().err
+        "coil-train -m +experiment=paper_authors" in capfd.readouterr().err
     )
     for folder in authors.all_folders:
         finish(folder)
@@ -101,7 +99,7 @@ def test_sweep_is_started_until_all_its_runs_are_finished(authors, started, monk
 
 def test_wrong_override_or_experiment_is_refused():
     with pytest.raises(
-        UserError, match=r"coil-train .* \+experiment=paper_dynamic learner.gama=1: there is no key"
+        UserError, match=r"coil-train \+experiment=paper_dynamic learner.gama=1: there is no key"
     ):
         planned("paper_dynamic", ["learner.gama=1"])
     with pytest.raises(UserError, match="there is no experiment=papr; experiment can be"):

@@ -7,8 +7,7 @@ from gymnasium import spaces
 from hydra import compose, initialize_config_module
 from programs import shipped
 
-from coil_rl.config.check import check_parts
-from coil_rl.config.choices import WITH_CHOICES
+from coil_rl.config.check import WITH_CHOICES, check_parts
 from coil_rl.errors import UserError
 
 METHODS = shipped("method")
@@ -53,8 +52,8 @@ def test_method_takes_choices_or_is_refused_with_those_that_do(method, tmp_path)
     with pytest.raises(UserError) as refused:
         checked(method, tmp_path)
     assert str(refused.value).startswith(
-        f"method={method} needs numbers as actions, but the action of env.id={__name__}:Switches "
-        "is 3 choices at once, of 2, 2, 2 options; with choices take learner=ppo and method=coil"
+        f"method={method} needs numbers as actions, but they are choices here; with choices take "
+        "learner=ppo and method=coil"
     )
 
 

@@ -50,7 +50,7 @@ WORDS = [  # of a run of PPO in env=gym env.id=odd_parts:Plain
     ("degrade=[noisy]", "degrade=[noisy] has no effect, because there is no guide"),
     ("network=gru learner=sac", "SAC cannot train a network with a memory; take network=mlp"),
     ("method=mixing guide=random method.transforms.mixing.weight=2", "weight=2 must be at most 1"),
-    ("track=unseen", "only the cone world (env=cone_track) has the group track; leave it out"),
+    ("track=unseen", "Could not override 'track'. No match in the defaults list"),
     ("+track=unseen", "+track=unseen has no effect: nothing in this run reads track"),
     ("+preset=paper", "+preset=paper has no effect: nothing in this run reads preset"),
     ("+evaluation.measures.speed.entry=speed", "measures.speed=speed is no entry of the env"),

@@ -639,10 +639,10 @@ VALUES = st.sampled_from(JUNK) | st.text(max_size=8).filter(lambda text: "\0" no
 
 
 # All examples of a test share its folder.
-@pytest.mark.parametrize("examples", [10, pytest.param(150, marks=pytest.mark.slow)])
-def test_any_value_is_accepted_or_refused_in_one_sentence(started, examples):
+@pytest.mark.slow
+def test_any_value_is_accepted_or_refused_in_one_sentence(started):
     @settings(
-        max_examples=examples, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow]
+        max_examples=150, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow]
     )
     @given(
         key=st.sampled_from(LEAVES) | st.sampled_from(LEAVES).map(lambda key: key + "x"),

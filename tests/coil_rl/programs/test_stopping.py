@@ -1,6 +1,5 @@
 """Signals, closed streams and failing jobs: what was learned is kept, and the others go on."""
 
-import os
 import re
 import shlex
 import shutil
@@ -153,11 +152,3 @@ def test_failed_job_of_joblib_leaves_the_others_alone(tmp_path):
     assert "1 job of this sweep failed: job 0" in done.stderr
     (folder,) = [path for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
     assert is_evaluated(folder)
-
-
-def test_number_of_processes_of_a_sweep_is_limited(tmp_path):
-    jobs = "hydra.launcher.n_jobs=100000"
-    sweep = [*SWEEP, "hydra/launcher=joblib", jobs]
-    error = called("train", *sweep, cwd=tmp_path, code=2).stderr
-    assert "n_jobs=100000 must be at most" in error
-    assert not os.listdir(tmp_path)

@@ -281,7 +281,7 @@ def test_equal_labels_are_distinguished_by_seed_and_then_by_number():
         ),
         (
             "recording=drive.mcap runs=[nowhere]",
-            "runs=nowhere is not the folder of a run: it has no config.yaml",
+            "nowhere is not the folder of a run: it has no config.yaml",
         ),
         ("recording=drive.mcap runs=[guide]", "guide has no agent: its guide drives alone"),
         ("recording=drive.mcap policy=last", "policy=last has no effect: nothing in a replay with"),
