@@ -44,6 +44,7 @@ MODULES = [
     "coil_rl.envs.recordings.mcap_files",
     "coil_rl.envs.recordings.messages",
     "coil_rl.envs.robot.clusters",
+    "coil_rl.ranges",
 ]
 
 # Folder -> allowed imports besides the standard library and the folder itself.

@@ -85,7 +85,7 @@ def verdict(entries: Mapping[str, Entry], failed: Sequence[str] = ()) -> Verdict
     if use.name in IDLE:
         what = sentences.idle(use, kept, entries)
     undecided = sentences.undecided(use, others, MATERIAL * scale, failed)
-    said = (what, sentences.gained(use, entries), undecided)
+    said = [*what, *sentences.gained(use, entries), *undecided]
     return Verdict(use.name, train, score, wrong, said)
 
 
