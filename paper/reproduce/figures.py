@@ -140,10 +140,9 @@ def _term(ppo: PPO, rows: TensorDictBase, advantage: float) -> tuple[float, floa
     """
     losses = ppo.losses(rows)
     slope = torch.autograd.grad(losses["loss_objective"], rows["action_log_prob"])[0]
-    losses = losses.detach()
     # Standardised, the advantages are 1 / sqrt(2) and its opposite.
-    gain = advantage - 2 * math.sqrt(2) * float(losses["loss_objective"])
-    return 2 * float(losses["mean_ratio"]) - 1, gain, float(slope[0])
+    gain = advantage - 2 * math.sqrt(2) * float(losses["loss_objective"].detach())
+    return float(losses["log_ratio"][0].detach().exp()), gain, float(slope[0])
 
 
 class OnTheWay(Drawing):

@@ -10,7 +10,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Anchor, Gru, Reinforce
 from coil_rl.learners.anchor import BARS, PROMISING, Hold, StartTest, hold_of
-from coil_rl.learners.sampling import UNCLIPPED
+from coil_rl.learners.policy import UNCLIPPED
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions, Takeover
 from coil_rl.transforms.action_space import ActionSpace
