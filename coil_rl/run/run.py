@@ -499,10 +499,6 @@ class Run:
 def whole(name: str, number: Any) -> int:
     """Return a number of things that somebody gave.
 
-    Args:
-        name: of the argument.
-        number: what was given.
-
     Raises:
         UserError: if it is no whole number, or below 1.
     """
