@@ -79,14 +79,12 @@ class File(Generic[T]):
         return self.remedy.format(folder=shlex.quote(str(folder)))
 
 
-def json_file(name: str, kind: type[T], remedy: str, largest: int = LARGEST_NUMBERS) -> File[T]:
+def json_file(name: str, kind: type[T], remedy: str) -> File[T]:
     """Return a file of JSON with the values of a type, such as a model of pydantic.
 
     Args:
         name: as of `File`.
-        kind: of its content.
         remedy: as of `File`.
-        largest: as of `File`.
     """
     adapter = TypeAdapter(kind)
 
@@ -101,7 +99,7 @@ def json_file(name: str, kind: type[T], remedy: str, largest: int = LARGEST_NUMB
     def text_of(content: T) -> str:
         return json.dumps(adapter.dump_python(content), indent=2)
 
-    return File(name, parse, remedy, largest, text_of)
+    return File(name, parse, remedy, text_of=text_of)
 
 
 def table(content: bytes) -> list[dict[str, str]]:
@@ -203,42 +201,6 @@ class Delivery(BaseModel):
     frames: int | None = None
 
 
-class Episode(BaseModel):
-    """An episode of a table: its case, return, number of steps, and the measures."""
-
-    model_config = ConfigDict(extra="allow")
-
-    case: str
-    reward: float
-    steps: int
-
-
-class Driven(BaseModel):
-    """The episodes of a guide, with the recorded entries of their steps by name.
-
-    Attributes:
-        rate: control steps per second.
-        episodes: one a case.
-        histories: of each entry those of all episodes, nested lists of numbers.
-    """
-
-    rate: float
-    episodes: list[Episode]
-    histories: dict[str, list[Any]]
-
-
-class GuideEpisodes(BaseModel):
-    """The episodes of the guides alone.
-
-    Attributes:
-        key: another one where the guides would drive other episodes.
-        guides: by title.
-    """
-
-    key: str
-    guides: dict[str, Driven]
-
-
 def _text(content: bytes) -> str:
     return content.decode("utf-8-sig").strip()
 
@@ -254,8 +216,5 @@ PAGE = File("evaluation.md", _text, AGAIN)
 DELIVERY = json_file("delivery.json", Delivery, "remove it, and the sentence is left out")
 GUIDE_RETURNS = json_file(
     "guide_return.json", dict[str, float], "remove it, and the run measures it again"
-)
-GUIDE_EPISODES = json_file(
-    "guide_episodes.json", GuideEpisodes, "remove it, and they are driven again", LARGEST_TABLE
 )
 SECONDS = json_file("training_time.json", dict[str, float], "remove it, and no time is shown")

@@ -27,9 +27,9 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # Headings of the API, by the beginning of the module that defines a name; the first that fits.
 PARTS = {
     "Runs": ("coil_rl.run", "coil_rl.config", "coil_rl.comparison", "coil_rl.measures"),
-    "Envs": ("coil_rl.envs",),
+    "Envs": ("coil_rl.envs", "coil_rl.foreign.gymnasium_env", "coil_rl.foreign.torchrl_env"),
     "Transforms": ("coil_rl.transforms",),
-    "Guides": ("coil_rl.guides",),
+    "Guides": ("coil_rl.guides", "coil_rl.foreign", "coil_rl.cones"),
     "Learners": ("coil_rl.learners", "coil_rl.imitation"),
     "Checks of your own parts": ("coil_rl.testing",),
     "Other": ("coil_rl",),

@@ -42,8 +42,6 @@ class Boundaries:
         """Estimate the boundaries.
 
         Args:
-            frame: of the cars.
-            visible: the cones in sight.
             cones: positions of all candidates, [2, N, 2, B] m in world coordinates.
             new: [B], whether a cone of the candidates came into sight.
             samples: last boundary estimate, [2, 5, 2, B] m in world coordinates.

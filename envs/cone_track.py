@@ -12,7 +12,7 @@ same tensor operations for all cars, whatever happens to them, and does not wait
 import math
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -21,7 +21,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from coil_rl.envs.boundaries import Boundaries
 from coil_rl.envs.constants import constant
-from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
+from coil_rl.envs.limits import Degrees, Laps, Seconds, Starts
 from coil_rl.envs.meanings import of_cones
 from coil_rl.envs.reward import (
     HISTORY,
@@ -37,10 +37,12 @@ from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SAMPLES, SIGHT, Frame, View, 
 from coil_rl.envs.splines import spline_fit
 from coil_rl.envs.track import NEVER, Track, begin_in_sight, places
 from coil_rl.envs.track_map import Location, TrackMap
+from coil_rl.ranges import Count, Interval, Positive, Seed, checked
 
 FINISH_RADIUS = 0.625  # m
 
 
+@checked
 class ConeTrackEnv(SeededEnv):
     """Cars on tracks between cones.
 
@@ -111,47 +113,30 @@ class ConeTrackEnv(SeededEnv):
     def __init__(
         self,
         tracks: Sequence[Track],
-        num_envs: int = 64,
+        num_envs: Count = 64,
         *,
-        rate: float = 24.0,
+        rate: Annotated[float, Interval(gt=0, le=1000)] = 24.0,
         spline: Literal["cubic", "quadratic"] = "cubic",
         smoothing: float = 0.1,
         cone_bonus: Literal["first_sighting", "every_sighting"] = "first_sighting",
         reward: dict[str, float] | None = None,
-        laps: int = 2,
-        time_limit: float = 200.0,
-        held_steps: int = 0,
-        starts: int | None = None,
+        laps: Laps = 2,
+        time_limit: Seconds = 200.0,
+        held_steps: Annotated[int, Interval(ge=0, le=10**6)] = 0,
+        starts: Starts | None = None,
         assignment: Literal["random", "drawn", "cyclic"] = "random",
-        sight: float = SIGHT,
+        sight: Annotated[float, Interval(gt=0, le=100)] = SIGHT,
         hold_boundary: bool = False,
         finish_in_sight: bool = False,
-        kept_cones: int = 16,
-        speed: float = 2.0,
-        car_length: float = 2.0,
-        max_steering: float = 80.0,
+        kept_cones: Count = 16,
+        speed: Positive = 2.0,
+        car_length: Positive = 2.0,
+        max_steering: Degrees = 80.0,
         info: bool = True,
-        seed: int = 0,
+        seed: Seed = 0,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        check_choice(("first_sighting", "every_sighting"), cone_bonus=cone_bonus)
-        check_choice(("random", "drawn", "cyclic"), assignment=assignment)
-        check_range(
-            0,
-            above=True,
-            num_envs=num_envs,
-            kept_cones=kept_cones,
-            speed=speed,
-            car_length=car_length,
-        )
-        check_range(0, 100, above=True, sight=sight)
-        check_range(1, LARGEST_STARTS, starts=1 if starts is None else starts)
-        check_range(0, 1000, above=True, rate=rate)
-        check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
-        check_range(0, 90, above=True, max_steering=max_steering)
-        check_range(0, LARGEST_COUNT, held_steps=held_steps)
-        check_range(0, seed=seed)
         if round(time_limit * rate) < 1:
             raise ValueError(f"time_limit={time_limit} must be at least one step of 1/{rate} s")
         check_weights("reward", reward or {}, RewardWeights._fields)

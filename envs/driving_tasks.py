@@ -47,8 +47,6 @@ class DrivingTasksEnv(ConeTrackEnv):
     in `reward` the terms of `PositionWeights`.
 
     Args:
-        tracks: the tracks, at least one; cars refer to them by index.
-        num_envs: B, the number of cars, which are independent of each other.
         tasks: name of each task to its weights, by the names of `RewardWeights` and
             `PositionWeights`; at least one task.
         only: a task that all cars keep; by default they change between all tasks.
@@ -56,31 +54,14 @@ class DrivingTasksEnv(ConeTrackEnv):
             probabilities; at least one step.
         reward: weights that a task does not set; those that are not here either are those of the
             paper, and 0 for the lateral position.
-        rate: control steps per second.
-        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (least-squares
-            parabola).
-        smoothing: lambda of the cubic smoothing spline, m^3.
-        cone_bonus: "first_sighting" rewards a cone once a lap, "every_sighting" whenever it comes
-            into sight.
-        laps: completed laps that end an episode.
-        time_limit: s, after which an episode is truncated; at least one step.
-        held_steps: number of steps at the start of an episode with steering 0.
         starts: number of places where an episode may begin, as explained for `ConeTrackEnv`; None
             for the starts of the tracks.
         assignment: "random" draws a place at each reset, "cyclic" keeps car i on place i mod
             places.
-        sight: m, range of view.
         hold_boundary: whether the boundary estimate stays in place until a cone comes into view.
         finish_in_sight: whether the finish line is between the first cones that are visible from
             the track's start, in place of the first cones of the level file.
-        kept_cones: K, the nearest visible cones of each side that are written.
-        speed: m/s, constant.
-        car_length: m, distance between the axles.
-        max_steering: degrees of an action of 1, at most 90.
-        info: whether to write `info`, which takes time.
         seed: of the draws of places and tasks, at least 0.
-        device: of all tensors.
-        dtype: of all floating-point tensors.
 
     Raises:
         ValueError: for a value outside its range, an unknown weight or an unknown task.
@@ -240,7 +221,6 @@ def _weight_table(
     """Return the weights of all tasks, one row per weight and one column per task.
 
     Args:
-        tasks: name to weights.
         reward: weights that a task does not set.
     """
     common = RewardWeights()._asdict() | PositionWeights()._asdict() | dict(reward)

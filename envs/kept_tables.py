@@ -40,7 +40,6 @@ def kept(name: str, source: Iterable[bytes], make: Callable[[], dict[str, Tensor
     Args:
         name: what they are, the beginning of the name of their file.
         source: everything that they follow from, the program included.
-        make: computes them, on the CPU.
     """
     try:
         file = cache_folder() / f"{name}_{_digest(source)[:32]}{SUFFIX}"

@@ -71,8 +71,6 @@ def _sides(path: Path, header: Sequence[str], rows: Sequence[Row]) -> list[NDArr
     """Return the cones of both sides, [N, 2] m each, y pointing up.
 
     Args:
-        path: of the file, for messages.
-        header: names of the columns.
         rows: number of the line, and its cells.
     """
     columns = [name.casefold() for name in header]

@@ -1,10 +1,16 @@
 """Checks of numbers and choices among the arguments of a constructor."""
 
 import math
+from typing import Annotated
+
+from coil_rl.ranges import Interval
 
 LARGEST_SEED = 2**63 - 1
-LARGEST_COUNT = 10**6  # of laps, and of seconds or held steps of an episode
-LARGEST_STARTS = 10**5  # places of a world where an episode may begin
+# Of an episode: laps, seconds, and places where it may begin.
+Laps = Annotated[int, Interval(gt=0, le=10**6)]
+Seconds = Annotated[float, Interval(gt=0, le=10**6)]
+Starts = Annotated[int, Interval(ge=1, le=10**5)]
+Degrees = Annotated[float, Interval(gt=0, le=90)]  # of the largest steering
 
 
 def check_range(
@@ -30,7 +36,6 @@ def check_choice(choices: tuple[str, ...], **values: str) -> None:
     """Raise a `ValueError` for the first value that is not one of the choices.
 
     Args:
-        choices: the allowed values.
         values: the values to check, by the name that the message gives them.
     """
     for name, value in values.items():

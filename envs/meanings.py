@@ -29,7 +29,6 @@ def meaning(name: str, value: Any) -> dict[str, str]:
     """Return a meaning as a mapping.
 
     Args:
-        name: of the entry.
         value: a text, or a mapping with some of `FIELDS`; else a `ValueError`.
     """
     if isinstance(value, str):

@@ -41,7 +41,6 @@ def read_regular(path: str | os.PathLike[str], largest: int) -> bytes:
     """Return the bytes of a file, as `open_regular`.
 
     Args:
-        path: of the file.
         largest: allowed size, in bytes.
 
     Raises:

@@ -87,7 +87,6 @@ def check_weights(name: str, weights: Mapping[str, float], known: Sequence[str])
     Args:
         name: of the argument that holds the weights, for the message.
         weights: the weights by name.
-        known: the names that exist.
     """
     unknown = set(weights) - set(known)
     if unknown:

@@ -88,7 +88,6 @@ def view(local: Tensor, limit: int, sight: float = SIGHT) -> View:
 
     Args:
         local: the candidates, [2, N, 2, B] m in the car's frame.
-        limit: largest number of cones per side.
         sight: m, range of view.
     """
     x, y = local.unbind(0)

@@ -36,7 +36,6 @@ def simulator_track(
     Cones of other colours than blue and yellow are left out, unless a column names their side.
 
     Args:
-        name: of the track.
         columns: in lower case.
         rows: number of the line, and its cells.
         start: m, m, radians; None for that of the file, or just before the first cones.

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from coil_rl.envs.constants import constant, flat_index
-from coil_rl.envs.limits import check_choice
+from coil_rl.ranges import checked
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,7 @@ class Spline:
         return torch.add(start, constant((0, rows), start.unsqueeze(0))).flatten()
 
 
+@checked
 def spline_fit(
     spline: Literal["cubic", "quadratic"], smoothing: float
 ) -> Callable[[Tensor, Tensor], Spline]:
@@ -98,7 +99,6 @@ def spline_fit(
             `ValueError`.
         smoothing: lambda of the smoothing spline, m^3; the parabola has none.
     """
-    check_choice(("cubic", "quadratic"), spline=spline)
     if spline == "quadratic":
         return least_squares_parabola
     return partial(smoothing_spline, smoothing=smoothing)

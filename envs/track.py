@@ -202,7 +202,6 @@ def places(tracks: Sequence[Track], count: int | None) -> tuple[NDArray[np.int64
     spread along the lap, also if only the first ones are used.
 
     Args:
-        tracks: the tracks.
         count: P, number of places; None for the tracks' starts.
 
     Returns:

@@ -264,9 +264,7 @@ def nearby_cones(
     """Return the relevant cones of each cell of a track, by number, ascending, then -1.
 
     Args:
-        track: the track.
         sight: m, range of view.
-        dtype: of the corner of the grid.
 
     Returns:
         Whether any cone may be visible, [cells]; the cones of the left and of the right side that
@@ -299,12 +297,7 @@ def nearby_cones(
 
 @lru_cache(maxsize=64)
 def boundary_distances(track: Track, dtype: torch.dtype) -> NDArray[np.float64]:
-    """Return the distances of the grid nodes from both boundaries: [nodes, 2] m, at most 3.
-
-    Args:
-        track: the track.
-        dtype: of the corner of the grid.
-    """
+    """Return the distances of the grid nodes from both boundaries: [nodes, 2] m, at most 3."""
     from scipy.spatial import cKDTree  # only tables that are not kept yet need it
 
     nodes = Grid(track, FIELD_CELL, dtype).nodes()

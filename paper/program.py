@@ -76,12 +76,7 @@ def _index(config: DictConfig, folder: Path) -> str:
 
 
 def trained_runs(config: DictConfig, results: Sequence[Result]) -> Runs:
-    """Return the runs of all experiments of some results, after training the missing ones.
-
-    Args:
-        config: of the program.
-        results: whose experiments are needed.
-    """
+    """Return the runs of all experiments of some results, after training the missing ones."""
     from coil_paper import sweeps
     from coil_rl.report import read_runs
 
@@ -99,9 +94,6 @@ def trained_runs(config: DictConfig, results: Sequence[Result]) -> Runs:
 
 def requested(config: DictConfig) -> list[str]:
     """Return the names in `results` of the requested results, at least one.
-
-    Args:
-        config: of the program.
 
     Raises:
         UserError: if nothing is requested, or something unknown.
@@ -142,7 +134,6 @@ def command(config: DictConfig, key: str, name: str = "") -> str:
     """Return the command that makes a result, with the given options that affect it.
 
     Args:
-        config: of the program.
         key: what is requested, such as "table=1", or "all=true".
         name: of the result; empty for all results.
     """

@@ -84,7 +84,6 @@ def run(sweep: Sweep, launcher: Sequence[str] = ()) -> None:
     """Run a sweep unless all of its runs are finished.
 
     Args:
-        sweep: the runs.
         launcher: overrides of Hydra's launcher.
 
     Raises:

@@ -105,12 +105,7 @@ class Share(NamedTuple):
 
 
 def share_of(correct: int, total: int) -> Share:
-    """Return the share that was classified correctly.
-
-    Args:
-        correct: number of correctly classified clusters.
-        total: number of all clusters.
-    """
+    """Return the share that was classified correctly."""
     if not total:
         return Share(np.nan, np.nan, np.nan, 0, 0)
     low, high = binomtest(correct, total).proportion_ci(method="wilson")
@@ -130,7 +125,6 @@ def train_classifier(
         thick: [N], whether the cone is thick.
         drives: [N], group of each cluster; a group is held out as a whole and should have both
             kinds of cone.
-        folds: number of folds.
 
     Raises:
         UserError: if there are fewer groups than folds, or only one kind of cone.
@@ -201,12 +195,7 @@ def train_on_drives(left: Sequence[Scans], right: Sequence[Scans]) -> Training:
 
 
 def save_classifier(classifier: ConeClassifier, path: str | os.PathLike[str]) -> None:
-    """Write a classifier as JSON.
-
-    Args:
-        classifier: a trained classifier.
-        path: output file.
-    """
+    """Write a classifier as JSON."""
     # One line for each array, so that the file can be compared and read.
     lines = []
     for part in fields(classifier):
@@ -246,7 +235,6 @@ def clusters_in_range(drives: Sequence[Scans], every: int = 1) -> tuple[Array, I
     """Return the features of all clusters within 1 m.
 
     Args:
-        drives: the scans of each drive.
         every: only one scan of so many is used.
 
     Returns:
@@ -307,10 +295,6 @@ def _label_drive(drive: SimulatedDrive, max_distance: float) -> LabelledClusters
 def accuracy(classifier: ConeClassifier, labelled: LabelledClusters) -> dict[str, Share]:
     """Return the share of correctly classified clusters.
 
-    Args:
-        classifier: a trained classifier.
-        labelled: the clusters with their true cones.
-
     Returns:
         The share of `all` clusters, and the shares by range and by visibility of the cone.
     """
@@ -329,7 +313,6 @@ def recall(
     A cone counts if its surface is in range and at least one beam hits it.
 
     Args:
-        classifier: a trained classifier.
         drives: with the true cone of each range.
 
     Returns:

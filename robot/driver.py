@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from coil_rl import check_range
-from coil_rl.envs import Perception
+from coil_rl.envs import Degrees, Perception
 from coil_rl.envs.robot import BoundaryMemory
+from coil_rl.ranges import Positive, checked
 from coil_robot.watchdog import Limits, Scan, Watchdog
 
 State = Literal["waiting", "driving", "stopped"]
@@ -50,6 +50,7 @@ class Command(NamedTuple):
 HALT = Command(0.0, 0.0)
 
 
+@checked
 @dataclass(frozen=True)
 class Car:
     """The car that is driven.
@@ -61,16 +62,10 @@ class Car:
         largest_turn_rate: radians/s, of a command; None for that of the largest steering.
     """
 
-    speed: float = 0.15
-    car_length: float = 2 / 7
-    max_steering: float = 80.0
-    largest_turn_rate: float | None = None
-
-    def __post_init__(self) -> None:
-        check_range(0, above=True, speed=self.speed, car_length=self.car_length)
-        check_range(0, 90, above=True, max_steering=self.max_steering)
-        if self.largest_turn_rate is not None:
-            check_range(0, above=True, largest_turn_rate=self.largest_turn_rate)
+    speed: Positive = 0.15
+    car_length: Positive = 2 / 7
+    max_steering: Degrees = 80.0
+    largest_turn_rate: Positive | None = None
 
     def command(self, action: float) -> Command:
         """Return the command for a steering as a fraction of the largest (equation 100)."""
@@ -178,7 +173,6 @@ class LiveDriver:
         """Return the command after a scan.
 
         Args:
-            scan: the scan.
             now: s of a steady clock, when it came.
         """
         if self.state == "stopped":
@@ -234,7 +228,6 @@ class LiveDriver:
         """Stop the car until `lift`; return the command.
 
         Args:
-            reason: for the log.
             now: s of the same steady clock.
         """
         self.state, self.reason, self.command = "stopped", reason, HALT

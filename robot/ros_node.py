@@ -152,7 +152,6 @@ def run_node(driver: LiveDriver, **options: Any) -> None:
     """Drive until the node is shut down; the last command stops the car.
 
     Args:
-        driver: of the car.
         options: those of `DriveNode`.
     """
     rclpy.init()

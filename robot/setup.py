@@ -50,9 +50,6 @@ class Setup:
         """Return the setup for another car that drives alike, in lengths of itself.
 
         Its view, the cones and its way between two scans are larger by as much as it is longer.
-
-        Args:
-            car: the other car.
         """
         growth = car.car_length / self.car.car_length
         perception = replace(

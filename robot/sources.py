@@ -97,8 +97,6 @@ def drive_recording(
     The car of the recording goes its own way, so its odometry is not compared with the commands.
 
     Args:
-        driver: of the car.
-        recording: with the scans.
         lift_after: s after which a stop is lifted; None: never.
     """
     watched, before = _Watched(driver, lift_after), None
@@ -139,7 +137,6 @@ def drive_simulation(
     Its odometry, if it has any, is exact and comes with each scan.
 
     Args:
-        driver: of the robot.
         env: of one robot, with the speed and size of the driver's car.
         seconds: of the drive at most.
         lift_after: s after which a stop is lifted; None: never.

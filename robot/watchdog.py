@@ -14,7 +14,7 @@ from dataclasses import KW_ONLY, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coil_rl import check_range
+from coil_rl.ranges import Positive, Share, checked
 
 INTERVALS = 6  # between scans, of which the median is the rate
 NEAR = 1.5  # m, ranges that change as the car moves
@@ -49,6 +49,7 @@ class Scan:
         return np.where(inside & (ranges > 0), ranges, np.float32(np.inf))
 
 
+@checked
 @dataclass(frozen=True)
 class Limits:
     """When a car is stopped.
@@ -68,30 +69,18 @@ class Limits:
         ValueError: for a value outside its range.
     """
 
-    rate: float
+    rate: Positive
     _: KW_ONLY
-    rate_tolerance: float = 0.25
-    longest_gap: float = 0.5
-    blind: float = 2.0
-    fewest_returns: float = 0.02
-    window: float = 1.5
-    speed_tolerance: float = 0.5
-    turn_tolerance: float = 0.3
-    still: float = 0.2
+    rate_tolerance: Positive = 0.25
+    longest_gap: Positive = 0.5
+    blind: Positive = 2.0
+    fewest_returns: Share = 0.02
+    window: Positive = 1.5
+    speed_tolerance: Positive = 0.5
+    turn_tolerance: Positive = 0.3
+    still: Share = 0.2
 
     def __post_init__(self) -> None:
-        check_range(
-            0,
-            above=True,
-            rate=self.rate,
-            rate_tolerance=self.rate_tolerance,
-            longest_gap=self.longest_gap,
-            blind=self.blind,
-            window=self.window,
-            speed_tolerance=self.speed_tolerance,
-            turn_tolerance=self.turn_tolerance,
-        )
-        check_range(0, 1, fewest_returns=self.fewest_returns, still=self.still)
         if self.longest_gap <= 1 / self.rate:
             raise ValueError(
                 f"longest_gap={self.longest_gap} s must be more than the time between two scans, "

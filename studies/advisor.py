@@ -14,15 +14,14 @@ from collections.abc import Callable, Sequence
 from typing import Unpack
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from coil_rl.learners import networks
-from coil_rl.learners.advantages import standardise
 from coil_rl.learners.encoders import Mlp
 from coil_rl.learners.kickstart import KickstartLoss
+from coil_rl.learners.policy import Entries, Policy
 from coil_rl.learners.ppo import PPO, PPOSettings
 from coil_rl.ranges import NonNegative, checked
 
@@ -61,8 +60,8 @@ class Advisor(PPO):
         env: EnvBase,
         in_keys: Sequence[NestedKey],
         network: Mlp,
-        make_actor: Callable[..., ProbabilisticTensorDictSequential],
-    ) -> ProbabilisticTensorDictSequential:
+        make_actor: Callable[..., Policy],
+    ) -> Policy:
         """Return the policy, and make the auxiliary one."""
         self.imitator = networks.actor(env, in_keys, network, inputs=self.inputs)
         return super().build_policy(env, in_keys, network, make_actor)
@@ -71,33 +70,35 @@ class Advisor(PPO):
         """Return the parameters that the optimiser updates."""
         return [*super().parameter_groups(), [*self.imitator.parameters()]]
 
-    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+    def losses(self, minibatch: Entries) -> dict[str, Tensor]:
         """Return the losses of `PPO` with another `loss_objective`, `loss_imitation`, and `weight`.
 
         `loss_objective` is the weighted sum of both losses, `weight` the mean of w, and
         `loss_imitation` the loss of the auxiliary policy.
         """
-        losses = super().losses(minibatch)
-        predicted = self.imitation.each(self.imitator, minibatch)
-        weight = (-self.alpha * self.distance(minibatch, predicted.detach())).exp()
-        log_ratio = (
-            self.head.get_dist(minibatch).log_prob(minibatch["action"])
-            - minibatch["action_log_prob"]
+        steps = TensorDict(dict(minibatch), len(minibatch["advantage"]))
+        predicted = self.imitation.each(self.imitator, steps)
+        weight = (-self.alpha * self.distance(steps, predicted.detach())).exp()
+        imitation = self.imitation.each(self.head, steps)
+        losses = super().losses(
+            Entries({**minibatch, "weight": weight, "loss_of_imitation": imitation})
         )
-        advantage = standardise(minibatch["advantage"]).squeeze(-1)
-        clipped = log_ratio.clamp(*self.loss._clip_bounds)
-        gain = torch.minimum(log_ratio.exp() * advantage, clipped.exp() * advantage)
-        mixed = weight * self.imitation.each(self.head, minibatch) - (1 - weight) * gain
         losses["loss_imitation"] = predicted.mean()
-        losses["loss_objective"] = mixed.mean() + losses["loss_imitation"]
+        losses["loss_objective"] = losses["loss_objective"] + losses["loss_imitation"]
         losses["weight"] = weight.mean()
         return losses
+
+    def objective(self, log_prob: Tensor, minibatch: Entries) -> Tensor:
+        """Return the loss of the policy in each step of a minibatch [N]."""
+        weight = minibatch["weight"]
+        own = super().objective(log_prob, minibatch)
+        return weight * minibatch["loss_of_imitation"] + (1 - weight) * own
 
     @torch.no_grad()
     def distance(self, minibatch: TensorDictBase, surprise: Tensor) -> Tensor:
         """Return D [N]; `surprise` is -log pi_aux(g | s)."""
         if not minibatch["action"].is_floating_point():
             return surprise
-        mode = self.imitator.get_dist(minibatch.select(*self.imitator.in_keys)).deterministic_sample
+        mode = self.imitator.get_dist(minibatch.select(*self.imitator.in_keys)).mode
         difference: Tensor = minibatch["guide_action"][..., self.imitation.guide, :] - mode
         return difference.abs().flatten(1).amax(1)

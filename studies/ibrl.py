@@ -17,7 +17,7 @@ from typing import Any, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from tensordict.utils import expand_as_right
 from torch import Tensor
 from torch.distributions import Categorical
@@ -26,6 +26,7 @@ from torchrl.objectives import LossModule, SACLoss
 
 from coil_rl.learners.critics import Critics
 from coil_rl.learners.encoders import Mlp
+from coil_rl.learners.policy import Policy
 from coil_rl.learners.sac import SAC, SACSettings
 from coil_rl.ranges import NonNegative, checked
 from coil_rl.transforms.action_space import ActionSpace
@@ -43,7 +44,6 @@ class IBRL(SAC):
 
     Args:
         env: the env, with continuous actions and advice.
-        in_keys: entries that policy and critics observe.
         sharpness: a proposal is drawn with probabilities softmax(sharpness * min Q'), and y has its
             mean value, as in PEX; None: the better one. In evaluation it is always the better one.
         edit: largest change of the guide's action by the third proposal, as a fraction of half the
@@ -124,11 +124,11 @@ class Proposals(Critics):
 
     def __init__(
         self,
-        actor: ProbabilisticTensorDictSequential,
+        actor: Policy,
         loss: SACLoss,
         *,
         space: ActionSpace,
-        editor: ProbabilisticTensorDictSequential | None,
+        editor: Policy | None,
         guide: int,
         sharpness: float | None,
         edit: float,
@@ -209,10 +209,9 @@ class ProposalLoss(SACLoss):
         loss, values = super().actor_loss(tensordict)
         if self.editor is None:
             return loss, values
-        distribution = self.editor.get_dist(tensordict)
-        change = distribution.rsample()
+        change, log_prob = self.editor.get_dist(tensordict).draw()
         data = tensordict.select(*self.qvalue_network.in_keys, strict=False)
         data.set("action", self.proposals.edited(tensordict, change))
         rated = self._vmap_qnetworkN0(data, self._cached_detached_qvalue_params)
         value = rated["state_action_value"].amin(0).squeeze(-1)
-        return loss + (self._alpha * distribution.log_prob(change) - value).mean(), values
+        return loss + (self._alpha * log_prob - value).mean(), values

@@ -20,7 +20,7 @@ def walks():
         .partition("## How the code runs")[2]
         .partition("\n## ")[0]
     )
-    lists = text.split("One env step with advice")
+    lists = text.split("One step of a tensor")
     return [re.findall(r"^\d+\. `([^`]+)`", part, flags=re.MULTILINE) for part in lists]
 
 
@@ -53,10 +53,20 @@ def test_walks_name_every_file_between_the_command_and_the_optimiser_step_and_th
 
     monkeypatch.setattr(torch.optim.Adam, "step", traced_step)
     monkeypatch.setattr(SplineGuide, "forward", traced_advice)
-    called("train", "method=coil", *TINY, "budget.frames=256", f"hydra.run.dir={tmp_path / 'run'}")
+    short = ["training.tests.time_limit=0.5", "learner.epochs=2", "learner.minibatches=2"]
+    called("train", "method=coil_anchored", *TINY, *short, f"hydra.run.dir={tmp_path / 'run'}")
     assert (
         {"coil_rl/programs/train.py", "coil_rl/learners/ppo.py"}
         <= set(stacks["optimiser"])
         <= set(training)
     )
     assert {"transforms/guide_actions.py"} <= set(stacks["advice"]) <= set(step)
+
+
+def test_tables_name_folders_that_exist():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    rows = re.findall(r"^\| (`[\w/]+/`.*?) \|", text, flags=re.MULTILINE)
+    folders = [folder for row in rows for folder in re.findall(r"`([\w/]+/)`", row)]
+    assert len(folders) > 15
+    for folder in folders:
+        assert (ROOT / folder).is_dir() or (ROOT / "coil_rl" / folder).is_dir(), folder

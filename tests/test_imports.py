@@ -1,4 +1,5 @@
 import ast
+import graphlib
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -43,6 +44,7 @@ MODULES = [
     "coil_rl.envs.recordings.mcap_files",
     "coil_rl.envs.recordings.messages",
     "coil_rl.envs.robot.clusters",
+    "coil_rl.ranges",
 ]
 
 # Folder -> allowed imports besides the standard library and the folder itself.
@@ -201,3 +203,23 @@ def test_every_folder_with_python_files_is_a_package() -> None:
     assert [
         str(path.relative_to(ROOT)) for path in folders if not (path / "__init__.py").is_file()
     ] == []
+
+
+class WithoutTypes(ast.NodeTransformer):
+    """Leaves out what is imported for type checkers only."""
+
+    def visit_If(self, node: ast.If) -> list[ast.stmt] | ast.If:
+        return node.orelse if ast.unparse(node.test) == "TYPE_CHECKING" else node
+
+
+def test_no_files_import_each_other() -> None:
+    files = [path for folder in ["coil_rl", *LINKED] for path in source_files(folder)]
+    modules = {path: ".".join([*package_of(path), path.stem]) for path in files}
+    modules = {path: name.removesuffix(".__init__") for path, name in modules.items()}
+    graph = {}
+    for path, module in modules.items():
+        tree = WithoutTypes().visit(ast.parse(path.read_text(encoding="utf-8")))
+        found = imported_modules(ast.unparse(tree), package_of(path))
+        names = {name if name in modules.values() else name.rpartition(".")[0] for name in found}
+        graph[module] = names - {module}
+    graphlib.TopologicalSorter(graph).prepare()  # a circle is a CycleError

@@ -85,6 +85,7 @@ def installed(wheel: Path) -> Path:
     return target
 
 
+@pytest.mark.slow
 def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Path) -> None:
     patterns = {
         "coil_rl": [
@@ -122,6 +123,7 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
     } <= names
 
 
+@pytest.mark.slow
 def test_wheel_has_three_import_names(wheel: Path) -> None:
     top = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
     assert {name for name in top if not name.endswith(".dist-info")} == {

@@ -53,6 +53,7 @@ def test_python_runs_as_printed(folder):
     assert set(found["run"].evaluate(cases=2)["driver"]) >= {"guide"}
 
 
+@pytest.mark.slow
 def test_commands_run_as_printed(folder):
     assert [command[0] for command in COMMANDS] == ["coil-train", "coil-evaluate"]
     for name, *arguments in COMMANDS:

@@ -43,6 +43,7 @@ def folder(tmp_path_factory):
         yield folder / "source"
 
 
+@pytest.mark.slow
 def test_env_and_controller_in_one_file_are_enough(tmp_path, monkeypatch):
     (tmp_path / "plant.py").write_text(PLANT)
     monkeypatch.syspath_prepend(tmp_path)
@@ -71,6 +72,7 @@ def test_files_that_are_named_or_linked_are_there():
         assert (SOURCE / name).is_file(), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("program", PROGRAMS, ids=["from Python", "parts", "checks", "Gymnasium"])
 def test_python_runs_as_printed(program, folder, tmp_path, monkeypatch):
     assert len([line for line in program.splitlines() if line]) <= 11

@@ -22,10 +22,7 @@ class ActionDelay(Delay):
     `last_action` are told the one in force. With `LastAction` an agent can know what is on its way.
 
     Args:
-        min_lag: smallest delay in steps.
-        max_lag: largest delay in steps.
         action_key: entry of the action.
-        seed: of the draws.
         memory_key: entry for the lag of each row, and for the actions on their way, oldest first.
 
     Raises:

@@ -71,11 +71,7 @@ class ActionRange:
         return f"{shown} in whole numbers" if self.whole else shown
 
     def same_as(self, other: ActionRange) -> bool:
-        """Return whether an action has the same numbers, up to rounding.
-
-        Args:
-            other: the range of the other action.
-        """
+        """Return whether an action has the same numbers, up to rounding."""
         if self.whole != other.whole or self.low.shape != other.low.shape:
             return False
         # Of the distance between the bounds, which may be in any unit.
@@ -156,7 +152,6 @@ class ActionSpace:
         Args:
             vectors: [..., A].
             others: [..., A].
-            scale: a factor.
         """
         if self.units is None or self.units.identity:
             return self.clamp(vectors + scale * others)
@@ -199,7 +194,6 @@ class ActionSpace:
         Args:
             action: [*batch, *agents, A], for choices also their indices; another shape is a
                 `ValueError`.
-            batch: of the action.
         """
         action = self._as_vector(action, batch)
         indices = self._indices(action, batch)
@@ -210,10 +204,6 @@ class ActionSpace:
         """Raise a `ValueError` for a guide's action that does not fit the env.
 
         It has another shape, or numbers that no action of the env has.
-
-        Args:
-            action: of the guide.
-            batch: of the action.
         """
         action = self._as_vector(action, batch)
         indices = self._indices(action, batch)
@@ -238,12 +228,7 @@ class ActionSpace:
             raise ValueError(f"is neither an index below {max(self.choices)} nor a one-hot vector")
 
     def takes(self, action: Tensor, batch: torch.Size) -> bool:
-        """Return whether the action of a guide has a shape of which `advice` makes a vector.
-
-        Args:
-            action: of the guide.
-            batch: of the action.
-        """
+        """Return whether the action of a guide has a shape of which `advice` makes a vector."""
         try:
             self._indices(self._as_vector(action, batch), batch)
         except ValueError:
@@ -254,10 +239,6 @@ class ActionSpace:
         """Return an action [*batch, 1] where a controller gave one number for each row, [*batch].
 
         Anything else is returned as it is, and so is it where an action is more than one number.
-
-        Args:
-            action: of the controller.
-            batch: of the rows.
         """
         is_number = self.continuous and self.event.numel() == 1
         return action.reshape(*batch, 1) if is_number and action.shape == batch else action
@@ -273,7 +254,6 @@ class ActionSpace:
 
         Args:
             action: of the guide, [*batch, ...].
-            batch: of the action.
 
         Returns:
             The number of the row, its action, and what `check_advice` says of it; of row 0 if each
@@ -342,10 +322,6 @@ class ActionSpace:
         """Return the spec of advice [*batch, *agents, guides, A].
 
         Its bounds are those of the action, or 0 and 1 for one-hot vectors.
-
-        Args:
-            batch: of the env.
-            guides: number of guides.
         """
         shape, device = (*batch, *self.agents, guides, self.size), self.spec.device
         if not self.continuous:
@@ -417,7 +393,6 @@ def random_action(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:
     """Write a random action of an env: uniform, see `ActionSpace.random`.
 
     Args:
-        env: with one action.
         tensordict: of the env, [*batch].
     """
     spec = env.full_action_spec[env.action_key]

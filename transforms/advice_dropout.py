@@ -22,7 +22,6 @@ class AdviceDropout(GuideTransform):
         probability: of an episode without advice, in training.
         in_evaluation: whether there is advice in evaluation.
         seed: of the draws.
-        action_key: entry of the env's action.
         advice_key: entry of the advice, [*batch, n_guides, A]; that of all guides is left out.
     """
 

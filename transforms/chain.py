@@ -91,7 +91,6 @@ def links_of(transform: Transform, *, tensors: bool = False) -> Iterator[Link]:
     """Yield the transforms that have an effect on what a policy sees or does.
 
     Args:
-        transform: of an env.
         tensors: whether states must be tensors, so that a transform of somebody else cannot have
             one.
     """

@@ -79,13 +79,7 @@ class CombinedAction(GuideTransform):
     def _spec_of_rows(
         self, kind: Callable[..., TensorSpec], *bounds: float, dtype: torch.dtype
     ) -> TensorSpec:
-        """Return the spec of one number a row, [*batch, 1].
-
-        Args:
-            kind: class of the spec.
-            bounds: its arguments.
-            dtype: of the number.
-        """
+        """Return the spec of one number a row, [*batch, 1]."""
         shape = (*self.parent.batch_size, 1)
         return kind(*bounds, shape=shape, device=self.parent.device, dtype=dtype)
 
@@ -296,7 +290,6 @@ class Takeover(_ActionSwitch):
             over the run.
         frames: number of steps at the start of the run, over all rows, after which the agent always
             acts, as in RLPD and WSRL; None for no limit.
-        seed: of the draws.
         settings: further ones of `GuideTransform`.
     """
 
@@ -329,7 +322,6 @@ class GradualResidual(Takeover):
         probability: of the guide's action alone, from 0 to 1, a number or a schedule over the run.
         frames: number of steps at the start of the run, over all rows, after which the agent's
             action is always added; None for no limit.
-        seed: of the draws.
         settings: further ones of `GuideTransform`.
     """
 
@@ -363,7 +355,6 @@ class JumpStart(_ActionSwitch):
         horizon: steps of the guide, a number or a schedule over the run; a decreasing schedule is a
             curriculum.
         random: draw the horizon of each episode uniformly from 0 to `horizon`.
-        seed: of the draws.
         settings: further ones of `GuideTransform`.
     """
 

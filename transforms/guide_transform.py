@@ -149,8 +149,6 @@ class SeededGenerator(nn.Module):
 
         Args:
             sample: draws a tensor of a shape with a generator, such as `torch.randn`.
-            shape: of the tensor.
-            dim: that of the rows.
         """
         if self.different is None:
             return sample(*shape, generator=self.generator)
@@ -169,7 +167,6 @@ class SeededGenerator(nn.Module):
 
         Args:
             sample: draws a tensor of a shape with a generator, such as `torch.randn`.
-            shapes: of the tensors.
             after_reset: whether this is a partial reset.
         """
         state = self.generator.get_state() if after_reset else None

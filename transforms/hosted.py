@@ -14,7 +14,6 @@ class ToldGuide(TensorDictModuleBase):
         """Take what an env says about itself.
 
         Args:
-            space: of the actions of the guides.
             choices: what converts one-hot entries to the numbering of the env, by entry.
         """
 
@@ -37,9 +36,6 @@ class HostedGuide(ToldGuide):
         None leaves the sentence to whoever asks the guide.
 
         Args:
-            action: that the guide wrote.
-            batch: of the action.
-            space: of the actions.
             problem: says why, as the end of a sentence.
         """
         return None

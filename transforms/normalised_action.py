@@ -92,7 +92,6 @@ def units_of(spec: TensorSpec, batch_dims: int) -> ActionUnits | None:
     """Return the units of an action; None for choices.
 
     Args:
-        spec: of the action.
         batch_dims: number of batch dimensions of the env.
     """
     if not spec.dtype.is_floating_point:
@@ -174,9 +173,6 @@ def given_units(env: EnvBase) -> ActionUnits | None:
     """Return the units in which an env gets its action behind `NormalisedAction`.
 
     None if nothing in it normalises: then they are those of its own spec.
-
-    Args:
-        env: with transforms.
     """
     for module in env.modules():
         if isinstance(module, NormalisedAction):
@@ -208,7 +204,6 @@ def in_unit_of(env: EnvBase, policy: TensorDictModuleBase) -> TensorDictModuleBa
 
     Args:
         env: with the transforms for which the policy was made.
-        policy: of the env.
     """
     units = given_units(env)
     return policy if units is None else Denormalised(policy, units)

@@ -24,11 +24,8 @@ class ObservationDelay(Delay):
     observation too; behind it only the agent does.
 
     Args:
-        min_lag: smallest delay in steps.
-        max_lag: largest delay in steps.
         in_keys: entries that are late; None for all numbers that the env itself writes, but for
             those under `info`.
-        seed: of the draws.
         memory_key: entry for the lag of each row and for its past observations, oldest first.
 
     Raises:

@@ -67,7 +67,6 @@ def arms_for(env: EnvBase, step: float, *, tunes: bool) -> list[Arm]:
     """Return the arms that fit an env.
 
     Args:
-        env: of the comparison.
         step: seconds of a step of one row.
         tunes: whether numbers of the guide are to be tuned.
     """
@@ -92,8 +91,6 @@ def short_words(words: Sequence[str], config: DictConfig, cases: int | None) -> 
     """Return the words that make the evaluation of a job short, unless some others give them.
 
     Args:
-        words: those that were given.
-        config: composed of them.
         cases: of the table; None for those of the env's file.
     """
     given = {key_of(word) for word in words}
@@ -108,7 +105,6 @@ def curve_cases(config: DictConfig, cases: int | None) -> int:
     """Return the number of cases of the learning curves.
 
     Args:
-        config: of a training.
         cases: of the table; None for those of the env's file.
     """
     curve = config.evaluation.curve
@@ -123,10 +119,7 @@ def job_of(given: Named, arm: Arm, seed: int, frames: int | None, short: Sequenc
 
     Args:
         given: env, guide and everything else that was given.
-        arm: what learns.
-        seed: of the job.
         frames: of the job; None for those that were given, or are of the env's file.
-        short: words that make its evaluation short.
     """
     words = list(given.words)
     if frames is not None:

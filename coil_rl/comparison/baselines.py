@@ -71,21 +71,12 @@ class Acting(TensorDictModuleBase):
 
     @classmethod
     def random(cls, env: EnvBase, seed: int = 0) -> "Acting":
-        """Return a policy with random actions, uniform in those of the env.
-
-        Args:
-            env: the env.
-            seed: of the draws.
-        """
+        """Return a policy with random actions, uniform in those of the env."""
         return cls(env, partial(_random, torch.Generator().manual_seed(seed)))
 
     @classmethod
     def zero(cls, env: EnvBase) -> "Acting":
-        """Return a policy with the neutral action, see `words`.
-
-        Args:
-            env: the env.
-        """
+        """Return a policy with the neutral action, see `words`."""
         return cls(env, _neutral)
 
     @property
@@ -107,12 +98,7 @@ def _neutral(space: ActionSpace, batch: torch.Size) -> Tensor:
 
 
 def measure_baselines(config: DictConfig, folder: Path) -> None:
-    """Let guide, opposite, zero and random act in the cases of the table, unless that is done.
-
-    Args:
-        config: of a training with a guide.
-        folder: of the comparison, for the file.
-    """
+    """Let guide, opposite, zero and random act in the cases of the table, unless that is done."""
     if (folder / FILE).exists():
         return
     evaluation, make_env = build_evaluation(config), env_maker(config)
@@ -142,7 +128,6 @@ def measure_network(folder: Path, run: Path) -> None:
     """Let the first network of a run act in the cases of the table, unless that is done.
 
     Args:
-        folder: of the comparison, for the file.
         run: folder of a finished run that kept its policies.
     """
     file = folder / "first_network.csv"
@@ -160,7 +145,6 @@ def measure_delayed(name: str, run: Path | None, config: DictConfig) -> pd.DataF
     """Return the episodes of a policy with one more step of delay on observation and action.
 
     Args:
-        name: of the policy.
         run: folder of its run; None for a guide or its opposite.
         config: of a training with a guide, for these.
     """
@@ -183,9 +167,6 @@ def measure_delayed(name: str, run: Path | None, config: DictConfig) -> pd.DataF
 def read_baselines(folder: Path) -> pd.DataFrame:
     """Return the rows of all that was measured in the cases of the table.
 
-    Args:
-        folder: of the comparison.
-
     Raises:
         UserError: if a file is empty or damaged.
     """
@@ -199,11 +180,7 @@ def read_baselines(folder: Path) -> pd.DataFrame:
 
 
 def action_words(table: pd.DataFrame) -> str:
-    """Return what the action of `zero` is, in words; a file without them has zero actions.
-
-    Args:
-        table: its rows.
-    """
+    """Return what the action of `zero` is, in words; a file without them has zero actions."""
     return str(table[ACTION].iloc[0]) if ACTION in table else ZERO_ACTIONS
 
 

@@ -36,7 +36,7 @@ from coil_rl.comparison.baselines import (
 from coil_rl.comparison.entry import IDLE, Entry
 from coil_rl.comparison.jobs import job_name, run_jobs
 from coil_rl.comparison.outcome import Outcome, first_of, read_outcome
-from coil_rl.comparison.page import command_of, delayed_sentence, draw, guide_lines, page_of
+from coil_rl.comparison.page import command_of, delayed_sentence, draw, page_of
 from coil_rl.comparison.same import identity_of, keep_plan, known_plan
 from coil_rl.comparison.timing import Plan
 from coil_rl.comparison.verdict import NOTHING, Verdict, verdict
@@ -278,7 +278,7 @@ class Comparison:
         with decoration(f"the picture in {self.folder}"):
             cases = base.evaluation.curve.num_envs
             if outcome.runs:
-                draw(outcome, guide_lines(outcome), cases, self.folder / PICTURE)
+                draw(outcome, cases, self.folder / PICTURE)
         report = shlex.join(["coil-report", f"folder={self.folder}"])
         more = f"; {report} has more" if outcome.runs else ""
         say(f"{page}\nSee {self.folder}{more}.")

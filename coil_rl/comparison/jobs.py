@@ -15,12 +15,7 @@ from coil_rl.run.run import Run
 
 
 def job_name(arm: str, seed: int) -> str:
-    """Return the name of a training, and of its folder.
-
-    Args:
-        arm: name of what learns.
-        seed: of the training.
-    """
+    """Return the name of a training, and of its folder."""
     return f"{arm}_seed{seed}"
 
 
@@ -29,8 +24,6 @@ def run_jobs(jobs: Mapping[str, Named], folder: Path, frames: int) -> dict[str, 
 
     Args:
         jobs: what each training consists of, by its name.
-        folder: of the comparison.
-        frames: of each training.
     """
     failed: dict[str, str] = {}
     with progress(total=len(jobs) * frames, unit="frame", unit_scale=True, desc="compare") as bar:
@@ -94,11 +87,7 @@ class Tick:
         return bool(row)
 
     def after_update(self, update: int) -> dict[str, float]:
-        """Show the new frames.
-
-        Args:
-            update: number of updates so far.
-        """
+        """Show the new frames."""
         done = int(self.frames * self.share)
         with decoration("the progress bar"):
             self.bar.update(done - self.done)

@@ -38,7 +38,6 @@ def read_outcome(folder: Path, arms: Sequence[str], failed: Mapping[str, str]) -
     """Return what was measured so far.
 
     Args:
-        folder: of the comparison.
         arms: names of what learns, in the order of the table.
         failed: reason by the name of a failed job.
     """
@@ -145,11 +144,6 @@ def _failures(tables: Sequence[pd.DataFrame]) -> float:
 
 
 def first_of(outcome: Outcome, name: str) -> Run | None:
-    """Return the first run of an arm; None for what does not learn.
-
-    Args:
-        outcome: what was measured.
-        name: of an entry.
-    """
+    """Return the first run of an arm; None for what does not learn."""
     runs = outcome.runs.get(name, ())
     return runs[0] if runs else None

@@ -2,16 +2,13 @@
 
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from matplotlib.artist import Artist
-from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter
 
 from coil_rl.comparison.arms import ANCHORED, ARMS, TUNE
 from coil_rl.comparison.entry import Entry, difference
@@ -20,9 +17,8 @@ from coil_rl.comparison.verdict import Verdict
 from coil_rl.config.compose import key_of
 from coil_rl.config.python import Named
 from coil_rl.learners.anchor import StartTest
-from coil_rl.report import markdown_table, style
-from coil_rl.report.curves import RETURNS, draw_guides, mean_curve, points
-from coil_rl.report.runs import RETURN, Run
+from coil_rl.report import draw_learning_curves, markdown_table
+from coil_rl.report.runs import Run
 from coil_rl.report.table import AUTO_FORMAT, return_format
 
 FEW = 4  # cases of a start test, below which only a very large difference is certain
@@ -43,9 +39,6 @@ def page_of(verdict: Verdict, outcome: Outcome, delayed: str, measured: int, com
     """Return the page.
 
     Args:
-        verdict: the recommendation.
-        outcome: what was measured.
-        delayed: the sentence about a delay.
         measured: env steps that only measured.
         command: that trains the recommended method to the end; empty for none.
     """
@@ -76,11 +69,7 @@ def page_of(verdict: Verdict, outcome: Outcome, delayed: str, measured: int, com
 
 
 def few_cases(runs: Sequence[Run]) -> str:
-    """Return the sentence about start tests that held no guide after few cases; empty for none.
-
-    Args:
-        runs: of anchored COIL.
-    """
+    """Return the sentence about start tests that held no guide after few cases; empty for none."""
     *_, cases, weight = StartTest.names
     firsts = [run.curve[0] for run in runs if run.curve]
     few = [row[cases] for row in firsts if row.get(cases, np.nan) < FEW and not row[weight]]
@@ -98,9 +87,7 @@ def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> str:
     """Return the sentence about a step of delay on observation and action.
 
     Args:
-        entry: what came out best.
         late: the same with the delay.
-        random: random actions.
     """
     found = difference(late, Entry(entry.name, entry.returns[:1]))
     own = float(entry.returns[0].mean())
@@ -123,7 +110,6 @@ def command_of(given: Named, verdict: Verdict) -> str:
 
     Args:
         given: env, guide and everything else that was given.
-        verdict: the recommendation.
     """
     if not verdict.train:
         return ""
@@ -166,46 +152,9 @@ def _bounds(each: Any) -> str:
     return f"[{', '.join(map(str, each))}]"
 
 
-def draw(outcome: Outcome, lines: Mapping[str, float], cases: int | None, path: Path) -> None:
-    """Draw the learning curves of all arms, each seed thin and their mean thick, beside the guide.
-
-    Args:
-        outcome: what was measured.
-        lines: return of guide and opposite in the cases of the curves, by name.
-        cases: number of these cases.
-        path: of the picture.
-    """
-    strokes = style.strong_strokes(outcome.runs)
-    handles: list[Artist] = []
-    for name, stroke in strokes.items():
-        look = {"color": stroke.colour, "ls": stroke.linestyle}
-        count = len(outcome.runs[name])
-        handles.append(Line2D([], [], lw=2, label=f"{name} ({count} seeds)", **look))
-    with style.picture(path, None, handles, 4.2) as figure:
-        label = RETURNS if cases is None else f"{RETURNS}, mean of {cases} cases"
-        axes = figure.add_subplot(xlabel="frames", ylabel=label)
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        style.lighten(axes)
-        for name, stroke in strokes.items():
-            look = {"color": stroke.colour, "ls": stroke.linestyle}
-            curves: Sequence[Run] = outcome.runs[name]
-            for run in curves:
-                axes.plot(*points(run.curve, RETURN).T, lw=0.7, alpha=0.6, **look)
-            frames, mean, *_ = mean_curve([run.curve for run in curves], RETURN)
-            axes.plot(frames, mean, lw=1.8, **look)
-        axes.margins(x=0.02)
-        axes.set_xlim(left=0)
-        draw_guides(axes, lines)
-
-
-def guide_lines(outcome: Outcome) -> dict[str, float]:
-    """Return the lines of the picture: the guide in the cases of the curve, if a run knows it.
-
-    Args:
-        outcome: what was measured.
-    """
-    for runs in outcome.runs.values():
-        for run in runs:
-            if run.guide_returns:
-                return dict(run.guide_returns)
-    return {}
+def draw(outcome: Outcome, cases: int | None, path: Path) -> None:
+    """Draw the learning curves of all arms beside the guide, if a run knows its line."""
+    known = [run.guide_returns for runs in outcome.runs.values() for run in runs]
+    guides = next(filter(None, known), {})
+    curves = {name: [run.curve for run in runs] for name, runs in outcome.runs.items()}
+    draw_learning_curves(curves, path, guides=guides, cases=cases)

@@ -55,22 +55,12 @@ def identity_of(given: Named, config: DictConfig, minutes: float, seed: int) -> 
 
 
 def keep_plan(file: Path, identity: Identity, plan: Plan) -> None:
-    """Write the plan of a comparison.
-
-    Args:
-        file: of the plan.
-        identity: of the comparison.
-        plan: what is going to be done.
-    """
+    """Write the plan of a comparison."""
     write_text(file, json.dumps({**identity, "plan": plan.to_dict()}, indent=2, default=str))
 
 
 def known_plan(file: Path, identity: Identity) -> Plan:
     """Return the plan in a file, which must be that of the same comparison.
-
-    Args:
-        file: of the plan.
-        identity: of the comparison.
 
     Raises:
         UserError: for another comparison, with what differs first, and for a damaged file.

@@ -163,9 +163,6 @@ def plan(config: DictConfig, pace: Pace, arms: Sequence[Arm], minutes: float) ->
     least a few of them.
 
     Args:
-        config: of a training.
-        pace: measured.
-        arms: what learns.
         minutes: that it may take.
     """
     cases = _cases(config, pace, arms, minutes)

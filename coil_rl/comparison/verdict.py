@@ -85,7 +85,7 @@ def verdict(entries: Mapping[str, Entry], failed: Sequence[str] = ()) -> Verdict
     if use.name in IDLE:
         what = sentences.idle(use, kept, entries)
     undecided = sentences.undecided(use, others, MATERIAL * scale, failed)
-    said = (what, sentences.gained(use, entries), undecided)
+    said = [*what, *sentences.gained(use, entries), *undecided]
     return Verdict(use.name, train, score, wrong, said)
 
 
@@ -97,7 +97,6 @@ def _leading(entries: Sequence[Entry], sure: Collection[str]) -> str:
     """Return the name of the policy with the highest mean of those that learned; empty for none.
 
     Args:
-        entries: of all that was compared.
         sure: names of those that are clearly better than random actions. If some of these learned,
             the others are left out.
     """
@@ -130,7 +129,6 @@ def _replaced(use: Entry, others: Sequence[Entry], sure: Collection[str], least:
     """Return the best of those that may take the place of an entry; without one, that entry.
 
     Args:
-        use: the entry.
         others: that may take its place if they are clearly better.
         sure: names of what is clearly better than random actions. Without being among them the
             entry loses its place to any other that is.

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from coil_rl.envs.limits import check_range
+from coil_rl.envs.limits import Degrees
+from coil_rl.ranges import Positive, checked
 
 INSTALL = "pip install git+https://github.com/papalotis/ft-fsd-path-planning.git"
 
 
+@checked
 class ConePlannerGuide(TensorDictModuleBase):
     """Pure pursuit of the path that ft-fsd-path-planning finds through the visible cones.
 
@@ -39,10 +41,11 @@ class ConePlannerGuide(TensorDictModuleBase):
     pure = True
 
     def __init__(
-        self, look_ahead: float = 2.0, car_length: float = 2.0, max_steering: float = 80.0
+        self,
+        look_ahead: Positive = 2.0,
+        car_length: Positive = 2.0,
+        max_steering: Degrees = 80.0,
     ) -> None:
-        check_range(0, above=True, look_ahead=look_ahead, car_length=car_length)
-        check_range(0, 90, above=True, max_steering=max_steering)
         super().__init__()
         self.look_ahead, self.car_length = look_ahead, car_length
         self.max_steering = math.radians(max_steering)

@@ -9,10 +9,12 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from coil_rl.cones.spline import TARGET_REACHED, SplineGuide, first_point
-from coil_rl.envs.limits import check_range
+from coil_rl.envs.limits import Degrees
 from coil_rl.envs.splines import slots_in_use
+from coil_rl.ranges import Positive, checked
 
 
+@checked
 class RacingLineGuide(SplineGuide):
     """Pure pursuit of the farthest target of `SplineGuide` that the car reaches on a clear arc.
 
@@ -29,9 +31,6 @@ class RacingLineGuide(SplineGuide):
         max_steering: steering angle of action 1, degrees, at most 90.
         car_length: distance between the axles, m.
         spline: of the path, "cubic" (smoothing spline) or "quadratic" (least-squares parabola).
-        smoothing: lambda of the cubic smoothing spline, m^3.
-        in_keys: entries of cones, cone count and steering.
-        out_key: entry for the advice.
 
     Raises:
         ValueError: for a value out of range.
@@ -42,11 +41,11 @@ class RacingLineGuide(SplineGuide):
     def __init__(
         self,
         margin: float = 0.6,
-        turn: float = 1.4,
-        lookahead: float = 7.0,
-        spacing: float = 0.5,
-        max_steering: float = 80.0,
-        car_length: float = 2.0,
+        turn: Positive = 1.4,
+        lookahead: Positive = 7.0,
+        spacing: Positive = 0.5,
+        max_steering: Degrees = 80.0,
+        car_length: Positive = 2.0,
         *,
         spline: Literal["cubic", "quadratic"] = "cubic",
         smoothing: float = 1.0,
@@ -57,10 +56,6 @@ class RacingLineGuide(SplineGuide):
         super().__init__(
             spline, smoothing, max_steering=max_steering, in_keys=in_keys, out_key=out_key
         )
-        check_range(
-            0, above=True, turn=turn, lookahead=lookahead, spacing=spacing, car_length=car_length
-        )
-        check_range(0, 90, above=True, max_steering=max_steering)
         if not 0 <= margin < car_length:  # the smallest turning radius
             raise ValueError(
                 f"margin={margin} must be at least 0 and less than car_length={car_length}"

@@ -6,7 +6,7 @@ it by equation 103. All rows of a batch go through the same tensor operations.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -14,10 +14,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coil_rl.envs.constants import constant, flat_index
-from coil_rl.envs.limits import check_range
 from coil_rl.envs.sight import field_of_view_margin
 from coil_rl.envs.sorting import smallest
 from coil_rl.envs.splines import Spline, slots_in_use, spline_fit
+from coil_rl.ranges import Interval, NonNegative, Positive, checked
 
 PAIR_DISTANCE = 4.0  # m, between the two cones of a pair
 TARGET_REACHED = 0.625  # m
@@ -48,6 +48,7 @@ class PathPlan(NamedTuple):
         return first_point(self.targets, self.squared_distance, self.excluded)
 
 
+@checked
 class SplineGuide(TensorDictModuleBase):
     """Pursuit of a smooth path through the midpoints of left-right pairs of cones.
 
@@ -78,18 +79,15 @@ class SplineGuide(TensorDictModuleBase):
     def __init__(
         self,
         spline: Literal["cubic", "quadratic"] = "cubic",
-        smoothing: float = 1.0,
-        gain: float = 1.0,
-        sharpness: float = 1.8,
-        max_steering: float = 80.0,
+        smoothing: NonNegative = 1.0,
+        gain: Annotated[float, Interval(ge=-1e6, le=1e6)] = 1.0,
+        sharpness: NonNegative = 1.8,
+        max_steering: Positive = 80.0,
         in_keys: Sequence[NestedKey] = ("cones", "cone_count", "steering"),
         out_key: NestedKey = "action",
     ) -> None:
         self.in_keys, self.out_keys = list(in_keys), [out_key]
         super().__init__()
-        check_range(0, smoothing=smoothing, sharpness=sharpness)
-        check_range(0, above=True, max_steering=max_steering)
-        check_range(-1e6, 1e6, gain=gain)
         self.fit = spline_fit(spline, smoothing)
         self.gain, self.sharpness, self.max_steering = gain, sharpness, max_steering
         self.compiled: Callable[..., Sequence[Tensor]] | None = None

@@ -13,10 +13,10 @@ from torchrl.envs import TensorDictPrimer
 
 from coil_rl.cones.spline import TARGET_REACHED, SplineGuide
 from coil_rl.envs.constants import constant
-from coil_rl.envs.limits import check_range
 from coil_rl.envs.sight import SIGHT, Frame, field_of_view_margin
 from coil_rl.envs.sorting import append, first_come, rows_in_use
 from coil_rl.envs.splines import slots_in_use
+from coil_rl.ranges import Positive, checked
 
 TARGETS, CONES = 192, 128  # room for targets, and for the cones of a side
 CANDIDATES = 15  # targets of one path, at most
@@ -25,6 +25,7 @@ SAME_COORDINATE = 5e-3  # m; midpoints of the authors' cones are on a grid of 16
 NOWHERE = 1e4  # m, coordinates of empty slots
 
 
+@checked
 class SplineMemoryGuide(SplineGuide):
     """Pursuit of remembered targets: the paper's safety policy as in the authors' program.
 
@@ -46,8 +47,6 @@ class SplineMemoryGuide(SplineGuide):
             steering is kept without one, and passed targets count again out of sight.
         sight: m, range in which a target is visible.
         gain: factor of the advice of equation 103.
-        sharpness: power of the distance in equation 103, at least 0.
-        max_steering: steering angle of action 1, degrees.
 
     Raises:
         ValueError: for a value out of range.
@@ -67,7 +66,7 @@ class SplineMemoryGuide(SplineGuide):
     def __init__(
         self,
         oddities: bool = False,
-        sight: float = SIGHT,
+        sight: Positive = SIGHT,
         gain: float = 1.0,
         sharpness: float = 1.8,
         max_steering: float = 80.0,
@@ -91,7 +90,6 @@ class SplineMemoryGuide(SplineGuide):
             self.memory["path_in_circle"] = ((1,), False, torch.bool)
         keys = ["cones", "cone_count", "steering", "motion", "is_init", *self.memory]
         super().__init__("quadratic", 1.0, gain, sharpness, max_steering, keys)
-        check_range(0, above=True, sight=sight)
         self.out_keys: list[NestedKey] = [*self.out_keys, *(("next", key) for key in self.memory)]
         self.oddities, self.sight = oddities, sight
 

@@ -32,11 +32,11 @@ from coil_rl.config.values import complete_measures
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
-from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run.folder import locked
 from coil_rl.run.guide_returns import GuideReturns
 from coil_rl.run.judge import Trial, guide_titles
 from coil_rl.run.parts import EnvMaker
+from coil_rl.run.reasons import about_returns
 from coil_rl.run.run import Budget, Run
 from coil_rl.transforms.normalised_action import in_unit_of
 
@@ -136,36 +136,10 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
     )
 
 
-def about_returns(sizes: Mapping[str, int], *, tested: bool = False) -> list[str]:
-    """Return what the return of the progress bar, of the curve and of the table counts.
-
-    Args:
-        sizes: number of cases of each set.
-        tested: whether a test at the end of the run decides what is handed over.
-    """
-    sentences = [
-        "All returns are sums of the env's own rewards: `training` beside the progress bar is the "
-        "mean of the last 100 episodes, with exploration; `curve` and learning_curve.png are means "
-        "of deterministic episodes in the cases of the curve; the table has those of the test."
-    ]
-    if EVALUATION in sizes:
-        chosen = ""
-        if SELECTION in sizes and not tested:
-            chosen = f", and the best policy of a report is chosen in {sizes[SELECTION]} others"
-        sentences.append(
-            f"The curve rests on {sizes[EVALUATION]} cases{chosen}; none of them is in the table."
-        )
-    return sentences
-
-
 def load_guides(folder: Path, config: DictConfig) -> Mapping[str, TensorDictModuleBase]:
     """Return the first guides of a run that trains its guides.
 
     The proxy of a guide takes its place, if there is one.
-
-    Args:
-        folder: of the run.
-        config: of the run.
     """
     guides = build_guides(config)
     for name in guides:

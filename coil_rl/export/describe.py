@@ -51,10 +51,6 @@ def describe(
     """Return the contract of an exported policy.
 
     Args:
-        run: of the policy.
-        controller: of the run.
-        step: what was exported.
-        parity: how much the file differs.
         contents: of the files, by name.
         which: policy of the run, "handed_over" or "last".
         outside: why the guides are outside; None if they are not.
@@ -108,10 +104,6 @@ def guide_itself(controller: Controller, step: PolicyStep) -> str | None:
     """Return the name of the guide that acts in place of a learned policy; None for a policy.
 
     A run may have handed over its guide, see `coil_rl.run.delivery`, or have no other policy.
-
-    Args:
-        controller: of the run.
-        step: what is exported of it.
     """
     policy = controller.policy
     if isinstance(policy, GuideActs):
@@ -164,7 +156,6 @@ def _bounds(spec: Any, batch_dims: int) -> dict[str, Any] | None:
 def _input(
     entry: Entry, plant: Any, step: PolicyStep, known: Mapping[str, Mapping[str, str]]
 ) -> dict[str, Any]:
-    """Return what an input is."""
     key = [entry.key] if isinstance(entry.key, str) else list(entry.key)
     about: dict[str, Any] = {"name": entry.name, "key": key, "shape": list(entry.shape)}
     about["dtype"] = _name(entry)
@@ -277,11 +268,7 @@ def _inside(step: PolicyStep) -> list[str]:
 
 
 def results_of(run: Run) -> list[dict[str, Any]]:
-    """Return the means of the evaluation of a run, by driver; empty if it was not evaluated.
-
-    Args:
-        run: the run.
-    """
+    """Return the means of the evaluation of a run, by driver; empty if it was not evaluated."""
     rows = record.EVALUATION.read(run.folder) or []
     cases = len({row["case"] for row in rows} - {MEAN_CASE})
     results = []

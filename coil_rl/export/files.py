@@ -22,11 +22,7 @@ TRACES = ("stack_trace", "nn_module_stack", "source_fn_stack", "from_node", "tor
 
 
 def names_of(step: PolicyStep) -> tuple[list[str], list[str]]:
-    """Return the names of the inputs and of the outputs of the files.
-
-    Args:
-        step: the function.
-    """
+    """Return the names of the inputs and of the outputs of the files."""
     inputs = [entry.name for entry in step.inputs]
     inputs += [f"state.{entry.name}" for entry in step.state]
     return inputs, ["action", *(f"next.{entry.name}" for entry in step.state)]
@@ -34,9 +30,6 @@ def names_of(step: PolicyStep) -> tuple[list[str], list[str]]:
 
 def traced(step: PolicyStep) -> ExportedProgram:
     """Return a step as the program of torch.export, for any number of rows.
-
-    Args:
-        step: the function.
 
     Raises:
         NotExportableError: for a step that is no function of tensors.
@@ -61,11 +54,7 @@ def traced(step: PolicyStep) -> ExportedProgram:
 
 
 def as_torch(program: ExportedProgram) -> bytes:
-    """Return the content of a file that `torch.export.load` reads.
-
-    Args:
-        program: the function.
-    """
+    """Return the content of a file that `torch.export.load` reads."""
     file = io.BytesIO()
     with _quiet():
         torch.export.save(program, file)
@@ -76,7 +65,6 @@ def as_onnx(program: ExportedProgram, step: PolicyStep) -> bytes:
     """Return the content of a file of ONNX.
 
     Args:
-        program: the function.
         step: the same, for the names.
 
     Raises:

@@ -166,8 +166,6 @@ def _found(observation: Any, entry: Mapping[str, Any], *, only: bool) -> Any:
     """Return the part of an observation that an input of the contract stands for.
 
     Args:
-        observation: of the env.
-        entry: of the contract.
         only: whether there is no other one.
     """
     source, path = entry.get("from"), entry["key"]
@@ -237,7 +235,6 @@ def _chosen(
     """Return numbers of choices, counted from 0.
 
     Args:
-        name: of the input, for the message.
         given: numbers as the env counts them, [..., n].
         choices: how many there are of each, [n].
         lowest: number of the first one of each, [n].

@@ -70,8 +70,6 @@ def record(
     """Drive the env of a run by a controller, and return what was seen and done.
 
     Args:
-        run: has the env.
-        controller: of the run.
         count: number of steps.
         seed: of the env and of the drawn actions.
         tick: called after every step.
@@ -155,7 +153,6 @@ def numbered(space: ActionSpace, vectors: Tensor) -> Tensor:
     """Return vectors [..., A] in the numbering of the env: of choices [..., n] whole numbers.
 
     Args:
-        space: of the actions.
         vectors: as `ActionSpace` has them.
     """
     if not space.choices:

@@ -57,11 +57,7 @@ class Entry:
         return self.key if isinstance(self.key, str) else ".".join(self.key)
 
     def rows(self, count: int) -> Tensor:
-        """Return a value for some rows: the first one, or zeros.
-
-        Args:
-            count: number of rows.
-        """
+        """Return a value for some rows: the first one, or zeros."""
         first = torch.zeros(self.shape, dtype=self.dtype) if self.first is None else self.first
         return first.expand(count, *self.shape).clone()
 
@@ -195,8 +191,8 @@ def exportable(controller: Controller) -> list[Link]:
     links = list(links_of(controller.env.transform, tensors=True))
     for link in links:
         if isinstance(link, DegradedAdvice):
-            draws = any(isinstance(part, SeededGenerator) for part in link.modules())
-            if draws or link.slots or link.needs_past:
+            draws = any(isinstance(part, SeededGenerator) for part in link.children())
+            if draws or link.needs_past or link.slots:
                 raise NotExportableError(
                     f"{type(link).__name__} degrades the advice at random or by that of earlier "
                     "steps, which is for experiments only; train without degrade"

@@ -87,7 +87,6 @@ def number(value: Any, what: str, dtype: np.dtype[Any]) -> float:
     """Return one finite number.
 
     Args:
-        value: what came.
         what: name of the number, for the message.
         dtype: in which the number must be finite.
 
@@ -117,7 +116,6 @@ def flag(value: Any, what: str) -> bool:
     """Return a flag.
 
     Args:
-        value: what came.
         what: name of the flag, for the message.
 
     Raises:
@@ -133,9 +131,6 @@ def flag(value: Any, what: str) -> bool:
 
 def action_array(value: Any) -> NDArray[Any]:
     """Return an action of a controller as an array of at least one dimension.
-
-    Args:
-        value: what the controller returned.
 
     Raises:
         ForeignError: for what is not numbers, or not finite; also for an action with a state, as

@@ -68,9 +68,6 @@ class GymnasiumEnv(SeededRows):
         max_steps: steps after which an episode is truncated, instead of the registered number or
             that of a `TimeLimit` of the maker. An env that names no number at all is truncated
             after 1,000, with a warning.
-        seed: of the draw of the episodes' seeds, at least 0.
-        first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
-            draw the seeds.
         cases: number of different episodes, by default `num_envs`; needs `first_seed`.
         info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], NaN where
             missing.
@@ -89,7 +86,6 @@ class GymnasiumEnv(SeededRows):
         workers: number of processes over which the rows are spread, 0 for none besides this one;
             "auto" for as many as there are cores if a timed step is long enough. The digits are
             the same.
-        device: of all tensors.
         dtype: of all floating-point tensors; an action of float64 with a range of less than 100
             steps of it stays float64.
 

@@ -91,7 +91,6 @@ class GymnasiumPlant(Plant):
         make: makes the env.
         makers: make the controllers, by name.
         fresh: whether every episode has a new env.
-        name: of the env, for messages.
         row: its number in a batch.
         dtype: of numbers; rewards must be finite in it.
 

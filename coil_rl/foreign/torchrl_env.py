@@ -28,9 +28,6 @@ class EnvBatch(SeededRows):
         num_envs: B, number of rows.
         max_steps: steps after which an episode is truncated. With None an env that names no number
             of its own is truncated after 1,000, with a warning.
-        seed: of the draw of the episodes' seeds, at least 0.
-        first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
-            draw the seeds.
         cases: number of different episodes, by default `num_envs`; needs `first_seed`.
 
     Raises:

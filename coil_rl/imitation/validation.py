@@ -36,7 +36,6 @@ def cross_validate(
         x: [N, inputs].
         y: [N, outputs].
         groups: [N], the track of each sample; None: random split only.
-        seed: of the random split.
     """
     if len(x) < MIN_SAMPLES:
         raise UserError(
@@ -98,7 +97,6 @@ def scores(predictions: Sequence[Tensor], targets: Sequence[Tensor], name: str) 
     Args:
         predictions: [N, A] of each fold.
         targets: [N, A] of each fold.
-        name: NAME, of the split.
     """
     y, predicted = (torch.cat(list(each)).cpu().numpy() for each in (targets, predictions))
     errors = (y - predicted) ** 2

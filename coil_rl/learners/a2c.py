@@ -9,11 +9,12 @@ batch is used for one pass only, because the gradient holds for the policy that 
 from collections.abc import Sequence
 from typing import Literal, Unpack
 
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
+from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.objectives import A2CLoss, LossModule
 
 from coil_rl.learners.advantages import standardise as standardised
+from coil_rl.learners.policy import Entries
 from coil_rl.learners.ppo import PPO, OnPolicySettings
 from coil_rl.ranges import NonNegative, Share, checked
 from coil_rl.schedules import Linear, Schedule
@@ -62,20 +63,13 @@ class A2C(PPO):
         )
         self.standardise = standardise
 
-    def build_loss(self, clip: float, critic: float) -> LossModule:
-        """Return TorchRL's loss of policy and critic; nothing is clipped."""
-        return A2CLoss(
-            self.head,
-            self.critic,
-            entropy_bonus=self.entropy(0) > 0,
-            entropy_coeff=self.entropy(0),
-            critic_coeff=critic,
-            loss_critic_type="l2",
-            functional=False,
-        )
-
-    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return TorchRL's losses of a minibatch [N]."""
+    def objective(self, log_prob: Tensor, minibatch: Entries) -> Tensor:
+        """Return the loss of the policy in each step of a minibatch [N]; nothing is clipped."""
+        advantage = minibatch["advantage"]
         if self.standardise:
-            minibatch = minibatch.copy().set("advantage", standardised(minibatch["advantage"]))
-        return super().losses(minibatch)
+            advantage = standardised(advantage)
+        return -(log_prob * advantage.squeeze(-1))
+
+    def losses(self, minibatch: Entries) -> dict[str, Tensor]:
+        """Return the losses of a minibatch [N]; there is no ratio to report."""
+        return {name: each for name, each in super().losses(minibatch).items() if not each.ndim}

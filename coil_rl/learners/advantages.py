@@ -44,6 +44,11 @@ class Advantages:
         return self.critic(states.select(*self.critic.in_keys))["state_value"]
 
 
-def standardise(advantage: Tensor) -> Tensor:
-    """Scale to mean 0 and standard deviation 1 over all entries."""
-    return (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
+def standardise(advantage: Tensor, least: float = 1e-6) -> Tensor:
+    """Scale to mean 0 and standard deviation 1 over all entries.
+
+    Args:
+        advantage: of any shape.
+        least: smaller standard deviations are taken as this one.
+    """
+    return (advantage - advantage.mean()) / advantage.std().clamp_min(least)

@@ -34,7 +34,7 @@ from torch import Tensor, nn
 
 from coil_rl.learners.learner import Callback, Cases
 from coil_rl.learners.normaliser import Normaliser
-from coil_rl.learners.sampling import UNCLIPPED, Sample
+from coil_rl.learners.policy import UNCLIPPED, Sample
 from coil_rl.ranges import Interval, Positive, Share, checked
 from coil_rl.transforms.action_space import ActionSpace
 
@@ -121,6 +121,8 @@ class ShownAdvice(TensorDictModuleBase):
         key: entry with the advice.
     """
 
+    by_key = True
+
     def __init__(self, hold: Hold, key: NestedKey) -> None:
         self.in_keys: list[NestedKey] = [key]
         self.out_keys: list[NestedKey] = [unravel_key(("shown", key))]
@@ -144,6 +146,8 @@ class AnchoredInputs(TensorDictModuleBase):
         normaliser: of some entries; None: of none.
         shown: the advice.
     """
+
+    by_key = True
 
     def __init__(self, normaliser: Normaliser | None, shown: ShownAdvice) -> None:
         parts: list[Normaliser | ShownAdvice] = [] if normaliser is None else [normaliser]
@@ -186,19 +190,14 @@ class AnchoredSample(Sample):
     """
 
     def __init__(self, sample: Sample, hold: Hold, anchor: Anchor, action_key: NestedKey) -> None:
-        super().__init__(sample.read, UNCLIPPED, sample.distribution, sample.options)
+        kind, options = sample.distribution_class, sample.distribution_kwargs
+        super().__init__(sample.in_keys, UNCLIPPED, kind, options)
         self.hold, self.anchor, self.action_key = hold, anchor, action_key
 
     @property
     def out_keys(self) -> list[NestedKey]:
         """Keys of the entries that `forward` writes."""
         return [*super().out_keys, self.action_key]
-
-    def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
-        """Write the own part and the action."""
-        tensordict = super().forward(tensordict, *args, **options)
-        self.write_action(tensordict)
-        return tensordict
 
     def write_action(self, entries: Any) -> None:
         """Write the action of the own part and the advice in some entries [*batch]."""

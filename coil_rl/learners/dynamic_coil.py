@@ -12,12 +12,13 @@ from typing import Annotated, Any, Literal, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torch.func import functional_call
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.encoders import Mlp
+from coil_rl.learners.policy import Entries, Policy
 from coil_rl.learners.ppo import PPO, PPOSettings
 from coil_rl.ranges import Count, Interval, NonNegative, Seed, checked
 from coil_rl.schedules import Linear, Schedule, schedule
@@ -228,13 +229,13 @@ class DynamicCoil(PPO):
         env: EnvBase,
         in_keys: Sequence[NestedKey],
         network: Mlp,
-        make_actor: Callable[..., ProbabilisticTensorDictSequential],
-    ) -> ProbabilisticTensorDictSequential:
+        make_actor: Callable[..., Policy],
+    ) -> Policy:
         """Return the guides followed by the agent."""
         shapes = {"guide_action": torch.Size([len(self.guides), *env.action_spec_unbatched.shape])}
         agent = make_actor(env, [*in_keys, *self.advice.out_keys], network, shapes=shapes)
         self.agent_parameters = list(agent.parameters())
-        return ProbabilisticTensorDictSequential(self.advice, *agent.module)
+        return Policy(self.advice, *agent.module)
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters of the agent, of the critic, and of each guide."""
@@ -250,7 +251,7 @@ class DynamicCoil(PPO):
         guides = [guide if index in phase.guides else 0.0 for index in range(len(self.guides))]
         return [agent * factor if phase.agent else 0.0, agent if critic_learns else 0.0, *guides]
 
-    def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:
+    def prepare(self, batch: TensorDictBase, progress: float) -> Entries:
         """Freeze the networks that do not learn in this phase, and do what `PPO` does."""
         for group, rate in zip(self.gradient.groups, self.learning_rates(progress), strict=True):
             for parameter in group:

@@ -27,7 +27,7 @@ class GradientStep(Stateful):
     no step can be compiled.
 
     Args:
-        losses: returns scalars by name for a minibatch.
+        losses: returns scalars by name for a minibatch, and other tensors that are reported.
         groups: parameters, grouped by learning rate.
         modules: hold the tensors that the losses read, besides the parameters.
         rates: returns the learning rate of each group for the progress of the run.
@@ -41,7 +41,7 @@ class GradientStep(Stateful):
 
     parts: ClassVar[tuple[str, ...]] = ("adam", "steps", "begun", "compile")
 
-    losses: Callable[[TensorDictBase], TensorDictBase]
+    losses: Callable[[Any], Mapping[str, Tensor]]
     groups: Sequence[Sequence[nn.Parameter]]
     modules: Sequence[nn.Module]
     rates: Callable[[float], Sequence[float]]
@@ -83,11 +83,11 @@ class GradientStep(Stateful):
         elif self.compile == "auto" and progress > self.begun:
             self.compile = self.steps * (1 - self.begun) / (progress - self.begun) >= ENOUGH
 
-    def __call__(self, minibatch: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
+    def __call__(self, minibatch: Any, weights: Mapping[str, float]) -> dict[str, Tensor]:
         """Take a step on the sum of the losses times `weights`.
 
-        Returns all losses, in the order of `names`. If `compile` is true and there is no C++
-        compiler, that is a `UserError`.
+        Returns what `losses` returns, detached. If `compile` is true and there is no C++ compiler,
+        that is a `UserError`.
         """
         if self.compile is True:
             try:
@@ -101,24 +101,19 @@ class GradientStep(Stateful):
                 self.steps += 1
                 return values
         losses = self.losses(minibatch)
-        self.take(losses, weights)
-        self.names = list(losses.keys())
-        return _vector(losses)
-
-    def take(
-        self, losses: TensorDictBase | Mapping[str, Tensor], weights: Mapping[str, float]
-    ) -> None:
-        """Take a step, not compiled, on the sum of losses times `weights`; both are by name."""
         self.steps += 1
         self.minimise(sum(weight * losses[name] for name, weight in weights.items()))
+        return {name: each.detach() for name, each in losses.items()}
 
-    def _compiled(self, minibatch: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
-        self.keys, self.weighted = list(minibatch.keys(True, True)), list(weights)
+    def _compiled(self, minibatch: Any, weights: Mapping[str, float]) -> dict[str, Tensor]:
+        nested = isinstance(minibatch, TensorDictBase)
+        self.keys = list(minibatch.keys(True, True) if nested else minibatch)
+        self.weighted = list(weights)
         rates = [group["lr"] for group in self.adam.param_groups]
-        numbers = torch.tensor([*weights.values(), *rates], device=minibatch.device)
+        numbers = torch.tensor([*weights.values(), *rates], device=self.parameters[0].device)
         self.state = self.state or self._state()
-        (values,) = self.compiled(numbers, *(minibatch[key] for key in self.keys), *self.state)
-        return values
+        values = self.compiled(numbers, *(minibatch[key] for key in self.keys), *self.state)
+        return dict(zip(self.names, values, strict=True))
 
     def minimise(self, loss: Any) -> None:
         """Take a step on a loss."""
@@ -132,13 +127,6 @@ class GradientStep(Stateful):
         self.adam.step()
         if self.after is not None:
             self.after()
-
-    def means(self, reports: Sequence[Tensor]) -> dict[str, float]:
-        """Return the means of what the calls returned, by name."""
-        columns = torch.stack(list(reports), -1).unbind(0)
-        return {
-            name: float(column.mean()) for name, column in zip(self.names, columns, strict=True)
-        }
 
     def _state(self) -> list[Tensor]:
         state = self.adam.state
@@ -166,7 +154,7 @@ class GradientStep(Stateful):
         weights, rates = numbers[:count].unbind(0), numbers[count:].unbind(0)
         losses = self.losses(minibatch)
         self.names = list(losses.keys())
-        total = sum(
+        total: Any = sum(
             weight * losses[name] for name, weight in zip(self.weighted, weights, strict=True)
         )
         with self._traceable(rates):
@@ -175,7 +163,8 @@ class GradientStep(Stateful):
                 parameter.grad = gradient
             torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm, foreach=False)
             self._step()
-        return [_vector(losses)]
+        # Copies, as a result may be an argument.
+        return [each.detach().clone() for each in losses.values()]
 
     @contextmanager
     def _traceable(self, rates: Sequence[Tensor]) -> Iterator[None]:
@@ -198,6 +187,10 @@ class GradientStep(Stateful):
         self.state = []
 
 
-def _vector(losses: TensorDictBase) -> Tensor:
-    """Return the means of values as a vector."""
-    return torch.stack([value.mean() for value in losses.detach().values()])
+def means(steps: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
+    """Return the means of the scalars that some steps returned, by name."""
+    names = [name for name, value in steps[0].items() if not value.ndim] if steps else []
+    if not names:
+        return {}
+    values = torch.stack([torch.stack([step[name] for name in names]) for step in steps])
+    return dict(zip(names, values.mean(0).tolist(), strict=True))

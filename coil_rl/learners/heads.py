@@ -5,8 +5,8 @@ import math
 import torch
 from tensordict.nn import NormalParamExtractor
 from torch import Tensor, nn
-from torch.distributions import Categorical, Independent
 
+from coil_rl.learners.density import padding
 from coil_rl.learners.encoders import ObservationNetwork
 
 
@@ -53,11 +53,6 @@ class GaussianHead(nn.Module):
         return shaped(loc, self.event), shaped(scale, self.event)
 
 
-def padding(dtype: torch.dtype) -> float:
-    """Return the logit of what is no option: finite, with a probability of exactly 0."""
-    return torch.finfo(dtype).min / 2
-
-
 class ChoicesHead(nn.Module):
     """Logits of several choices at once from a network.
 
@@ -80,31 +75,6 @@ class ChoicesHead(nn.Module):
         """Return the logits, [*batch, *event, n]."""
         logits = shaped(self.network(*inputs), self.valid.shape)
         return logits.masked_fill(~self.valid, padding(logits.dtype))
-
-
-class Choices(Independent):
-    """Distribution of several independent choices.
-
-    Args:
-        logits: of the options of each choice, [*batch, *event, n].
-        event_dims: number of dimensions of an action, which is one index for each choice.
-    """
-
-    def __init__(self, logits: Tensor, event_dims: int) -> None:
-        super().__init__(Categorical(logits=logits), event_dims)
-        self.event_dims = event_dims
-
-    @property
-    def deterministic_sample(self) -> Tensor:
-        """The most probable choices."""
-        return self.base_dist.mode
-
-    @property
-    def valid(self) -> Tensor:
-        """Whether each logit is that of an option, not padding, [*event, n]."""
-        logits: Tensor = self.base_dist.logits
-        event = logits[(0,) * (logits.ndim - self.event_dims - 1)]
-        return event > padding(logits.dtype) / 2
 
 
 def shaped(vectors: Tensor, event: torch.Size) -> Tensor:

@@ -8,11 +8,9 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
-from torch.distributions import Categorical, Normal, kl_divergence
-from torchrl.modules import TanhNormal
 
+from coil_rl.learners.density import Choices, Normal, SquashedNormal
 from coil_rl.learners.extension import Extension
-from coil_rl.learners.heads import Choices
 from coil_rl.ranges import Positive, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 
@@ -90,32 +88,19 @@ class KickstartLoss(Extension):
     def each(self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase) -> Tensor:
         """Return the loss of each row of a minibatch, [N]; for choices it is the cross-entropy."""
         advice = minibatch[self.advice_key][..., self.guide, :]
-        distribution = policy.get_dist(minibatch.select(*policy.in_keys))
-        if isinstance(distribution, Categorical):
-            return -(advice * distribution.logits).sum(-1)
-        if isinstance(distribution, Choices):
+        density = policy.get_dist(minibatch.select(*policy.in_keys))
+        if isinstance(density, Choices):
             # The advice is one-hot for each choice, one beside the other.
-            logits = distribution.base_dist.logits
-            return -(advice * logits[:, distribution.valid]).sum(-1)
-        if isinstance(distribution, TanhNormal):
-            return self._each_squashed(distribution, advice)
+            return -(advice * density.logits[:, density.valid]).sum(-1)
+        mean = advice
+        if isinstance(density, SquashedNormal):
+            unit = density.unit(advice).clamp(EDGE - 1, 1 - EDGE)
+            advice, mean = density.from_unit(unit), unit.atanh()
         if self.kind == "likelihood":
-            return -distribution.log_prob(advice)
-        return self._divergence(advice, distribution.base_dist)
-
-    def _each_squashed(self, distribution: TanhNormal, advice: Tensor) -> Tensor:
-        low, high = distribution.low, distribution.high
-        middle, half = (high + low) / 2, (high - low) / 2
-        unit = ((advice - middle) / half).clamp(EDGE - 1, 1 - EDGE)
-        if self.kind == "likelihood":
-            return -distribution.log_prob(middle + half * unit)
+            return -density.log_prob(advice)
         # The divergence of squashed distributions is that of the normal ones before squashing.
-        return self._divergence(unit.atanh(), distribution)
-
-    def _divergence(self, mean: Tensor, policy: Normal | TanhNormal) -> Tensor:
-        """Return KL(N(mean, scale) || N(loc, scale of the policy)) of each row, [N]."""
-        divergence = kl_divergence(Normal(mean, self.scale), Normal(policy.loc, policy.scale))
-        return divergence.flatten(1).sum(-1)
+        guide = Normal(mean, torch.full_like(mean, self.scale), density.event_dims)
+        return guide.divergence(density)
 
 
 @checked
@@ -153,7 +138,7 @@ class FilteredKickstartLoss(KickstartLoss):
         self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase
     ) -> Tensor:
         """Return the weight of each row of a minibatch, [N]."""
-        own = policy.get_dist(minibatch.select(*policy.in_keys)).deterministic_sample
+        own = policy.get_dist(minibatch.select(*policy.in_keys)).mode
         advice = minibatch[self.advice_key][..., self.guide, :]
         of_guide, of_policy = self._values(minibatch, advice), self._values(minibatch, own)
         values = torch.stack([of_guide, of_policy])

@@ -1,15 +1,15 @@
 """Minibatches: how a batch of rollouts is divided for the steps of the optimiser."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
 from coil_rl.learners.networks import REMEMBERED
+from coil_rl.learners.policy import Entries
 from coil_rl.learners.state import Stateful
 
 
@@ -28,37 +28,31 @@ class Minibatches(Stateful):
         self.epochs, self.count = epochs, count
         self.generator = torch.Generator().manual_seed(seed)
 
-    def rows(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return what minibatches are drawn from: the steps of a batch [B, T], [B * T]."""
-        return batch.reshape(-1)
+    def rows(self, batch: TensorDictBase, keys: Sequence[NestedKey]) -> Entries:
+        """Return what minibatches are drawn from: entries of the steps of a batch [B, T], [B * T].
 
-    def draw(self, rows: TensorDictBase) -> Iterator[TensorDictBase]:
+        Args:
+            batch: of any number of dimensions.
+            keys: of the entries.
+        """
+        return Entries({key: batch[key].flatten(0, batch.ndim - 1) for key in keys})
+
+    def draw(self, rows: Entries) -> Iterator[Entries]:
         """Yield the minibatches [N] of all passes over `rows`.
 
         Raises:
             ValueError: if there are too few rows.
         """
-        for order in self.orders(rows):
-            yield from rows[order].split(self.size(rows))
-
-    def size(self, rows: TensorDictBase) -> int:
-        """Return the number of rows of a minibatch."""
-        return len(rows) // self.count
-
-    def orders(self, rows: TensorDictBase) -> Iterator[Tensor]:
-        """Yield the indices of the rows of each pass, those of its minibatches one after the other.
-
-        Raises:
-            ValueError: if there are too few rows.
-        """
-        size = self.size(rows)
-        if size * rows.shape[1:].numel() < 2:  # one advantage cannot be standardised
+        advantage = rows["advantage"]
+        size = len(advantage) // self.count
+        if size * advantage.shape[1:].numel() < 2:  # one advantage cannot be standardised
             raise ValueError(
-                f"minibatches={self.count} leaves less than 2 of {rows.numel()} frames to each"
+                f"minibatches={self.count} leaves less than 2 of {advantage.numel()} frames to each"
             )
         for _ in range(self.epochs):
-            order = torch.randperm(len(rows), generator=self.generator)[: size * self.count]
-            yield order.to(rows.device)
+            order = torch.randperm(len(advantage), generator=self.generator)[: size * self.count]
+            for index in order.to(advantage.device).split(size):
+                yield Entries({key: rows[key].index_select(0, index) for key in rows})
 
 
 class RowMinibatches(Minibatches):
@@ -78,18 +72,19 @@ class RowMinibatches(Minibatches):
         super().__init__(epochs, count, seed)
         self.memory = memory
 
-    def rows(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return what minibatches are drawn from: the rows of a batch, [B, T]."""
-        return batch.reshape(-1, batch.shape[-1])
+    def rows(self, batch: TensorDictBase, keys: Sequence[NestedKey]) -> Entries:
+        """Return what minibatches are drawn from: entries of the rows of a batch, [B, T]."""
+        rows = batch.select(*keys).reshape(-1, batch.shape[-1])
+        return Entries({key: rows[key] for key in keys})
 
-    def draw(self, rows: TensorDictBase) -> Iterator[TensorDictBase]:
+    def draw(self, rows: Entries) -> Iterator[Entries]:
         """Yield the minibatches [N] of all passes over `rows`.
 
         Raises:
             ValueError: if there are fewer rows than minibatches, or a minibatch would have less
                 than two steps.
         """
-        self.check_rows(len(rows))
+        self.check_rows(len(rows["advantage"]))
         yield from map(self.remember, super().draw(rows))
 
     def check_rows(self, rows: int) -> None:
@@ -104,11 +99,13 @@ class RowMinibatches(Minibatches):
                 "needs all steps of an env; take fewer minibatches or more envs"
             )
 
-    def remember(self, rows: TensorDictBase) -> TensorDictBase:
+    def remember(self, rows: Entries) -> Entries:
         """Return the steps of whole rows [N, T] with `remembered`, [N * T]."""
+        read = {key: rows[key] for key in self.memory.in_keys}
         with set_recurrent_mode(True):
-            remembered = self.memory(rows.select(*self.memory.in_keys))[REMEMBERED]
-        return rows.copy().set(REMEMBERED, remembered).reshape(-1)
+            remembered = self.memory(TensorDict(read, rows["advantage"].shape[:2]))[REMEMBERED]
+        rows.set(REMEMBERED, remembered)
+        return Entries({key: each.flatten(0, 1) for key, each in rows.items()})
 
 
 def minibatches_of(

@@ -6,13 +6,8 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModuleBase,
-    TensorDictSequential,
-)
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torch.distributions import Categorical as CategoricalDistribution
 from torchrl.data import (
     Bounded,
     Categorical,
@@ -23,12 +18,7 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import EnvBase
-from torchrl.modules import (
-    GRUModule,
-    IndependentNormal,
-    OneHotCategorical,
-    TanhNormal,
-)
+from torchrl.modules import GRUModule
 
 from coil_rl.learners.anchor import (
     Anchor,
@@ -38,6 +28,7 @@ from coil_rl.learners.anchor import (
     Hold,
     ShownAdvice,
 )
+from coil_rl.learners.density import Choices, Normal, OneHotChoice, SquashedNormal
 from coil_rl.learners.encoders import (
     STATE,
     ConcatObservations,
@@ -47,9 +38,9 @@ from coil_rl.learners.encoders import (
     Shapes,
     entry_specs,
 )
-from coil_rl.learners.heads import Choices, ChoicesHead, GaussianHead, GlobalScaleHead
+from coil_rl.learners.heads import ChoicesHead, GaussianHead, GlobalScaleHead
 from coil_rl.learners.normaliser import Normaliser
-from coil_rl.learners.sampling import ClippedNormal, Sample
+from coil_rl.learners.policy import ByKey, ClippedSample, Policy, Sample
 from coil_rl.transforms.action_space import ActionSpace, choices_of
 from coil_rl.transforms.normalised_action import units_of
 
@@ -68,6 +59,8 @@ class FastTensorDictModule(TensorDictModuleBase):
         in_keys: entries that it reads.
         out_keys: entries that it writes.
     """
+
+    by_key = True
 
     def __init__(
         self, module: nn.Module, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
@@ -131,11 +124,11 @@ def actor(
     clip: bool = True,
     inputs: Inputs | None = None,
     anchor: Anchor | None = None,
-) -> ProbabilisticTensorDictSequential:
+) -> Policy:
     """Return a stochastic policy for the actions of an env.
 
     Its distribution is a tanh-squashed normal for bounded actions (without `squash`, or if a bound
-    is infinite, a normal whose samples are clipped, see `ClippedNormal`), a normal for unbounded
+    is infinite, a normal whose samples are clipped, see `ClippedSample`), a normal for unbounded
     ones, a categorical for discrete ones, and several of these for several choices. Its
     deterministic action is the mode. It writes the action, and its logarithmic probability as
     `action_log_prob`. With a memory it also writes its next state, see `Gru`.
@@ -180,7 +173,7 @@ def actor(
             head = AnchoredHead(head, inputs.hold, part.valid, anchor.choice_weight)
             keys = [anchor.advice_key, *keys]
     module = FastTensorDictModule(head, keys, part.parameters)
-    return ProbabilisticTensorDictSequential(*before, module, sample)
+    return Policy(*before, module, sample)
 
 
 def inputs_of(env: EnvBase, normaliser: Normaliser | None, anchor: Anchor | None) -> Inputs | None:
@@ -252,7 +245,7 @@ def _action_part(
 def _one_choice(env: EnvBase, spec: TensorSpec, network_of: NetworkOf) -> _ActionPart:
     """Return the part for one of n options, as an index or one-hot."""
     is_index = isinstance(spec, Categorical)
-    distribution = CategoricalDistribution if is_index else OneHotCategorical
+    distribution = Choices if is_index else OneHotChoice
     valid = torch.ones(spec.space.n, dtype=torch.bool, device=spec.device)
     return _ActionPart(
         network_of(spec.space.n),
@@ -288,20 +281,21 @@ def _normal_head(
 
 def _unbounded(env: EnvBase, head: nn.Module, event: torch.Size) -> _ActionPart:
     """Return the part for numbers of shape `event` without bounds."""
-    sample = Sample(["loc", "scale"], env.action_key, IndependentNormal, {"event_dim": len(event)})
+    sample = Sample(["loc", "scale"], env.action_key, Normal, {"event_dims": len(event)})
     return _ActionPart(head, ["loc", "scale"], sample, torch.empty(0))
 
 
 def _squashed(env: EnvBase, head: nn.Module, low: Tensor, high: Tensor) -> _ActionPart:
     """Return the part for numbers that tanh squashes to their bounds."""
-    options = {"low": low, "high": high, "event_dims": low.ndim, "tanh_loc": False}
-    sample = Sample(["loc", "scale"], env.action_key, TanhNormal, options)
+    is_unit = bool((low == -1).all() and (high == 1).all())
+    options = {"event_dims": low.ndim, "bounds": None if is_unit else (low, high)}
+    sample = Sample(["loc", "scale"], env.action_key, SquashedNormal, options)
     return _ActionPart(head, ["loc", "scale"], sample, torch.empty(0))
 
 
 def _clipped(env: EnvBase, head: nn.Module, low: Tensor, high: Tensor) -> _ActionPart:
     """Return the part for numbers that are clipped to their bounds."""
-    sample = ClippedNormal(low, high, env.action_key)
+    sample = ClippedSample(low, high, env.action_key)
     return _ActionPart(head, ["loc", "scale"], sample, torch.empty(0))
 
 
@@ -337,17 +331,38 @@ def memory(
     return [FastTensorDictModule(entries, read, ["concatenated"]), gru]
 
 
-def split_memory(
-    policy: ProbabilisticTensorDictSequential,
-) -> tuple[TensorDictSequential | None, ProbabilisticTensorDictSequential]:
-    """Return the part of a policy that writes `remembered`, or None, and the part after it."""
-    modules = list(policy.module)
+@dataclass(frozen=True)
+class PolicyParts:
+    """A policy in parts, as an update computes them.
+
+    Attributes:
+        inputs: change what networks read, once for a batch; None: nothing does.
+        memory: computed for whole episodes; writes `remembered`. None: there is none.
+        head: computed for each minibatch.
+    """
+
+    inputs: Inputs | None
+    memory: TensorDictSequential | None
+    head: Policy
+
+
+def parts_of(policy: Policy) -> PolicyParts:
+    """Return the parts of a policy, with its own modules."""
+    inputs, modules, memory = None, list(policy.module), None
+    if isinstance(modules[0], Inputs):
+        inputs = modules.pop(0)
     for count, module in enumerate(modules, start=1):
         if isinstance(module, GRUModule):
-            return TensorDictSequential(*modules[:count]), ProbabilisticTensorDictSequential(
-                *modules[count:]
-            )
-    return None, policy
+            memory, modules = TensorDictSequential(*modules[:count]), modules[count:]
+            break
+    return PolicyParts(inputs, memory, Policy(*modules))
+
+
+def values_of(critic: TensorDictModuleBase, inputs: Inputs | None) -> TensorDictModuleBase:
+    """Return the part of a critic after `inputs`; all of it if it does not begin with them."""
+    if isinstance(critic, ByKey) and critic.module[0] is inputs:
+        return ByKey(*list(critic.module)[1:])
+    return critic
 
 
 def action_shape(env: EnvBase) -> torch.Size:
@@ -376,9 +391,7 @@ def critic(
     )
     if inputs is None:
         return FastTensorDictModule(values, in_keys, ["state_value"])
-    return TensorDictSequential(
-        inputs, FastTensorDictModule(values, inputs.reads(in_keys), ["state_value"])
-    )
+    return ByKey(inputs, FastTensorDictModule(values, inputs.reads(in_keys), ["state_value"]))
 
 
 def action_critic(

@@ -49,6 +49,8 @@ class Normaliser(TensorDictModuleBase):
             decision is a part of the state.
     """
 
+    by_key = True
+
     def __init__(self, env: EnvBase, keys: Sequence[NestedKey], *, automatic: bool = False) -> None:
         self.in_keys = list(keys)
         self.out_keys: list[NestedKey] = [unravel_key(("normalised", key)) for key in keys]

@@ -15,12 +15,12 @@ from coil_rl.learners import networks
 from coil_rl.learners.anchor import Anchor, start_tests
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.extensions import Extensions
-from coil_rl.learners.gradient import GradientStep
+from coil_rl.learners.gradient import GradientStep, means
 from coil_rl.learners.guided_steps import AGENT_ACTS, guide_may_act
 from coil_rl.learners.learner import Callback, Cases, Learner
 from coil_rl.learners.normaliser import RawObservations, normaliser
+from coil_rl.learners.policy import UNCLIPPED
 from coil_rl.learners.reward_scale import RewardScale
-from coil_rl.learners.sampling import UNCLIPPED
 from coil_rl.learners.state import Stateful
 from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Seed, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
@@ -231,8 +231,8 @@ class OffPolicy(Stateful, Learner):
         weights, reports, minibatch = self.loss_weights(progress), [], None
         for minibatch in self.samples():
             reports.append(self.gradient(minibatch, weights))
-        means = self.gradient.means(reports) if reports else {}
-        metrics = {name: means.get(name, math.nan) for name in self.reported}
+        found = means(reports)
+        metrics = {name: found.get(name, math.nan) for name in self.reported}
         metrics |= self.describe(minibatch) | {
             "minibatches": float(len(reports)),
             "compiled": float(self.gradient.compile is True),

@@ -7,32 +7,32 @@ near the policy that collected the batch:
     loss = -mean(min(r A, clip(r, 1 - clip, 1 + clip) A)),  r = pi(a | s) / pi_old(a | s)
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import ClassVar, Literal, TypedDict
 
-from tensordict import TensorDictBase, unravel_key
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+import torch
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
+from torch.nn import functional as F
 from torchrl.envs import EnvBase
-from torchrl.objectives import LossModule
 
 from coil_rl.learners import networks
-from coil_rl.learners.advantages import Advantages
+from coil_rl.learners.advantages import Advantages, standardise
 from coil_rl.learners.anchor import Anchor, start_tests
-from coil_rl.learners.clipped_loss import ClippedLoss
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.extensions import extensions_of
-from coil_rl.learners.gradient import GradientStep
-from coil_rl.learners.guided_steps import AGENT_ACTS, LossesOfAgentSteps, guide_may_act
-from coil_rl.learners.lean_update import LeanUpdate
+from coil_rl.learners.gradient import GradientStep, means
+from coil_rl.learners.guided_steps import AGENT_ACTS, guide_may_act, of_agent
 from coil_rl.learners.learner import Callback, Cases, Learner
 from coil_rl.learners.minibatches import RowMinibatches, minibatches_of
 from coil_rl.learners.normaliser import normaliser
+from coil_rl.learners.policy import UNCLIPPED, Entries, Policy, by_key
+from coil_rl.learners.ppo_report import OF_POLICY, SEEN, report_of
 from coil_rl.learners.reward_scale import RewardScale
-from coil_rl.learners.sampling import UNCLIPPED
 from coil_rl.learners.state import Stateful
 from coil_rl.ranges import Count, NonNegative, Positive, Seed, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
@@ -75,8 +75,8 @@ class PPO(Stateful, Learner):
 
     COIL is PPO with `guide_action` among `in_keys`. What is not PPO is in other files: `extensions`
     (`Extension`), a memory (`RowMinibatches`), and a guide that acts in some of the steps
-    (`LossesOfAgentSteps`). Subclasses override `build_policy`, `build_critic`, `build_loss`,
-    `losses`, `parameter_groups` and `learning_rates`.
+    (`losses_of_agent`). Subclasses override `build_policy`, `build_critic`, `objective`, `losses`,
+    `parameter_groups` and `learning_rates`.
 
     A value out of range, or an action that no policy can choose, is a `ValueError`; an entry that
     the env does not have a `KeyError`.
@@ -111,7 +111,7 @@ class PPO(Stateful, Learner):
 
     Attributes:
         policy: writes `action` and `action_log_prob`.
-        head: the part of the policy after its memory; all of it without one.
+        head: the part of the policy that is computed for each minibatch, see `PolicyParts`.
         critic: writes `state_value`.
         keys: entries that a batch must have.
         extensions: what is added to PPO.
@@ -127,6 +127,7 @@ class PPO(Stateful, Learner):
     with_memory: ClassVar[bool] = True  # whether the learner can train a network with a memory
     compilable: ClassVar[bool] = True  # whether the update can be compiled
     critic: TensorDictModuleBase
+    policy: Policy
     parts: ClassVar[tuple[str, ...]] = ("policy", "critic", "gradient", "sampler", "extensions")
 
     def __init__(
@@ -173,35 +174,28 @@ class PPO(Stateful, Learner):
         )
         self.policy = self.build_policy(env, in_keys, network, make_actor)
         self.critic = self.build_critic(env, in_keys, network)
-        memory, self.head = networks.split_memory(self.policy)
+        self.parts_of_policy = parts = networks.parts_of(self.policy)
+        self.head, self.values = parts.head, networks.values_of(self.critic, parts.inputs)
         scale = RewardScale(gamma) if scale_rewards else None
         self.extensions = extensions_of(env, in_keys, scale, self.normaliser, auxiliary)
 
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
-        self.loss = self.build_loss(clip, critic)
-        self.objective: Callable[[TensorDictBase], TensorDictBase] = self.losses
-        if guide_may_act(env):
-            self.objective = LossesOfAgentSteps(self.losses, self.loss.loss_critic)
-
+        # As TorchRL, in float32.
+        self.clip_bounds = torch.tensor([-clip, clip]).log1p().tolist()
+        self.critic_coefficient, self.has_bonus = critic, self.entropy(0) > 0
         self.epochs, self.minibatches = epochs, minibatches
-        self.sampler = minibatches_of(memory, epochs, minibatches, seed)
+        self.sampler = minibatches_of(parts.memory, epochs, minibatches, seed)
         self.gradient = GradientStep(
             self.all_losses,
             self.parameter_groups(),
-            [self.policy, self.critic, self.loss],
+            [self.policy, self.critic],
             self.learning_rates,
             eps=1e-5,
             max_grad_norm=max_grad_norm,
             compile=compile,
-            compilable=self.compilable and memory is None and not guide_may_act(env),
+            compilable=self.compilable and parts.memory is None and not guide_may_act(env),
         )
-        # Losses of a subclass, an extension or a guide that acts have no lean form.
-        plain = type(self).losses is PPO.losses and self.objective == self.losses
-        self.lean: LeanUpdate | None = None
-        if plain and not self.extensions.has_losses:
-            self.lean = LeanUpdate.of(
-                self.policy, self.critic, self.loss, self.sampler, self.gradient
-            )
+        self.on_tensors = by_key(self.head) and by_key(self.values)
         self._set_keys(env, in_keys)
 
     def build_policy(
@@ -209,8 +203,8 @@ class PPO(Stateful, Learner):
         env: EnvBase,
         in_keys: Sequence[NestedKey],
         network: Mlp,
-        make_actor: Callable[..., ProbabilisticTensorDictSequential],
-    ) -> ProbabilisticTensorDictSequential:
+        make_actor: Callable[..., Policy],
+    ) -> Policy:
         """Return the policy; `make_actor` is `networks.actor` with the other arguments set."""
         return make_actor(env, in_keys, network)
 
@@ -219,20 +213,6 @@ class PPO(Stateful, Learner):
     ) -> TensorDictModuleBase:
         """Return the critic."""
         return networks.critic(env, in_keys, network, self.inputs)
-
-    def build_loss(self, clip: float, critic: float) -> LossModule:
-        """Return TorchRL's loss of policy and critic; `critic` is the coefficient of the latter."""
-        return ClippedLoss(
-            self.head,
-            self.critic,
-            clip_epsilon=clip,
-            normalize_advantage=True,
-            entropy_bonus=self.entropy(0) > 0,
-            entropy_coeff=self.entropy(0),
-            critic_coeff=critic,
-            loss_critic_type="l2",
-            functional=False,
-        )
 
     def _set_keys(self, env: EnvBase, in_keys: Sequence[NestedKey]) -> None:
         """Set the entries that batches and minibatches need."""
@@ -264,49 +244,104 @@ class PPO(Stateful, Learner):
             progress: of the run, in [0, 1], for the schedules.
 
         Returns:
-            Means over the minibatches of the losses and of the other values that TorchRL's loss
+            Means over the minibatches of the losses and of the other values that TorchRL's PPO
             reports; the learning rate; and the metrics of the extensions.
         """
         rows, weights = self.prepare(batch, progress), self.loss_weights(progress)
-        if self.lean is not None and self.gradient.compile is not True:
-            means = self.lean(rows, weights)
-        else:
-            steps = [self.gradient(minibatch, weights) for minibatch in self.sampler.draw(rows)]
-            means = self.gradient.means(steps)
+        steps = [self.gradient(minibatch, weights) for minibatch in self.sampler.draw(rows)]
         known = {
             "learning_rate": self.learning_rate(progress),
             "compiled": float(self.gradient.compile is True),
         }
-        return means | known | self.extensions.finish(batch, progress)
+        return self.report(steps, weights) | known | self.extensions.finish(batch, progress)
 
-    def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:
+    def prepare(self, batch: TensorDictBase, progress: float) -> Entries:
         """Apply the schedules and compute advantages; returns what minibatches are drawn from."""
         self.gradient.begin(progress)
-        if self.loss.entropy_bonus:
-            self.loss.entropy_coeff.fill_(self.entropy(progress))
         self.extensions.prepare(batch)
         self.advantage(batch)
-        rows = self.sampler.rows(batch.select(*self.minibatch_keys))
-        # Some losses of TorchRL read the sample of the policy, others `action`.
-        return rows.set("action", rows[self.sample_key])
+        rows = self.sampler.rows(batch, self.minibatch_keys)
+        rows["action"] = rows.pop(self.sample_key)
+        if self.parts_of_policy.inputs is not None:
+            with torch.no_grad():  # they do not depend on weights
+                self.parts_of_policy.inputs(rows)
+        return rows
 
     def loss_weights(self, progress: float) -> dict[str, float]:
         """Return the weights of the losses in the sum that an update minimises."""
         weights = {"loss_objective": 1.0, "loss_critic": 1.0}
-        if self.loss.entropy_bonus:
-            weights["loss_entropy"] = 1.0
+        if self.has_bonus:
+            weights["loss_entropy"] = self.entropy(progress)
         return self.extensions.weights(weights, progress)
 
-    def all_losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+    def all_losses(self, minibatch: Entries) -> dict[str, Tensor]:
         """Return all losses of a minibatch [N] by name, and other values that are reported."""
-        losses = self.objective(minibatch)
-        for name, loss in self.extensions.losses(self.head, minibatch).items():
-            losses[name] = loss
+        losses = self.losses_of_agent(minibatch)
+        if self.extensions.has_losses:
+            steps = TensorDict(dict(minibatch), len(minibatch["advantage"]))
+            losses |= self.extensions.losses(self.head, steps)
         return losses
 
-    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return TorchRL's losses of a minibatch [N]: `loss_objective`, `loss_critic`, others."""
-        return self.loss(minibatch)
+    def losses_of_agent(self, minibatch: Entries) -> dict[str, Tensor]:
+        """Return `losses` of the steps in which the agent acted, that of the critic of all."""
+        if AGENT_ACTS not in minibatch:
+            return self.losses(minibatch)
+        agent_steps = of_agent(minibatch)
+        if len(agent_steps["advantage"]) >= 2:
+            return self.losses(agent_steps) | {"loss_critic": self.critic_loss(minibatch)[0]}
+        losses = self.losses(minibatch)  # one advantage cannot be standardised
+        unused = losses.keys() & {"loss_objective", "loss_entropy"}
+        return losses | {name: losses[name] * 0 for name in unused}
+
+    def losses(self, minibatch: Entries) -> dict[str, Tensor]:
+        """Return the losses of a minibatch [N]: `loss_objective`, `loss_critic`, others.
+
+        What is no scalar is for the report.
+        """
+        rows = minibatch if self.on_tensors else TensorDict(minibatch, len(minibatch["advantage"]))
+        density = self.head.density(rows)
+        log_prob = density.log_prob(rows["action"])
+        losses = {"loss_objective": self.objective(log_prob, rows).mean()}
+        if self.has_bonus:
+            entropy = density.entropy()
+            losses |= {"entropy": entropy.mean(), "loss_entropy": -entropy.mean()}
+        losses["loss_critic"], value = self.critic_loss(rows)
+        log_ratio = (log_prob - rows["action_log_prob"]).unsqueeze(-1)
+        return losses | dict(zip(SEEN, (log_ratio, value, rows["value_target"]), strict=True))
+
+    def objective(self, log_prob: Tensor, minibatch: Entries) -> Tensor:
+        """Return the loss of the policy in each step of a minibatch [N].
+
+        Args:
+            log_prob: log pi(a | s), [N].
+            minibatch: with `action_log_prob` [N], log pi_old(a | s), and `advantage` [N, 1].
+        """
+        log_ratio = log_prob - minibatch["action_log_prob"]
+        advantage = standardise(minibatch["advantage"], 1e-4).squeeze(-1)
+        clipped = log_ratio.clamp(*self.clip_bounds)
+        return -torch.minimum(log_ratio.exp() * advantage, clipped.exp() * advantage)
+
+    def critic_loss(self, minibatch: Entries) -> tuple[Tensor, Tensor]:
+        """Return the loss of the critic for a minibatch [N], and its values [N, 1]."""
+        value = self.values(minibatch)["state_value"]
+        errors = F.mse_loss(minibatch["value_target"], value, reduction="none")
+        return (self.critic_coefficient * errors).mean(), value
+
+    def report(
+        self, steps: Sequence[Mapping[str, Tensor]], weights: Mapping[str, float]
+    ) -> dict[str, float]:
+        """Return the means over the minibatches of the losses and of what `report_of` adds."""
+        means_of = means(steps)
+        if "loss_entropy" in means_of:
+            means_of["loss_entropy"] *= weights["loss_entropy"]
+        if SEEN[0] not in steps[0]:
+            return means_of
+        more = report_of(steps, self.clip_bounds)
+        first = {name: means_of.pop(name) for name in ("loss_objective",)}
+        first |= {name: more.pop(name) for name in OF_POLICY}
+        own = ("entropy", "loss_entropy", "loss_critic")
+        first |= {name: means_of.pop(name) for name in own if name in means_of}
+        return first | more | means_of
 
     def callbacks(self, cases: Cases) -> Sequence[Callback]:
         """Return the start test of an anchored policy."""

@@ -71,22 +71,26 @@ class Reinforce(A2C):
         """Return the baseline."""
         if self.baseline == "critic":
             return super().build_critic(env, in_keys, network)
-        return ZeroCritic(in_keys)
+        key = in_keys[0]
+        return ZeroCritic(key, len(env.observation_spec[key].shape) - len(env.batch_size))
 
 
 class ZeroCritic(TensorDictModuleBase):
     """A critic that writes 0 as `state_value` [*batch, 1].
 
     Args:
-        in_keys: entries that it reads, without effect.
+        key: entry that it reads for the size of a batch.
+        dims: number of dimensions of this entry after those of a batch.
     """
 
-    def __init__(self, in_keys: Sequence[NestedKey]) -> None:
-        self.in_keys, self.out_keys = list(in_keys), ["state_value"]
+    by_key = True
+
+    def __init__(self, key: NestedKey, dims: int) -> None:
+        self.in_keys, self.out_keys, self.dims = [key], ["state_value"], dims
         super().__init__()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the value."""
-        return tensordict.set(
-            "state_value", torch.zeros(*tensordict.shape, 1, device=tensordict.device)
-        )
+        entry = tensordict[self.in_keys[0]]
+        batch = entry.shape[: entry.ndim - self.dims]
+        return tensordict.set("state_value", torch.zeros(*batch, 1, device=entry.device))

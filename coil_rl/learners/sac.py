@@ -18,7 +18,7 @@ from typing import Annotated, Any, Unpack
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule, REDQLoss, SACLoss
@@ -29,6 +29,7 @@ from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.kickstart import KickstartLoss
 from coil_rl.learners.off_policy import OffPolicy, Ratio, ReplaySettings
+from coil_rl.learners.policy import Policy
 from coil_rl.ranges import Interval, NonNegative, Positive, Share, checked
 from coil_rl.transforms.action_space import ChoicesError, nested_key
 
@@ -140,9 +141,7 @@ class SAC(OffPolicy):
         self.policy = self.build_policy()
         self._extend(auxiliary)
 
-    def build_actor(
-        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp
-    ) -> ProbabilisticTensorDictSequential:
+    def build_actor(self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp) -> Policy:
         """Return a policy that reads entries that have been normalised already.
 
         Minibatches are normalised once, for all networks.
@@ -160,7 +159,7 @@ class SAC(OffPolicy):
         )
         if self.inputs is None:
             return policy
-        return ProbabilisticTensorDictSequential(*policy.module[1:])
+        return Policy(*policy.module[1:])
 
     def build_loss(
         self,
@@ -183,7 +182,7 @@ class SAC(OffPolicy):
     def build_policy(self) -> TensorDictSequential:
         """Return the policy that collects the batches."""
         before = [] if self.inputs is None else [self.inputs]
-        policy = ProbabilisticTensorDictSequential(*before, *self.actor.module)
+        policy = Policy(*before, *self.actor.module)
         return TensorDictSequential(policy, self.critics) if self.writes_uncertainty else policy
 
     def _extend(self, auxiliary: Sequence[Extension]) -> None:

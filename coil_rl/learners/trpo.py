@@ -11,17 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Unpack
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torch.distributions import Categorical, Distribution, Independent, Normal, kl_divergence
-from torch.nn import functional as F
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torchrl.envs import EnvBase
-from torchrl.modules import TanhNormal
 
 from coil_rl.learners.advantages import standardise
 from coil_rl.learners.guided_steps import of_agent
-from coil_rl.learners.heads import Choices
+from coil_rl.learners.policy import Entries
 from coil_rl.learners.ppo import PPO, OnPolicySettings
 from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Share, checked
 from coil_rl.schedules import Linear, Schedule
@@ -97,15 +94,14 @@ class TRPO(PPO):
         metrics = {name: float(value) for name, value in report.items()}
         errors = []
         for minibatch in self.sampler.draw(rows):
-            value = self.critic(minibatch.select(*self.critic.in_keys))["state_value"]
-            error = F.mse_loss(value, minibatch["value_target"])
+            error, _ = self.critic_loss(minibatch)
             self.gradient.minimise(error)
             errors.append(error.detach())
         metrics["loss_critic"] = float(torch.stack(errors).mean())
         metrics["learning_rate"] = self.learning_rate(progress)
         return metrics | self.extensions.finish(batch, progress)
 
-    def improve(self, rows: TensorDictBase, progress: float = 0.0) -> dict[str, Any]:
+    def improve(self, rows: Entries, progress: float = 0.0) -> dict[str, Any]:
         """Take a step of the policy; returns its metrics.
 
         Of the rows [N] with `minibatch_keys` those in which a guide acted count for the losses of
@@ -113,7 +109,7 @@ class TRPO(PPO):
         """
         weights = self.loss_weights(progress)
         # One advantage cannot be standardised.
-        if weights["loss_objective"] == 0 or len(of_agent(rows)) < 2:
+        if weights["loss_objective"] == 0 or len(of_agent(rows)["advantage"]) < 2:
             nothing = {name: 0.0 for name in weights if name != "loss_critic"}
             return nothing | {"kl": 0.0, "step": 0.0}
         evaluate = self.surrogate(rows, weights)
@@ -124,7 +120,7 @@ class TRPO(PPO):
             return losses | {"kl": 0.0, "step": 0.0}
         return improved
 
-    def surrogate(self, rows: TensorDictBase, weights: Mapping[str, float]) -> Surrogate:
+    def surrogate(self, rows: Entries, weights: Mapping[str, float]) -> Surrogate:
         """Return a function that evaluates the policy, which may change, beside the present one.
 
         Args:
@@ -132,20 +128,20 @@ class TRPO(PPO):
             weights: of the losses by name.
         """
         agent_rows = of_agent(rows)
-        observed = agent_rows.select(*self.policy.in_keys)
+        steps = TensorDict(dict(rows), len(rows["advantage"]))
         advantage = standardise(agent_rows["advantage"]).squeeze(-1)
         with torch.no_grad():
-            before = unsquashed(self.policy.get_dist(observed.copy()))
+            before = self.head.density(Entries(agent_rows))
 
         def evaluate() -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-            after = self.policy.get_dist(observed.copy())
+            after = self.head.density(Entries(agent_rows))
             ratio = (after.log_prob(agent_rows["action"]) - agent_rows["action_log_prob"]).exp()
             total = -(ratio * advantage).mean()
             losses = {"loss_objective": total}
-            for name, loss in self.extensions.losses(self.policy, rows).items():
+            for name, loss in self.extensions.losses(self.head, steps).items():
                 losses[name] = loss
                 total = total + weights[name] * loss
-            return total, kl_divergence(before, unsquashed(after)).mean(), losses
+            return total, before.divergence(after).mean(), losses
 
         return evaluate
 
@@ -182,16 +178,6 @@ class TRPO(PPO):
             fraction *= self.shrink
         vector_to_parameters(start, weights)
         return None
-
-
-def unsquashed(distribution: Any) -> Distribution:
-    """Return the distribution before squashing; squashing does not change KL divergences."""
-    if isinstance(distribution, Categorical):
-        return Categorical(logits=distribution.logits)
-    if isinstance(distribution, Choices):
-        return distribution
-    normal = distribution if isinstance(distribution, TanhNormal) else distribution.base_dist
-    return Independent(Normal(normal.loc, normal.scale), len(distribution.event_shape))
 
 
 def conjugate_gradients(

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import check_range
-from coil_rl.learners.sampling import NOISE
+from coil_rl.learners.policy import NOISE
 
 
 class CorrelatedNoise:

@@ -14,7 +14,7 @@ from torch import Tensor, where
 from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from coil_rl.envs.seeded_env import SeededEnv
-from coil_rl.learners.lean_policy import Entries, LeanPolicy
+from coil_rl.learners.policy import Entries, Policy, by_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.link import Link
 
@@ -41,9 +41,6 @@ class LeanEnv:
 
         They have if it is one of this project, and if its transforms are a sum of rewards and links
         that remember, record and draw nothing.
-
-        Args:
-            env: with transforms.
         """
         base = env.base_env if isinstance(env, TransformedEnv) else env
         return (
@@ -59,7 +56,6 @@ class LeanEnv:
         """Return the entries after a step.
 
         Args:
-            action: as the transforms get it.
             before: entries before the step, of which the sums of rewards are read.
         """
         # An env of this project reads its action by the key only; a dictionary is made at once.
@@ -96,7 +92,7 @@ class LeanSteps:
     """
 
     def __init__(self, env: EnvBase, policy: Any, keys: Sequence[NestedKey]) -> None:
-        self.policy, self.env = LeanPolicy(policy), LeanEnv(env)
+        self.policy, self.env = policy, LeanEnv(env)
         self.before = [key for key in keys if not _is_next(key)]
         self.after = {key: _in_next(key) for key in keys if _is_next(key)}
         self.carried = [*_observed(policy, keys), *self.env.sums]
@@ -105,17 +101,16 @@ class LeanSteps:
     def covers(env: EnvBase, policy: Any, keys: Sequence[NestedKey] | None) -> bool:
         """Return whether the steps of an env and a policy have this form.
 
-        They have if those of the env have, see `LeanEnv`, if the policy has a lean form, and if all
-        that it observes is written by the env.
+        They have if those of the env have, see `LeanEnv`, if the policy has none but modules of
+        this project, and if all that it observes is written by the env.
 
         Args:
-            env: with transforms.
-            policy: of the env.
             keys: entries that are kept of each step; None: all.
         """
         return (
             keys is not None
-            and LeanPolicy.covers(policy)
+            and isinstance(policy, Policy)
+            and by_key(policy)
             and LeanEnv.covers(env)
             and set(_observed(policy, keys)) <= set(env.observation_spec.keys(True, True))
         )
@@ -130,7 +125,7 @@ class LeanSteps:
         Args:
             entries: what is read in this step; it gets what the policy writes.
         """
-        after = self.env.step(self.policy.act(entries)["action"], entries)
+        after = self.env.step(self.policy(entries)["action"], entries)
         kept = {key: entries[key] for key in self.before}
         kept |= {key: after[name] for key, name in self.after.items()}
         return kept, self._begun(after)
@@ -157,7 +152,6 @@ class LeanSteps:
 
 
 def _transforms(env: EnvBase) -> list[Transform]:
-    """Return the transforms of an env."""
     if not isinstance(env, TransformedEnv):
         return []
     return list(env.transform) if isinstance(env.transform, Compose) else [env.transform]

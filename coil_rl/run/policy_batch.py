@@ -23,7 +23,7 @@ from torch.fx.node import map_arg
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from coil_rl.compiled import record
-from coil_rl.learners.sampling import NOISE
+from coil_rl.learners.policy import NOISE
 
 
 def policy_batch(

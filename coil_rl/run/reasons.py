@@ -1,4 +1,4 @@
-"""Sentences on the tests of a run: which guide its policy holds, and what is handed over."""
+"""Sentences on a run: what its returns are, which guide it holds, and what is handed over."""
 
 import math
 from collections.abc import Mapping
@@ -6,6 +6,7 @@ from pathlib import Path
 
 from coil_rl.learners.anchor import StartTest
 from coil_rl.record import DELIVERY, UNTESTED
+from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.report.sentences import Sentences
 from coil_rl.report.table import return_format
 
@@ -19,6 +20,16 @@ POLICIES = {
     "tuned": "the tuned guide",
     "best_candidate": "the best candidate",
 }
+
+
+def about_returns(sizes: Mapping[str, int], *, tested: bool = False) -> list[str]:
+    """Return what the return of the progress bar, of the curve and of the table counts.
+
+    Args:
+        tested: whether a test at the end of the run decides what is handed over.
+    """
+    others = 0 if tested else sizes.get(SELECTION, 0)
+    return SENTENCES.said("about_returns", cases=sizes.get(EVALUATION, 0), others=others)
 
 
 def start_test(row: Mapping[str, float]) -> list[str]:
@@ -38,9 +49,6 @@ def start_test(row: Mapping[str, float]) -> list[str]:
 
 def handed_over(folder: Path) -> list[str]:
     """Return the sentences that say what a run handed over and why; none without a test.
-
-    Args:
-        folder: of the run.
 
     Raises:
         UserError: if the file is damaged.

@@ -6,7 +6,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,14 +21,12 @@ from coil_rl.learners.learner import Callback, Learner
 from coil_rl.measures import Measure
 from coil_rl.output import decoration, say
 from coil_rl.report import draw_learning_curves, draw_phases
-from coil_rl.report.pictures import Picture
 from coil_rl.report.runs import EVALUATION, begun_with
 from coil_rl.run import checkpoint
 from coil_rl.run.beside import Beside, Driver
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import Watch
 from coil_rl.run.delivery import guide_of
-from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.experiment import PUT_BACK
 from coil_rl.run.folder import (
     HANDED_OVER,
@@ -41,9 +39,8 @@ from coil_rl.run.folder import (
     weights_file,
     write_config,
 )
-from coil_rl.run.guide_episodes import driven_once
 from coil_rl.run.guide_returns import guide_returns
-from coil_rl.run.judge import Evaluation, Trial, judge, report_outcome
+from coil_rl.run.judge import Trial, judge, report_outcome
 from coil_rl.run.next_step import next_step
 from coil_rl.run.parts import TRAIN, EnvMaker
 from coil_rl.run.reasons import SENTENCES, handed_over, start_test
@@ -394,10 +391,11 @@ class Run:
         """
         names = self.trial.guides if EVALUATION in self.make_env.sizes else ()
         saved = record.GUIDE_RETURNS.read(self.folder)
-        if saved is None or not saved.keys() >= set(names):
-            saved = guide_returns(self.make_env, self.make_env.guides())
-            record.GUIDE_RETURNS.write(self.folder, saved)
-        return {name: saved[name] for name in names}
+        if saved is not None and saved.keys() >= set(names):
+            return {name: saved[name] for name in names}
+        returns = guide_returns(self.make_env, self.make_env.guides())
+        record.GUIDE_RETURNS.write(self.folder, returns)
+        return returns
 
     def require_agent(self) -> Callable[[EnvBase], Learner]:
         """Return what makes the learner of the run for an env.
@@ -445,9 +443,9 @@ class Run:
         return policy
 
     def _trial_with_reasons(self) -> Trial:
-        """Return the trial with notes on the tests of the training. Its guides drive once."""
+        """Return the trial with notes on the tests of the training."""
         notes = [*self.trial.notes, *self.reasons()]
-        return replace(self.trial, guide_results=self._guide_results, notes=notes)
+        return replace(self.trial, notes=notes)
 
     def reasons(self) -> list[str]:
         """Return the sentences on how the training began, and on its tests."""
@@ -458,18 +456,6 @@ class Run:
         if self.which == HANDED_OVER and self.delivery == "tested":
             found += handed_over(self.folder)
         return found
-
-    def _guide_results(
-        self, evaluation: Evaluation, pictures: Sequence[Picture]
-    ) -> Mapping[str, EvaluationResult]:
-        """Return the episodes of the guides alone.
-
-        A resumed run does not drive them again, unless there are pictures that watch them.
-        """
-        drive = partial(self.trial.guide_results, evaluation, pictures)
-        if pictures:
-            return drive()
-        return driven_once(self.folder, self.settings, evaluation, drive)
 
     def in_env(
         self, env: EnvBase, which: str = HANDED_OVER
@@ -512,10 +498,6 @@ class Run:
 
 def whole(name: str, number: Any) -> int:
     """Return a number of things that somebody gave.
-
-    Args:
-        name: of the argument.
-        number: what was given.
 
     Raises:
         UserError: if it is no whole number, or below 1.

@@ -63,7 +63,6 @@ class TunedRun(Run):
         """Return the policy that follows the tuned guide of an env.
 
         Args:
-            env: with the transforms of the run.
             which: "handed_over" or "last", which are the same here.
 
         Raises:
@@ -269,7 +268,6 @@ def numbers_sentence(values: Values, own: Values) -> str:
 
     Args:
         values: by name.
-        own: those that it had.
     """
     listed = (f"{name} {value:.4g} (its own {own[name]:.4g})" for name, value in values.items())
     return f"The guide's numbers: {', '.join(listed)}; all digits are in {TUNED.name}."
@@ -277,10 +275,6 @@ def numbers_sentence(values: Values, own: Values) -> str:
 
 def read_tuned(folder: Path, numbers: Sequence[Number]) -> Values | None:
     """Return the numbers that a run found, by name; None if it has found none yet.
-
-    Args:
-        folder: of the run.
-        numbers: that it searched.
 
     Raises:
         UserError: for a file that holds other numbers, or numbers out of their bounds.

@@ -167,7 +167,6 @@ class Tuner:
         one after the other.
 
         Args:
-            values: of each guide.
             cases: C, number of new cases.
         """
         guides = [self.make_guide(each) for each in values]

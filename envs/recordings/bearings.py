@@ -79,7 +79,6 @@ def _decide(given: Angles, points: int) -> tuple[Angles, str, str]:
     """Return the angles to take, what is wrong with those given, and an example; perhaps empty.
 
     Args:
-        given: of a scan.
         points: number of its ranges, at least 2.
     """
     angles, in_degrees = _in_radians(given, points)

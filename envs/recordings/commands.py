@@ -19,7 +19,6 @@ def command_topic(wanted: str, contents: Contents, remarks: list[str]) -> str | 
     such as `/drive` of a car that is steered by Ackermann messages.
 
     Args:
-        wanted: topic of the configuration.
         contents: of the recording; messages on `wanted` are commands.
         remarks: a remark is added for another topic than the one that is wanted, or for others
             besides it.
@@ -53,8 +52,6 @@ def commands_of(path: Path, topic: str, contents: Contents, remarks: list[str]) 
     """Return the fields of a `Recording` that come from its commands.
 
     Args:
-        path: of the recording, for messages.
-        topic: of the commands.
         contents: of the recording; messages of other types than the first are left out.
         remarks: a remark is added on messages that are left out.
     """

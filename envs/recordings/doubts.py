@@ -17,11 +17,7 @@ CLOCKS_DIFFER = 2.0  # times as fast
 
 
 def doubts_about(recording: Recording) -> list[str]:
-    """Return remarks on what makes the meaning of a recording doubtful.
-
-    Args:
-        recording: as it was read.
-    """
+    """Return remarks on what makes the meaning of a recording doubtful."""
     return [
         *_about_clock(recording),
         *_about_scans(recording),

@@ -258,7 +258,6 @@ def _miscounted(counts: Mapping[str, int], contents: Contents) -> list[str]:
 
     Args:
         counts: that the metadata claim, by topic.
-        contents: of the files.
     """
     if contents.cut_off or contents.damage:
         return []
@@ -279,10 +278,8 @@ def _read_file(
     """Add the contents of a file.
 
     Args:
-        file: an MCAP file.
         topics: topics to read; None for all.
         types: message types whose topics are read too.
-        contents: to which the contents are added.
     """
     size, complete = _check_format(file)
     before = {topic: len(messages) for topic, messages in contents.messages.items()}
@@ -349,11 +346,9 @@ def _records(
     Damaged chunks are skipped. They and an early end are noted in the contents.
 
     Args:
-        file: the file, for messages.
         stream: its bytes.
         size: number of bytes.
         complete: whether the end of the file is there.
-        contents: of the recording.
     """
     reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size)
     read = reader.records
@@ -413,7 +408,6 @@ def _unpacked(chunk: records.Chunk, left: int) -> records.Chunk:
     """Return a chunk without compression.
 
     Args:
-        chunk: of a file.
         left: number of bytes that it may unpack to; more are a `_TooLargeError`.
     """
     most = min(left, chunk.uncompressed_size) + 1

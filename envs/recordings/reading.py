@@ -92,9 +92,6 @@ def _odometry(path: Path, topic: str, contents: Contents, remarks: list[str]) ->
     """Return the field of a `Recording` for its odometry, if it has any.
 
     Args:
-        path: of the recording, for messages.
-        topic: of the odometry.
-        contents: of the recording.
         remarks: a remark is added if there is odometry on other topics only.
     """
     if not contents.messages[topic]:
@@ -146,10 +143,7 @@ def _ignore_other_types(
     """Remove the messages of other types or encodings of a topic.
 
     Args:
-        path: of the recording, for messages.
-        topic: of the messages.
         types: the message types that can be read.
-        contents: of the recording.
         scan: topic of the scans; if there are only other messages on it, a `RecordingError` is
             raised.
 

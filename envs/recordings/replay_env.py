@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.limits import check_range
+from coil_rl.envs.limits import Degrees
 from coil_rl.envs.recordings.demonstrations import about_demonstrations
 from coil_rl.envs.recordings.folders import RecordingError
 from coil_rl.envs.recordings.mcap_files import read_messages
@@ -27,11 +27,13 @@ from coil_rl.envs.recordings.recording import STANDS, Recording
 from coil_rl.envs.reward import HISTORY, recent_mean
 from coil_rl.envs.robot.perception import BoundaryMemory, Perception, declare_specs
 from coil_rl.envs.sight import SIGHT
+from coil_rl.ranges import Count, Interval, Positive, checked
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.float64]], tuple[Any, Any]]
 AnyPath = str | os.PathLike[str]
 
 
+@checked
 class McapReplayEnv(EnvBase):
     """Recordings side by side, each replayed from its first to its last scan.
 
@@ -107,7 +109,7 @@ class McapReplayEnv(EnvBase):
         recordings: AnyPath | Recording | Sequence[AnyPath | Recording] | None,
         perception: Perceive,
         *,
-        num_envs: int | None = None,
+        num_envs: Count | None = None,
         scan: str = "/scan",
         odometry: str | None = "/odom",
         command: str | None = "/cmd_vel",
@@ -115,21 +117,16 @@ class McapReplayEnv(EnvBase):
         strict: bool = False,
         spline: Literal["cubic", "quadratic"] = "cubic",
         smoothing: float = 0.1,
-        smooth: float = -0.1,
-        kept_cones: int = 16,
-        sight: float | None = None,
-        speed: float = 0.15,
-        car_length: float = 2 / 7,
-        max_steering: float = 80.0,
+        smooth: Annotated[float, Interval(ge=-1e6, le=1e6)] = -0.1,
+        kept_cones: Count = 16,
+        sight: Positive | None = None,
+        speed: Positive = 0.15,
+        car_length: Positive = 2 / 7,
+        max_steering: Degrees = 80.0,
         device: torch.device | str = "cpu",
     ) -> None:
         if sight is None:
             sight = perception.sight if isinstance(perception, Perception) else SIGHT
-        check_range(
-            0, above=True, kept_cones=kept_cones, sight=sight, speed=speed, car_length=car_length
-        )
-        check_range(0, 90, above=True, max_steering=max_steering)
-        check_range(-1e6, 1e6, smooth=smooth)
         if isinstance(recordings, (str, os.PathLike, Recording)):
             sources = [recordings]
         else:
@@ -148,7 +145,6 @@ class McapReplayEnv(EnvBase):
             source if isinstance(source, Recording) else read(source) for source in sources
         ]
         rows = len(self.recordings) if num_envs is None else num_envs
-        check_range(0, above=True, num_envs=rows)
         super().__init__(device=torch.device(device), batch_size=torch.Size([rows]))
         self.smooth, self.max_steering = smooth, math.radians(max_steering)
         self.speed, self.car_length = speed, car_length
@@ -293,7 +289,6 @@ def _perceive(
     """Return the cones [N, 2, K, 2] m of all scans of a recording, and their number [N, 2].
 
     Args:
-        recording: the recording.
         perception: called once for all scans with equal bearings.
         kept_cones: K.
     """

@@ -31,9 +31,6 @@ def scans_of(
     """Return the fields of a `Recording` that come from the scans.
 
     Args:
-        path: of the recording, for messages.
-        topic: of the scans.
-        contents: of the recording.
         frame: of the scanner; None for the first one.
         remarks: to which remarks on the scanner, its angles and its ranges are added.
 
@@ -70,9 +67,6 @@ def _of_one_scanner(
     """Return the chosen scanner, and the log times, stamps, angles and ranges of its scans.
 
     Args:
-        path: of the recording, for messages.
-        topic: of the scans.
-        contents: of the recording.
         frame: of the scanner; None for the first one.
         remarks: a remark is added if there are several scanners.
     """
@@ -103,9 +97,6 @@ def decoded(
     """Return the log times of a topic, and the chosen fields of its messages.
 
     Args:
-        path: of the recording, for messages.
-        topic: of the messages.
-        contents: of the recording.
         fields: takes a decoded message and returns what is needed of it.
     """
     rows = []
@@ -128,11 +119,8 @@ def check_finite(
     """Raise a `RecordingError` for a message with numbers beyond what any robot does.
 
     Args:
-        path: of the recording, for the message.
-        topic: of the values.
         time: [M] ns, log time of each message.
         values: [M, n], in m, radians and s.
-        name: of the values, for the message.
     """
     wrong = np.flatnonzero(~(np.abs(values) < LARGEST).all(axis=1))
     if len(wrong):
@@ -146,14 +134,7 @@ def check_finite(
 def _padded(
     path: Path, topic: str, scans: Sequence[NDArray[np.float32]], points: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """Return scans as rows of the length of the longest, padded with infinity.
-
-    Args:
-        path: of the recording, for messages.
-        topic: of the scans, for messages.
-        scans: the ranges of each scan.
-        points: their number.
-    """
+    """Return scans as rows of the length of the longest, padded with infinity."""
     if not points.any():
         raise RecordingError(
             f"{path}, topic {topic}: no scan has a range; check that the scanner ran, and record "
@@ -176,8 +157,6 @@ def _on_ranges(ranges: NDArray[np.float32], low: np.float32, high: np.float32) -
 
     Args:
         ranges: [N, P], of all scans, as they were sent.
-        low: smallest range of the scanner.
-        high: greatest one.
     """
     returned = ranges[np.isfinite(ranges) & (ranges > 0)]
     inside = returned[(returned >= low) & (returned <= high)]
@@ -197,9 +176,6 @@ def _choose_scanner(
     """Return the first scanner, or the first one with a frame.
 
     Args:
-        path: of the recording, for messages.
-        topic: of the scans.
-        scanners: of all scans.
         frame: to choose; None for the first scanner.
         remarks: a remark is added if there are others to choose from.
     """

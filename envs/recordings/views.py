@@ -29,7 +29,6 @@ def caution_about_view(
     most clusters in sight are no cones.
 
     Args:
-        recording: the recording.
         cones: [N, 2, K, 2] m in the car's frame, left side first.
         count: [N, 2], number of the cones.
         both_valid: [N], whether both boundaries are valid in a scan.

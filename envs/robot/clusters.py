@@ -107,7 +107,6 @@ def single_linkage(points: Points, gap: float = GAP) -> Integers:
     """Return the cluster label of each point [M], counted from 0 through all scans.
 
     Args:
-        points: the points.
         gap: m, points nearer to each other than this are linked.
     """
     count = len(points.scan)
@@ -126,7 +125,6 @@ def _candidate_pairs(points: Points, run_end: Integers, gap: float) -> tuple[Int
     """Return the pairs of points of a scan that may be close although their runs differ.
 
     Args:
-        points: the points.
         run_end: [M], index behind the last point of each point's run.
         gap: m.
 
@@ -166,7 +164,6 @@ def measure(points: Points, label: Integers, min_points: int = 2) -> Clusters:
     """Return the clusters of points with their features.
 
     Args:
-        points: the points.
         label: [M], cluster of each point, as `single_linkage` returns it.
         min_points: clusters of fewer points are left out.
     """

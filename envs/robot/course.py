@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from coil_rl.envs.limits import check_range
 from coil_rl.envs.sight import Frame
 from coil_rl.envs.track import SIDES, Array, Track, TrackError, resample
+from coil_rl.ranges import NonNegative, checked
 
 THIN, THICK = 0.020, 0.045  # m, radius of a cone on the left and on the right
 HALF_WIDTH = 0.18  # m, from the centre line to the middle of a cone
@@ -51,8 +51,13 @@ def robot_track() -> Track:
     return Track("robot (simulated)", left, right)
 
 
+@checked
 def robot_tracks(
-    scale: float = 1, count: int = 1, missing: float = 0, moved: float = 0, seed: int = 0
+    scale: float = 1,
+    count: int = 1,
+    missing: NonNegative = 0,
+    moved: NonNegative = 0,
+    seed: int = 0,
 ) -> list[Track]:
     """Return copies of the robot's track, enlarged and with faults.
 
@@ -67,7 +72,6 @@ def robot_tracks(
     Raises:
         TrackError: for a track with too few cones, or with sides that cross.
     """
-    check_range(0, missing=missing, moved=moved)
     track, generator, tracks = robot_track(), np.random.default_rng(seed), []
     start = (scale * track.start[0], scale * track.start[1], track.start[2])
     for copy in range(count):
@@ -158,7 +162,6 @@ class RobotCourse:
 
 
 def _squares(x: Tensor, y: Tensor) -> Tensor:
-    """Return x^2 + y^2."""
     return (x * x).add_(y * y)
 
 
@@ -171,7 +174,6 @@ def cones_of(track: Track, *, left: bool = True, right: bool = True) -> tuple[Te
     """Return the cones of a robot's track, thin ones left and thick ones right.
 
     Args:
-        track: the track.
         left: whether to include the cones of the left side.
         right: whether to include those of the right side; neither side is a `ValueError`.
 

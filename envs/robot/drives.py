@@ -19,7 +19,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type, step_mdp
 
-from coil_rl.envs.limits import check_choice
 from coil_rl.envs.recordings.folders import RecordingError
 from coil_rl.envs.recordings.mcap_files import RecordingWriter
 from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, header, twist
@@ -36,6 +35,7 @@ from coil_rl.envs.robot.course import (
 from coil_rl.envs.robot.env import SimulatedRobotEnv
 from coil_rl.envs.robot.lidar import RANGE_MAX, RANGE_MIN, SimulatedLidar, cast_beams
 from coil_rl.envs.track import Track, TrackError
+from coil_rl.ranges import checked
 
 Path = str | os.PathLike[str]
 Sides = Literal["left", "right", "both"]
@@ -83,6 +83,7 @@ class SimulatedDrive:
         return self.radius > (THIN + THICK) / 2
 
 
+@checked
 def simulated_drive(sides: Sides, seed: int, lidar: SimulatedLidar | None = None) -> SimulatedDrive:
     """Simulate a lap along the centre line of `robot_track()`.
 
@@ -91,7 +92,6 @@ def simulated_drive(sides: Sides, seed: int, lidar: SimulatedLidar | None = None
         seed: of the noise and of the sway.
         lidar: the sensor; None for an RPLIDAR A1M8.
     """
-    check_choice(("left", "right", "both"), sides=sides)
     track, lidar = robot_track(), lidar or SimulatedLidar()
     generator = torch.Generator().manual_seed(seed)
     line = torch.from_numpy(middle_line(track, SPEED / lidar.rate))
@@ -345,7 +345,6 @@ def _write(
     """Write a recording of a simulated robot.
 
     Args:
-        path: of the file.
         rate: scans per second.
         angles: [P] radians, bearings of the beams.
         ranges: [T, P] m, the scans.

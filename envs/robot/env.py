@@ -16,7 +16,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
+from coil_rl.envs.limits import Degrees, Laps, Seconds, Starts
 from coil_rl.envs.meanings import of_cones
 from coil_rl.envs.reward import (
     HISTORY,
@@ -37,10 +37,12 @@ from coil_rl.envs.robot.perception import (
 )
 from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.envs.track import NEVER, Track, places
+from coil_rl.ranges import Count, Positive, checked
 
 FINISH_RADIUS = 0.15  # m, covers the width between the cones
 
 
+@checked
 class SimulatedRobotEnv(SeededEnv):
     """Simulated robots on tracks between cones, independent of one another.
 
@@ -90,27 +92,22 @@ class SimulatedRobotEnv(SeededEnv):
     def __init__(
         self,
         tracks: Sequence[Track] | None = None,
-        num_envs: int = 1,
+        num_envs: Count = 1,
         *,
-        starts: int | None = None,
+        starts: Starts | None = None,
         assignment: Literal["random", "drawn", "cyclic"] = "random",
         perception: Perception | None = None,
         lidar: SimulatedLidar | None = None,
         spline: Literal["cubic", "quadratic"] = "cubic",
         smoothing: float = 0.1,
         reward: dict[str, float] | None = None,
-        laps: int = 3,
-        time_limit: float = 200.0,
-        speed: float = 0.15,
-        car_length: float = 2 / 7,
-        max_steering: float = 80.0,
+        laps: Laps = 3,
+        time_limit: Seconds = 200.0,
+        speed: Positive = 0.15,
+        car_length: Positive = 2 / 7,
+        max_steering: Degrees = 80.0,
         seed: int = 0,
     ) -> None:
-        check_range(0, above=True, num_envs=num_envs, speed=speed, car_length=car_length)
-        check_range(1, LARGEST_STARTS, starts=1 if starts is None else starts)
-        check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
-        check_range(0, 90, above=True, max_steering=max_steering)
-        check_choice(("random", "drawn", "cyclic"), assignment=assignment)
         if tracks is not None and not tracks:
             raise ValueError("tracks is empty; give at least one, or None for robot_track()")
         check_weights("reward", reward or {}, RewardWeights._fields)

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from coil_rl.envs.limits import check_range
+from coil_rl.ranges import Count, NonNegative, Positive, checked
 
 RANGE_MIN = 0.15  # m, minimum range of the sensor
 RANGE_MAX = 12.0  # m, maximum range
 MARGIN = 1e-3  # m and radians, more than the error of the windows of bearings
 
 
+@checked
 @dataclass(eq=False)
 class SimulatedLidar:
     """Range measurements with the noise of an RPLIDAR A1M8.
@@ -40,17 +41,15 @@ class SimulatedLidar:
         phase: [P], time of each beam as a share of the scan.
     """
 
-    beams: int = 360
-    rate: float = 5.5
-    noise: float = 0.0007
-    noise_growth: float = 0.001
-    quantum: float = 0.00025
+    beams: Count = 360
+    rate: Positive = 5.5
+    noise: NonNegative = 0.0007
+    noise_growth: NonNegative = 0.001
+    quantum: Positive = 0.00025
     no_return: float = 0.02
     outliers: float = 0.005
 
     def __post_init__(self) -> None:
-        check_range(0, above=True, beams=self.beams, rate=self.rate, quantum=self.quantum)
-        check_range(0, noise=self.noise, noise_growth=self.noise_growth)
         if min(self.no_return, self.outliers) < 0 or self.no_return + self.outliers > 1:
             raise ValueError(
                 f"no_return={self.no_return} and outliers={self.outliers} must be shares of all "
@@ -133,7 +132,6 @@ def _nearest(place: Tensor, cone: Tensor, distance: Tensor, size: int) -> tuple[
         place: of each hit, [N].
         cone: of each hit, [N].
         distance: m, of each hit, [N].
-        size: number of places.
     """
     nearest = torch.full((size,), torch.inf, dtype=distance.dtype)
     nearest = nearest.scatter_reduce(0, place, distance, "amin")

@@ -8,7 +8,7 @@ import json
 import math
 from dataclasses import KW_ONLY, dataclass, fields
 from importlib import resources
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, make_composite_from_td
 
-from coil_rl.envs.limits import check_range
 from coil_rl.envs.robot.clusters import GAP, Clusters, measure, points_of, single_linkage
 from coil_rl.envs.sight import SAMPLES, SIGHT, encode_samples
 from coil_rl.envs.splines import spline_fit
+from coil_rl.ranges import Count, Interval, NonNegative, Positive, checked
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -113,6 +113,7 @@ def simulated_cone_classifier() -> ConeClassifier:
     return ConeClassifier(**json.loads(file.read_text(encoding="utf-8")))
 
 
+@checked
 @dataclass(eq=False)
 class Perception:
     """Cones in view from LiDAR scans.
@@ -147,31 +148,20 @@ class Perception:
     classifier: ConeClassifier
     _: KW_ONLY
     range_min: float = 0.15
-    range_max: float = 1.0
-    bearing_max: float = 60.0
-    scale: float = 7.0
-    laser_yaw: float = 0.0
-    margin: float = 0.15
-    gap: float = GAP
-    kept_cones: int = 16
+    range_max: Positive = 1.0
+    bearing_max: Annotated[float, Interval(gt=0, le=180)] = 60.0
+    scale: Positive = 7.0
+    laser_yaw: Annotated[float, Interval(ge=-360, le=360)] = 0.0
+    margin: NonNegative = 0.15
+    gap: Positive = GAP
+    kept_cones: Count = 16
 
     def __post_init__(self) -> None:
-        check_range(
-            0,
-            above=True,
-            range_max=self.range_max,
-            scale=self.scale,
-            gap=self.gap,
-            kept_cones=self.kept_cones,
-        )
         if not 0 < self.range_min < self.range_max:
             raise ValueError(
                 f"range_min={self.range_min} must be above 0, the code for no return, and below "
                 "range_max"
             )
-        check_range(0, margin=self.margin)
-        check_range(0, 180, above=True, bearing_max=self.bearing_max)
-        check_range(-360, 360, laser_yaw=self.laser_yaw)
 
     @property
     def sight(self) -> float:
@@ -311,12 +301,7 @@ class BoundaryMemory(nn.Module):
 
 
 def declare_specs(env: EnvBase, example: TensorDictBase) -> None:
-    """Set the specs of a simulated or replayed robot.
-
-    Args:
-        env: the env.
-        example: the entries of its reset.
-    """
+    """Set the specs of a simulated or replayed robot."""
     batch, device = env.batch_size, env.device
     spec = make_composite_from_td(example, unsqueeze_null_shapes=False)
     for key in ("observation", "steering"):

@@ -81,8 +81,6 @@ def draw_boundary(axes: Axes, boundary: Spline, side: int, valid: bool, samples:
     """Draw the boundary estimate of a side, and its samples.
 
     Args:
-        axes: of the picture.
-        boundary: the estimate.
         side: 0 for left, 1 for right.
         valid: whether there is an estimate; without one the samples are remembered, and hollow.
         samples: [5, 2] m.

@@ -84,7 +84,6 @@ def drive(
 
     Args:
         folders: of finished runs; tracks and guide are those of the first one.
-        count: number of tracks.
         policy: of each run, "last" or "handed_over".
     """
     runs = [open_run(folder) for folder in folders]
@@ -102,10 +101,6 @@ def drive(
 
 def test_tracks(pictures: Sequence[object], folder: Path) -> Sequence[Track]:
     """Return the tracks of the picture of driven lines that the evaluation of a run draws.
-
-    Args:
-        pictures: of the evaluation.
-        folder: of the run, for the message.
 
     Raises:
         UserError: for a run in another world than that of the cones.

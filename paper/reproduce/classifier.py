@@ -208,7 +208,6 @@ def draw_cone_features(
     Args:
         features: [N, 3], see `coil_rl.envs.robot.FEATURES`.
         thick: [N], whether each cluster is a thick cone.
-        path: of the picture.
         wrong: [N], whether each cluster is classified wrongly and gets a ring; by default none.
         title: above the picture.
     """
@@ -245,7 +244,6 @@ def _draw_directions(axes: Axes, directions: Array, upper_right: Array) -> None:
     """Draw an arrow for each feature near the upper right corner, which has few clusters.
 
     Args:
-        axes: of the picture.
         directions: [F, 2], the direction of each feature.
         upper_right: [2], the largest coordinates of the clusters.
     """

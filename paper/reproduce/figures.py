@@ -82,7 +82,6 @@ def _lines(
     """Return the options of matplotlib for the line of each series.
 
     Args:
-        names: of all series.
         configured: by name of a series a colour and options; the others get a strong colour.
     """
     lines: dict[str, dict[str, Any]] = {}
@@ -136,16 +135,14 @@ def _term(ppo: PPO, rows: TensorDictBase, advantage: float) -> tuple[float, floa
     """Return the ratio, the value and the slope of the first of two terms of PPO's objective.
 
     Args:
-        ppo: the learner.
         rows: two rows of a batch; the second one has the ratio 1 and the opposite advantage.
         advantage: of the first row, 1 or -1.
     """
     losses = ppo.losses(rows)
     slope = torch.autograd.grad(losses["loss_objective"], rows["action_log_prob"])[0]
-    losses = losses.detach()
     # Standardised, the advantages are 1 / sqrt(2) and its opposite.
-    gain = advantage - 2 * math.sqrt(2) * float(losses["loss_objective"])
-    return 2 * float(losses["mean_ratio"]) - 1, gain, float(slope[0])
+    gain = advantage - 2 * math.sqrt(2) * float(losses["loss_objective"].detach())
+    return float(losses["log_ratio"][0].detach().exp()), gain, float(slope[0])
 
 
 class OnTheWay(Drawing):

@@ -56,7 +56,6 @@ def certain_verdict(holds: bool, details: str) -> str:
 
     Args:
         holds: whether the claim held up.
-        details: what the cell says about it.
     """
     return f"**{'held up' if holds else 'did not hold up'}**: {details}"
 
@@ -124,9 +123,7 @@ def origin(command: str, commit: str, runs: Sequence[Run] = ()) -> str:
     """Return one line that says how a result was made.
 
     Args:
-        command: the command that made it.
         commit: the commit of the code, as `git describe` names it.
-        runs: the training runs that were used.
     """
     made = f"Made by `{command}` at commit {_commit(commit)}."
     if not runs:
@@ -157,10 +154,8 @@ def all_results(
     Args:
         pages: the page of each result by its name; None if it is not made yet.
         commands: the command of each result by its name.
-        command: the command that makes all results.
         note: the warning in each page, which is given only once; None for none.
         known_problems: sentences on the paper's numbers.
-        not_reproduced: sentences on what is missing.
     """
     split = [_split_claims(text) for text in pages.values() if text is not None]
     claims = []

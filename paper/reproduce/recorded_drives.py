@@ -85,7 +85,6 @@ def measure(recording: Recording, method: str | None = None) -> RecordedDrive:
     """Measure a recorded drive, except for its smoothness.
 
     Args:
-        recording: the drive.
         method: display name of the policy that drove; by default the `policy` in the recording's
             notes, or the file name.
 
@@ -188,7 +187,6 @@ def draw_drives(drives: Sequence[RecordedDrive], path: Path, title: str) -> None
 
     Args:
         drives: the drives, at least one.
-        path: of the picture.
         title: above the picture.
     """
     panels: dict[tuple[str, str], list[RecordedDrive]] = {}

@@ -78,7 +78,6 @@ def check_pools(result: Result, runs: Runs) -> None:
     """Check that runs of one label, of which a result shows means, differ by their seed only.
 
     Args:
-        result: the result.
         runs: the finished runs by experiment.
 
     Raises:
@@ -98,7 +97,6 @@ def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:
     """Return the runs of each label.
 
     Args:
-        labels: the wanted labels.
         runs: the available runs by experiment.
 
     Raises:

@@ -186,7 +186,6 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
     """Return the page of Tables 6 and 7.
 
     Args:
-        rows: the measures of the drives.
         suffix: of the headings, such as " (simulated)".
         max_steering: angle of an action of 1, degrees.
     """
@@ -229,7 +228,6 @@ def _claims(
     """Return the verdicts on the claims of the paper in one world.
 
     Args:
-        table: the line of each policy.
         drives: the measures of the drives by policy and by seed.
     """
     of_seeds = {
@@ -265,10 +263,7 @@ def _claim(
 
     Args:
         by_method: measures by policy and by seed.
-        claim: its text.
-        key: of the measure.
         policy: the policy that is claimed to have more.
-        other: the policy to compare with.
         sign: -1 if it is claimed to have less.
 
     Returns:

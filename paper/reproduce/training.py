@@ -129,9 +129,7 @@ class Figure22(WorldsResult):
     on.
 
     Args:
-        experiments: names of the experiments in the main world, files of `paper/conf/experiment`.
         labels: of the runs to draw, at least one.
-        worlds: the experiments in each variant of the main world by its name; none by default.
     """
 
     def __init__(

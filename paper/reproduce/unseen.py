@@ -213,7 +213,6 @@ def _paper_difference(measure: str, policy: str, other: str, relative: bool) -> 
     """Return the paper's difference between two policies; None if it has not both.
 
     Args:
-        measure: which is compared.
         policy: the first policy.
         other: the second policy.
         relative: whether rewards are divided by the guide's.

@@ -62,11 +62,7 @@ def observations_with_advice(observations: ArrayLike, actions: int) -> Integers:
 
 
 def optimal_guide(mdp: MDP) -> Array:
-    """Return an optimal policy, [S, A] probabilities.
-
-    Args:
-        mdp: the world.
-    """
+    """Return an optimal policy, [S, A] probabilities."""
     return mdp.probabilities(value_iteration(mdp).policy)
 
 
@@ -74,18 +70,13 @@ def noisy_guide(mdp: MDP, noise: float = 0.5) -> Array:
     """Return an optimal policy that sometimes takes a random action, [S, A] probabilities.
 
     Args:
-        mdp: the world.
         noise: the probability of the random action, which is drawn uniformly from all actions.
     """
     return (1 - noise) * optimal_guide(mdp) + noise * random_guide(mdp)
 
 
 def random_guide(mdp: MDP) -> Array:
-    """Return the uniform policy, [S, A] probabilities.
-
-    Args:
-        mdp: the world.
-    """
+    """Return the uniform policy, [S, A] probabilities."""
     return np.full_like(mdp.r, 1 / mdp.r.shape[1])
 
 
@@ -93,8 +84,5 @@ def worst_guide(mdp: MDP) -> Array:
     """Return the policy with the lowest value, [S, A] probabilities.
 
     It is the optimal policy for the negated rewards.
-
-    Args:
-        mdp: the world.
     """
     return optimal_guide(MDP(mdp.P, -mdp.R, mdp.gamma))

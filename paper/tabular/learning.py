@@ -50,9 +50,6 @@ class Simulator:
 
         At the end of an episode the next one begins: then `state` is its start state, and not the
         state that is returned.
-
-        Args:
-            action: index of the action.
         """
         next_state = bisect_right(self._next[self.state][action], self.rng.random())
         reward = self._rewards[self.state][action][next_state]
@@ -85,7 +82,6 @@ def sample_transitions(
     """Sample consecutive transitions of a policy.
 
     Args:
-        mdp: the world.
         policy: actions [S], or their probabilities [S, A].
         steps: N, the number of transitions.
         rng: of the world and of the actions.
@@ -114,11 +110,7 @@ class ModelEstimate:
         self.rewards: Array = np.zeros((states, actions, states))  # sum of their rewards
 
     def add(self, transitions: Transitions) -> None:
-        """Count more transitions.
-
-        Args:
-            transitions: the sampled transitions.
-        """
+        """Count more transitions."""
         index = (transitions.state, transitions.action, transitions.next_state)
         np.add.at(self.counts, index, 1)
         np.add.at(self.rewards, index, transitions.reward)
@@ -193,7 +185,6 @@ def q_learning(
 
     Args:
         mdp: the world; the learner uses its `Simulator` only.
-        steps: number of transitions.
         rng: of the world and of the actions.
         epsilon: probability of a random action, more than 0 and at most 1.
         power: alpha = n ** -power at the n-th visit of (s, a), more than 1/2 and at most 1 (theorem

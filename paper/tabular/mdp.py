@@ -180,9 +180,6 @@ def garnet(
     distribution and a normally distributed reward that does not depend on the next state.
 
     Args:
-        states: number of states.
-        actions: number of actions.
-        rng: of all random numbers.
         branches: number of states to which an action can lead, from 1 to `states`.
         gamma: the discount factor, from 0 to less than 1.
     """

@@ -35,7 +35,6 @@ def policy_evaluation(mdp: MDP, policy: ArrayLike, tolerance: float = 1e-9) -> A
     """Return the value of each state under a policy, by iteration from 0 (algorithm 1).
 
     Args:
-        mdp: the world.
         policy: actions [S], or their probabilities [S, A].
         tolerance: the largest error of V, more than 0.
 
@@ -56,7 +55,6 @@ def solve(mdp: MDP, policy: ArrayLike) -> Array:
     The equations are linear in V, so this needs no iteration.
 
     Args:
-        mdp: the world.
         policy: actions [S], or their probabilities [S, A].
 
     Returns:
@@ -73,7 +71,6 @@ def policy_iteration(
     """Alternate policy evaluation and greedy improvement until the policy is stable (algorithm 2).
 
     Args:
-        mdp: the world.
         policy: actions [S] to begin with; by default the first action everywhere.
         tolerance: the largest error of V in each policy evaluation, more than 0.
 
@@ -101,7 +98,6 @@ def value_iteration(mdp: MDP, tolerance: float = 1e-9) -> PlanningResult:
     """Iterate V <- max over actions of r + gamma P V from 0 until convergence (algorithm 3).
 
     Args:
-        mdp: the world.
         tolerance: the largest error of V, more than 0.
 
     Returns:

@@ -101,12 +101,6 @@ def _changed(part: Any, node: Any, name: str) -> Any:
 def _driver(config: DictConfig, controller: Any, setup: Setup, log: DriveLog) -> LiveDriver:
     """Return the driver.
 
-    Args:
-        config: of the program, with the limits.
-        controller: what drives.
-        setup: what it drives with.
-        log: of the drive.
-
     Raises:
         UserError: for a policy that cannot drive a car by the entries of the cone world.
     """

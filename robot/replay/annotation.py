@@ -55,8 +55,6 @@ def annotate(
     is faded. Metadata and attachments are copied. Equal results make equal bytes.
 
     Args:
-        result: of one recording.
-        path: destination.
         topics: of the recording, copied besides its transforms.
         speed: m/s of the robot, for the commands.
         scale: factor from the robot's metres to those of the cone world.
@@ -160,12 +158,7 @@ def _marker(
 
 
 def foxglove_layout(result: OpenLoop, *, scan: str = SCAN) -> str:
-    """Return the shipped Foxglove layout with the policies, frame and topics of a recording.
-
-    Args:
-        result: of the recording.
-        scan: topic of the LiDAR.
-    """
+    """Return the shipped Foxglove layout with the policies, frame and topics of a recording."""
     text = files("coil_robot.replay").joinpath("foxglove_layout.json").read_text(encoding="utf-8")
     layout: dict[str, Any] = json.loads(text)
     for name, panel in layout["configById"].items():

@@ -10,7 +10,6 @@ def caution(result: OpenLoop, perception: object) -> str:
     """Return a warning if the perception or the commands hardly fit the recording, else nothing.
 
     Args:
-        result: of the recording.
         perception: of the env; only a `Perception` is asked for the clusters.
     """
     view = result.cones, result.count, result.both_valid

@@ -154,7 +154,6 @@ def recorded_steering(
     there are.
 
     Args:
-        recording: a recording with commands.
         speed: m/s of the robot, for a recording without speeds.
         car_length: length L of the robot, m.
         max_steering: radians of an action of 1.
@@ -175,7 +174,6 @@ def _share_beyond(
     """Return the share of the recorded commands that no steering of the robot fulfils.
 
     Args:
-        recording: a recording with commands.
         speed: m/s of the robot, for a recording without speeds.
         car_length: length L of the robot, m.
         max_steering: radians of an action of 1.

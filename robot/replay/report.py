@@ -25,11 +25,7 @@ NOTES = (
 
 
 def describe(result: OpenLoop) -> str:
-    """Return a section of Markdown about one recording.
-
-    Args:
-        result: of the recording.
-    """
+    """Return a section of Markdown about one recording."""
     columns = {
         "policy": ("policy", ""),
         "smoothness": ("smoothness", ".3f"),
@@ -57,9 +53,6 @@ def extent(result: OpenLoop) -> str:
 
     These are the number of scans and of commands, the duration, the rate, the share of scans with
     both boundaries valid, and remarks on the file.
-
-    Args:
-        result: of the recording.
     """
     recording = result.recording
     rate = f", {1 / recording.turn:.1f} a second" if recording.turn else ""
@@ -73,21 +66,13 @@ def extent(result: OpenLoop) -> str:
 
 
 def disagreement(result: OpenLoop) -> pd.DataFrame:
-    """Return the mean |a - b| of each pair of policies, over the scans with both actions.
-
-    Args:
-        result: of the recording.
-    """
+    """Return the mean |a - b| of each pair of policies, over the scans with both actions."""
     actions = pd.DataFrame({name: steering.action for name, steering in result.steering.items()})
     return pd.DataFrame({name: actions.sub(actions[name], axis=0).abs().mean() for name in actions})
 
 
 def outcome(result: OpenLoop) -> str:
-    """Return the extent of the recording, and which policies disagree most.
-
-    Args:
-        result: of the recording.
-    """
+    """Return the extent of the recording, and which policies disagree most."""
     text = f"{result.recording.path}: {extent(result)}"
     distances = disagreement(result)
     pairs = distances.where(np.triu(np.ones(distances.shape, dtype=bool), 1)).stack().dropna()
@@ -102,9 +87,6 @@ def over_time(result: OpenLoop) -> list[dict[str, Any]]:
 
     Its columns are the time (s), whether both boundaries are valid, and the actions and omegas
     (radians/s) of all policies.
-
-    Args:
-        result: of the recording.
     """
     columns: dict[str, Any] = {
         "time": result.recording.seconds,
@@ -123,8 +105,6 @@ def draw_steering(
     Recorded commands are dashed. Scans without both boundaries are grey.
 
     Args:
-        result: of the recording.
-        path: of the picture.
         title: above the picture.
     """
     seconds, invalid = result.recording.seconds, ~result.both_valid

@@ -36,9 +36,6 @@ Act = Callable[[TensorDictBase], Tensor]
 def drawn(measures: Mapping[str, NDArray[np.float64]]) -> Iterator[tuple[str, str, str, str]]:
     """Yield the measures that can be drawn: those that have a picture and any number.
 
-    Args:
-        measures: the values of each measure.
-
     Yields:
         The name of the measure, and title, axis label and file name of its picture.
     """
@@ -53,7 +50,6 @@ def agreement(act: Act, states: TensorDictBase) -> Tensor:
     """Return |a - g_k|, the distance between the action and the advice of each guide.
 
     Args:
-        act: the agent.
         states: [N], with `guide_action` [N, n_guides, A].
 
     Returns:
@@ -75,7 +71,6 @@ def intervention(
     agent's action; 0 if the advice has no influence.
 
     Args:
-        act: the agent.
         states: [N], with `guide_action` [N, n_guides, A].
         donors: number of replacements per state and guide, at least 1.
         generator: of the donors, on the CPU; by default PyTorch's own.
@@ -98,7 +93,6 @@ def gradient(act: Act, states: TensorDictBase) -> Tensor:
     It is 1 if the action is the advice, and NaN without a derivative, as for discrete actions.
 
     Args:
-        act: the agent.
         states: [N], with `guide_action` [N, n_guides, A].
 
     Returns:
@@ -126,9 +120,6 @@ def split_policy(
     policy: TensorDictModuleBase,
 ) -> tuple[TensorDictModuleBase | None, TensorDictModuleBase]:
     """Split a policy into what writes `guide_action` and what reads it.
-
-    Args:
-        policy: the policy of an agent.
 
     Returns:
         The first module of the policy if it writes `guide_action`, else None; and the rest of it.

@@ -38,7 +38,6 @@ def smooth_line(track: Track, spacing: float = 0.25, smoothing: float = SMOOTHIN
     """Return the line half-way between the boundaries, smoothed over single cones.
 
     Args:
-        track: the track.
         spacing: approximate distance between points, m.
         smoothing: standard deviation s of the Gaussian filter, m; a turn of radius R becomes
             s^2 / 2R smaller.
@@ -127,7 +126,6 @@ class WholeEpisode:
         """Draw the mean of each measure against the step.
 
         Args:
-            data: the measures.
             folder: of the pictures and of the numbers, `listening.csv`, which is the last file.
         """
         size = max(1, -(-int(data.step.max() + 1) // POINTS))

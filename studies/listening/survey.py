@@ -94,10 +94,8 @@ def survey(
     Args:
         env: [B], one episode per row.
         policy: the agent, which reads `guide_action`.
-        sections: the division of the episodes.
         evaluation: the cases and the measures of the episodes.
         donors: number of replacements of the advice per state and guide, as for `intervention`.
-        seed: of the donors.
         tick: called at every step.
 
     Raises:
@@ -163,12 +161,7 @@ class Ablation(NamedTuple):
 
 
 def ablations(guides: int, sections: int) -> list[Ablation]:
-    """Return the removal of each guide everywhere and in each section.
-
-    Args:
-        guides: number of guides.
-        sections: number of sections.
-    """
+    """Return the removal of each guide everywhere and in each section."""
     removed = []
     for guide in range(guides):
         removed += [Ablation(guide, section) for section in (None, *range(sections))]
@@ -195,9 +188,7 @@ def drive_ablated(
     Args:
         env: [B]; each ablation gets an equal share of the rows, in order.
         policy: the agent, which reads `guide_action`.
-        sections: the division of the episodes.
         evaluation: the cases and the measures of the episodes.
-        removed: the ablations.
         replacement: what replaces the removed advice, [n_guides, A].
         tick: called at every step.
 
@@ -236,12 +227,6 @@ def table_by_section(
     ablated: Mapping[Ablation, Sequence[Mapping[str, Any]]],
 ) -> list[dict[str, Any]]:
     """Return how much the agent uses each guide everywhere and in each section.
-
-    Args:
-        data: the measures.
-        sections: the division of the episodes.
-        evaluation: the measures of the episodes.
-        ablated: the episodes of each ablation.
 
     Returns:
         Rows with `guide`, `section`, `share` of the states, `agreement`, `intervention`,

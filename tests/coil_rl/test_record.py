@@ -17,19 +17,6 @@ CONTENTS = [
     (record.VERSIONS, {"python": "3.11"}),
     (record.GUIDE_RETURNS, {"guide": 0.1 + 0.2, "guide slow": math.nan}),
     (record.DELIVERY, record.Delivery(policy="last", cases=2, returns={"last": -1e-7})),
-    (
-        record.GUIDE_EPISODES,
-        record.GuideEpisodes(
-            key="k",
-            guides={
-                "guide": record.Driven(
-                    rate=math.nan,
-                    episodes=[record.Episode(case="a", reward=1 / 3, steps=2, crashed=True)],
-                    histories={"pose": [[[1 / 3, 2.0]]]},
-                )
-            },
-        ),
-    ),
 ]
 
 

@@ -79,6 +79,7 @@ def test_every_page_is_in_the_contents():
     assert {page for page in PAGES if page.parent != ROOT} - found - outside == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXECUTED)
 def test_code_runs_as_printed(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

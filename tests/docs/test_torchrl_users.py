@@ -48,6 +48,7 @@ def test_distributed_collector_runs_a_learner(tmp_path):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 3])
 def test_other_blocks_run(number):
     assert run(BLOCKS[number])["env"] is not None

@@ -28,6 +28,7 @@ def outcome(*arguments):
     return done.returncode, done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_results_write_pages_numbers_and_pictures_and_print_the_pages():
     code, out, _ = outcome("table=1", "figure=6", "hydra.run.dir=run")
     files = {path.name for path in Path("run").iterdir()}
@@ -74,6 +75,7 @@ def test_options_reach_the_result_and_the_command_on_its_page():
     assert f"`coil-reproduce all=true budget=paper {everything}` writes this file" in text
 
 
+@pytest.mark.slow
 def test_a_further_result_is_requested_by_its_kind_and_name():
     mine = "+results.figure_of_mine={_target_: coil_paper.reproduce.toymaker.Figure6}"
     code, out, _ = outcome("figure=of_mine", mine, "hydra.run.dir=run")
@@ -81,6 +83,7 @@ def test_a_further_result_is_requested_by_its_kind_and_name():
     assert "Made by `coil-reproduce figure=of_mine" in out
 
 
+@pytest.mark.slow
 def test_results_md_collects_all_results_made_so_far():
     assert outcome("table=1", "budget=smoke")[0] == 0
     first = Path("outputs/reproduce/smoke/table_1.md").read_text()
@@ -92,6 +95,7 @@ def test_results_md_collects_all_results_made_so_far():
     assert "- `coil-reproduce table=4 budget=smoke`" in text.split("## Not made yet")[1]
 
 
+@pytest.mark.slow
 def test_table_7_is_an_alias_of_table_6_and_recordings_need_no_runs():
     circle(Path("mine.mcap"), scans=250, odometry=True, commands=True)
     arguments = ["table=[6,7]", "results.table_6.recordings=[mine.mcap]"]

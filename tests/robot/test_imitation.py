@@ -52,6 +52,7 @@ def table(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_recorded_steering_is_learned_and_the_imitation_drives(folder):
     done = trained(folder, "recording=[a.mcap,b.mcap,c.mcap]", "hydra.run.dir=three")
     assert "a.mcap: 33 of 33 scans are learned; left out: 0 without" in done.stdout
@@ -99,6 +100,7 @@ def test_data_set_is_the_first_round_of_dagger(folder):
     assert [float(row["learner/samples"]) for row in rows[1:]] == [76.0, 86.0]
 
 
+@pytest.mark.slow
 def test_a_second_pass_and_further_rows_teach_nothing_new(folder):
     words = ["recording=[a.mcap,b.mcap]", "budget.num_envs=3", "budget.frames=198"]
     done = trained(folder, *words, "hydra.run.dir=more")
@@ -109,6 +111,7 @@ def test_a_second_pass_and_further_rows_teach_nothing_new(folder):
     assert (folder / "more" / "evaluation.md").exists()
 
 
+@pytest.mark.slow
 def test_run_is_evaluated_and_replayed_like_any_other(folder):
     trained(folder, "recording=[a.mcap,b.mcap]", "hydra.run.dir=again")
     called("evaluate", "run=again", "hydra.run.dir=evaluated", cwd=folder)
@@ -117,6 +120,7 @@ def test_run_is_evaluated_and_replayed_like_any_other(folder):
     assert "| oil " in called("replay", *arguments, cwd=folder).stdout
 
 
+@pytest.mark.slow
 def test_python_gives_the_same_run_as_the_command(folder, monkeypatch):
     monkeypatch.chdir(folder)
     trained(folder, "recording=[a.mcap,b.mcap]", "hydra.run.dir=command")

@@ -67,6 +67,7 @@ def test_steps_that_nobody_can_imitate_are_learned_as_ppo_does():
     assert losses["weight"] < 1e-3
 
 
+@pytest.mark.slow
 def test_imitator_learns_from_the_guide_alone_and_tells_what_it_can_predict():
     advisor, rollout = make(learning_rate=1e-2)
     data = torch.cat([advisor.prepare(rollout.collect(), 0.0) for _ in range(4)])

@@ -35,6 +35,7 @@ def compared(tmp_path_factory):
     return folder, done
 
 
+@pytest.mark.slow
 def test_table_has_everything_that_acts(compared):
     folder, _ = compared
     rows = {row["policy"]: row for row in rows_of(folder / "compare.csv")}
@@ -48,6 +49,7 @@ def test_table_has_everything_that_acts(compared):
     assert float(rows["guide"]["worst"]) <= float(rows["guide"]["return"])
 
 
+@pytest.mark.slow
 def test_it_says_before_what_it_runs_and_how_to_go_on(compared):
     folder, done = compared
     assert "trainings of 128 frames each" in done.stderr
@@ -56,6 +58,7 @@ def test_it_says_before_what_it_runs_and_how_to_go_on(compared):
     assert shlex.quote(f"folder={folder}") in done.stderr
 
 
+@pytest.mark.slow
 def test_verdict_is_a_file_for_programs(compared):
     folder, _ = compared
     found = json.loads((folder / "verdict.json").read_text())
@@ -66,6 +69,7 @@ def test_verdict_is_a_file_for_programs(compared):
     assert found["command"].startswith("coil-train env=pendulum")
 
 
+@pytest.mark.slow
 def test_page_has_three_sentences_and_a_command_that_composes(compared):
     folder, done = compared
     page = (folder / "compare.md").read_text()
@@ -77,6 +81,7 @@ def test_page_has_three_sentences_and_a_command_that_composes(compared):
     assert coil_rl.compose_train([*words, "run_dir=unused"]).env.id == "Pendulum-v1"
 
 
+@pytest.mark.slow
 def test_folder_is_one_for_reports_by_the_printed_command(compared):
     folder, done = compared
     assert (folder / "compare.png").stat().st_size > 10_000
@@ -88,6 +93,7 @@ def test_folder_is_one_for_reports_by_the_printed_command(compared):
     assert "coil_anchored" in page
 
 
+@pytest.mark.slow
 def test_same_command_goes_on_without_repeating_anything(compared, monkeypatch):
     folder, _ = compared
     before = (folder / "compare.csv").read_text()
@@ -98,6 +104,7 @@ def test_same_command_goes_on_without_repeating_anything(compared, monkeypatch):
     assert "goes on" in done.stderr
 
 
+@pytest.mark.slow
 def test_other_arguments_in_the_same_folder_are_refused(compared):
     folder, _ = compared
     tune = "tune={gain: [0.1, 10, log]}"

@@ -47,6 +47,14 @@ def test_guide_that_is_reversed_is_said_to_be_the_wrong_way_round():
     )
 
 
+@pytest.mark.parametrize(("opposite", "is_reversed"), [(55.2, False), (56.2, True)])
+def test_opposite_must_be_better_by_a_tenth_of_the_way_from_random_to_the_best(
+    opposite, is_reversed
+):
+    found = verdict(entries(guide=50.0, opposite=opposite))
+    assert (found.use == "opposite") == found.wrong_way_round == is_reversed
+
+
 def test_policy_may_be_better_than_the_opposite_of_a_reversed_guide():
     found = verdict(entries(guide=-90.0, opposite=89.0, ppo=0.0, coil_anchored=95.0))
     assert found.use == "coil_anchored"

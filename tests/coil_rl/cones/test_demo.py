@@ -5,6 +5,7 @@ from PIL import Image
 from programs import called
 
 
+@pytest.mark.slow
 def test_picture_shows_one_lap_and_the_program_says_what_comes_next(tmp_path):
     done = called("demo", "picture.png", cwd=tmp_path)
     assert Image.open(tmp_path / "picture.png").width >= 800

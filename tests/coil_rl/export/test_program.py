@@ -19,6 +19,7 @@ def exported(tmp_path_factory):
     return folder, called("export", RUN, *words).stdout
 
 
+@pytest.mark.slow
 def test_export_prints_what_it_does_and_what_comes_next(exported):
     folder, text = exported
     lines = text.strip().splitlines()
@@ -34,6 +35,7 @@ def test_next_step_of_a_guide_outside_is_python():
     assert next_step("RUN", "folder", "outside") == text
 
 
+@pytest.mark.slow
 def test_contract_says_what_the_numbers_mean(exported):
     folder, _ = exported
     contract = json.loads((folder / CONTRACT).read_text("utf-8"))
@@ -51,6 +53,7 @@ def test_contract_says_what_the_numbers_mean(exported):
     assert str(folder) not in json.dumps(contract)
 
 
+@pytest.mark.slow
 def test_evaluation_of_the_file_is_that_of_the_policy(exported, tmp_path):
     folder, _ = exported
     words = ["evaluation.cases=3"]
@@ -65,6 +68,7 @@ def test_evaluation_of_the_file_is_that_of_the_policy(exported, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_file_is_a_guide_of_its_env_only(exported, tmp_path):
     folder, _ = exported
     words = ["guide=exported", f"guide.exported.file={folder}"]

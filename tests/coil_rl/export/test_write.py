@@ -54,6 +54,7 @@ def rooms(count=12):
     return generator.normal([-3, 5], 2, (count, 2)).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_torch_guide_with_memory_is_inside(tmp_path):
     guide = "thermostat.control:BatchedPI"
     run, policy = exported(tmp_path, "coil", "learner.normalise=true", guide=guide)
@@ -89,7 +90,8 @@ def test_python_guide_that_the_policy_does_not_read_is_absent(tmp_path, capsys):
     same_actions(run, policy, rooms())
 
 
-@pytest.mark.parametrize("guide", [pytest.param("PI", marks=pytest.mark.slow), "proportional"])
+@pytest.mark.slow
+@pytest.mark.parametrize("guide", ["PI", "proportional"])
 def test_guide_that_was_handed_over_is_said_to_be_no_policy(guide, tmp_path, capsys):
     folder = learned(
         tmp_path / "run", "coil", "delivery=tested", guide=f"thermostat.control:{guide}"
@@ -107,6 +109,7 @@ def test_guide_that_was_handed_over_is_said_to_be_no_policy(guide, tmp_path, cap
     assert "itself" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_first_policy_that_was_handed_over_is_said_to_have_learned_nothing(tmp_path, capsys):
     folder = learned(tmp_path / "run", "coil_anchored", guide="thermostat.control:proportional")
     report = json.loads((folder / "delivery.json").read_text())
@@ -145,12 +148,13 @@ def test_memory_of_a_policy_goes_in_and_out(method, tmp_path):
     assert policy.act(rooms(1)[0]) == action
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("guide", "place", "reason"),
     [
         ("proportional", "inside", ""),
-        pytest.param("PI", "outside", "Python object", marks=pytest.mark.slow),
-        pytest.param("KnowsTheDay", "outside", "draws|Python|beside", marks=pytest.mark.slow),
+        ("PI", "outside", "Python object"),
+        ("KnowsTheDay", "outside", "draws|Python|beside"),
     ],
 )
 def test_place_of_a_guide_depends_on_what_it_is(guide, place, reason, tmp_path):
@@ -232,12 +236,13 @@ def test_delayed_advice_is_refused(tmp_path):
         coil_rl.export_policy(run, tmp_path / "exported", observations=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "guide", "observed"),
     [
         ("ppo", None, "last_action"),
         # The memory of this guide reads the executed action.
-        pytest.param("residual", "BatchedPI", "guide_action,last_action", marks=pytest.mark.slow),
+        ("residual", "BatchedPI", "guide_action,last_action"),
     ],
 )
 def test_last_actions_of_the_agent_go_in_and_out(method, guide, observed, tmp_path):
@@ -275,6 +280,7 @@ def test_wrong_file_is_not_written(tmp_path, monkeypatch):
     assert not (tmp_path / "exported").exists()
 
 
+@pytest.mark.slow
 def test_files_hold_no_path_of_this_machine(tmp_path):
     _, policy = exported(tmp_path, "ppo")
     folder = policy.file.parent

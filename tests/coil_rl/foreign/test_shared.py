@@ -113,6 +113,23 @@ def test_network_that_rounds_differently_in_a_batch_is_none_of_these():
     assert found == expected
 
 
+class Beside(nn.Module):
+    """Gives a row another number in a batch than alone."""
+
+    def __init__(self, share):
+        super().__init__()
+        self.share = share
+
+    def forward(self, observation):
+        return observation * (1 + self.share * (len(observation) > 1))
+
+
+def test_a_percent_of_the_largest_number_is_rounding_and_more_is_a_mixture_of_rows():
+    advice(ControllerGuide(Beside(0.009)), [1.0, -0.5])
+    with pytest.raises(ForeignError, match="mixes the rows"):
+        advice(ControllerGuide(Beside(0.012)), [1.0, -0.5])
+
+
 @pytest.mark.parametrize("network", [False, True])
 def test_check_asks_ever_more_rarely(network):
     asked = []

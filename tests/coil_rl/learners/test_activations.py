@@ -48,6 +48,7 @@ def test_gradients_of_first_and_second_order_are_those_of_tanh():
     torch.testing.assert_close(leaf.grad, 1 - before.tanh().square())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [PPO, TRPO, SAC])
 def test_a_learner_with_fast_tanh_begins_and_learns_as_with_tanh(kind):
     weights = []

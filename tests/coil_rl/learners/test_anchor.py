@@ -10,7 +10,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Anchor, Gru, Reinforce
 from coil_rl.learners.anchor import BARS, PROMISING, Hold, StartTest, hold_of
-from coil_rl.learners.sampling import UNCLIPPED
+from coil_rl.learners.policy import UNCLIPPED
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions, Takeover
 from coil_rl.transforms.action_space import ActionSpace
@@ -307,6 +307,7 @@ def test_only_what_is_ahead_in_every_case_goes_on():
     assert cases.steps == 2 * 100 * max(BARS) + 2 * 100, "the guide in the first two cases only"
 
 
+@pytest.mark.slow
 def test_useless_guides_are_rarely_held():
     """The rates of error of the bars are 0.5 % to 1 % for each of two candidates and four looks."""
     held = 0

@@ -106,6 +106,7 @@ def test_log_probability_is_that_of_pytorch(name, squash):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["matrix", "float64", "multi_categorical", "categorical_column", "binary"]
 )

@@ -9,7 +9,6 @@ import worlds
 from any_env import AnyEnv
 from hydra import compose, initialize_config_module
 from run_folders import make_untrained_run
-from slow import some_fast
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, Unbounded
 from torchrl.envs import Compose, RewardSum, TransformedEnv
@@ -121,6 +120,7 @@ def share_of_right_answers(policy):
     return (evaluate_policy(around(Recall(200, seed=1), Gru(state=16)), policy).mean_reward + 1) / 2
 
 
+@pytest.mark.slow
 def test_policy_with_a_memory_solves_what_needs_one_and_one_without_cannot():
     check_env(Recall(4))
     assert share_of_right_answers(learnt(Gru((16,), state=16), updates=15)) > 0.95
@@ -255,7 +255,8 @@ def composed(folder, *overrides, name="train"):
         return compose(name, [*overrides, f"run_dir={folder}"])
 
 
-@pytest.mark.parametrize("method", some_fast(["ppo", "coil", "jump_start"], ["ppo"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["ppo", "coil", "jump_start"])
 def test_run_resumes_to_the_bit_and_is_evaluated_in_a_new_env(method, tmp_path):
     run, stopped = tmp_path / "run", tmp_path / "stopped"
     config = composed(run, *TINY, "network=gru", f"method={method}")

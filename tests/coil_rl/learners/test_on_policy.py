@@ -70,6 +70,7 @@ def test_state_contains_everything_the_next_update_depends_on(kind):
     assert torch.equal(weights(first), weights(second))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LEARNERS)
 @pytest.mark.parametrize("make", [partial(JumpStart, 0, random=True), partial(Takeover, 0.0)])
 def test_guide_that_never_acts_changes_no_bit(kind, make):
@@ -99,6 +100,7 @@ def test_only_the_critic_learns_from_steps_of_the_guide(kind):
         assert all(torch.equal(old, new) != changes for old, new in zip(*nets, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [PPO, A2C, TRPO])
 def test_large_kickstart_loss_makes_the_policy_imitate_the_guide(kind):
     torch.manual_seed(0)

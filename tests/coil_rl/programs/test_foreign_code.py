@@ -186,6 +186,7 @@ class Model:
         return np.float32(-observation[:1]), state
 
 
+@pytest.mark.slow
 def test_model_of_another_library_is_a_guide_in_one_line(tmp_path):
     words = [word for word in TINY[1:] if not word.startswith(("hydra", "budget.frames"))]
     words.append("evaluation.gif=false")
@@ -199,6 +200,7 @@ def test_model_of_another_library_is_a_guide_in_one_line(tmp_path):
     assert (table["driver"] == "guide").any()
 
 
+@pytest.mark.slow
 def test_run_and_resume_take_one_spelling(tmp_path):
     words = [word for word in TINY if not word.startswith("hydra")]
     words += ["method=ppo", "env.id=odd_plants:Plant", "evaluation.gif=false", "existing=resume"]

@@ -121,11 +121,11 @@ def refusal(name, *arguments):
             "device=cuda compile=true",
             "compile=true is for the CPU only, not for device=cuda; take compile=false",
         ),
-        ("preset.rate=1e23", "env: rate=1e+23 must be more than 0 and at most 1000"),
-        ("env.time_limit=1e300", "env: time_limit=1e+300 must be more than 0 and at most 1000000"),
+        ("preset.rate=1e23", "env: rate=1e+23 must be at most 1000"),
+        ("env.time_limit=1e300", "env: time_limit=1e+300 must be at most 1000000"),
         (
             "env.laps=999999999999999999",
-            "env: laps=999999999999999999 must be more than 0 and at most 1000000",
+            "env: laps=999999999999999999 must be at most 1000000",
         ),
         (
             "learner.hidden=[99999999]",
@@ -639,10 +639,10 @@ VALUES = st.sampled_from(JUNK) | st.text(max_size=8).filter(lambda text: "\0" no
 
 
 # All examples of a test share its folder.
-@pytest.mark.parametrize("examples", [10, pytest.param(150, marks=pytest.mark.slow)])
-def test_any_value_is_accepted_or_refused_in_one_sentence(started, examples):
+@pytest.mark.slow
+def test_any_value_is_accepted_or_refused_in_one_sentence(started):
     @settings(
-        max_examples=examples, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow]
+        max_examples=150, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow]
     )
     @given(
         key=st.sampled_from(LEAVES) | st.sampled_from(LEAVES).map(lambda key: key + "x"),

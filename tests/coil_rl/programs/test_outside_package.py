@@ -91,6 +91,7 @@ def test_batched_env_is_the_same_room(installed):
         assert state["info", "in_band"][1].item() == info["in_band"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", ["room", "rooms"])
 def test_run_has_cases_measures_and_a_line_of_the_guide(env, runs):
     file = runs / env / "evaluation.csv"
@@ -108,6 +109,7 @@ def test_run_has_cases_measures_and_a_line_of_the_guide(env, runs):
     assert table(runs / env / "metrics.csv")[-1]["frames"] == 192
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", ["room", "rooms"])
 def test_finished_run_is_evaluated_and_listened_to_without_its_yaml_files(
     env, runs, installed, tmp_path
@@ -148,6 +150,7 @@ def test_each_kind_of_controller_is_a_guide(guide, at_least, installed, tmp_path
     assert at_least < mean["reward"] < 90
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command", [["evaluate", "run=run"], ["listen", "run=run"], ["train", "resume=run"]]
 )
@@ -160,6 +163,7 @@ def test_package_that_is_not_declared_is_refused_by_name(command, runs, tmp_path
     assert "allow it with trust=[thermostat] on the command line" in stderr
 
 
+@pytest.mark.slow
 def test_package_that_is_not_declared_can_be_trusted(runs, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(SOURCE)
     trusted = ["trust=[thermostat]", "evaluation.repeats=1", "hydra.run.dir=again"]

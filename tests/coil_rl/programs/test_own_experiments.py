@@ -125,6 +125,7 @@ def test_own_file_that_overrides_a_group_of_another_env_is_named(tmp_path):
     assert "Could not override 'track'. No match in the defaults list" in refused.stderr
 
 
+@pytest.mark.slow
 def test_sweep_says_its_runs_and_frames_and_then_trains(tmp_path):
     words = ["+experiment=coil_vs_ppo", "guide=controller", *ENV, *TINY]
     words += ["budget.frames=256", "budget.minibatches=4", "evaluation.curve.points=1", "seed=0"]

@@ -60,6 +60,7 @@ def test_folder_of_hydra_is_refused_where_files_go_elsewhere(sweep, name, argume
     assert all_files() == before
 
 
+@pytest.mark.slow
 def test_files_have_full_precision(sweep):
     report("folder=sweep", "actions=both")
     rows = {
@@ -82,6 +83,7 @@ def test_files_have_full_precision(sweep):
     assert text.index("## Deterministic actions") < text.index("## Sampled actions")
 
 
+@pytest.mark.slow
 def test_several_folders_make_one_report_in_the_first(sweep):
     rows = driven("guide", {"a": 500.0, "b": 600.0}) + driven("residual", {"a": 1.0, "b": 2.0})
     make_run(Path("other/run"), "residual", 0, rows)

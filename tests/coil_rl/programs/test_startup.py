@@ -38,9 +38,7 @@ def start(cwd, *commands):
 
 
 # Hydra takes more than a second for each help text.
-@pytest.mark.parametrize(
-    "names", [["train", "report", "demo", "info"], pytest.param(PROGRAMS, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("names", [["train"], pytest.param(PROGRAMS, marks=pytest.mark.slow)])
 def test_help_begins_with_examples_and_imports_nothing_heavy(names, tmp_path):
     results = start(tmp_path, *([name, "--help"] for name in names))
     for name, (code, out, _, heavy) in zip(names, results, strict=True):
@@ -49,6 +47,7 @@ def test_help_begins_with_examples_and_imports_nothing_heavy(names, tmp_path):
         assert out.count(f"\n  coil-{name}") >= 2
 
 
+@pytest.mark.slow
 def test_wrong_override_is_refused_without_heavy_imports(tmp_path):
     commands = [[name, "seeed=1"] for name in PROGRAMS]
     commands += [
@@ -64,6 +63,7 @@ def test_wrong_override_is_refused_without_heavy_imports(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_training_imports_no_library_that_it_does_not_use():
     """Each of these takes half a second or more in every training, and is for something else."""
     script = (

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from programs import called
+from slow import some_fast
 
 from coil_rl import open_run
 from coil_rl.config.parts import env_maker
@@ -59,6 +60,7 @@ def guide_wins(tmp_path_factory):
     return trained(folder, "method=coil", "training.learning_rate=0", ONCE, *disturbed)
 
 
+@pytest.mark.slow
 def test_policies_that_act_alike_have_equal_returns_whatever_disturbs_the_env(guide_wins):
     guide, agent = [
         row
@@ -70,6 +72,7 @@ def test_policies_that_act_alike_have_equal_returns_whatever_disturbs_the_env(gu
     assert len(set(curve) - {"nan"}) == 1 < len(curve)  # no policy learned anything
 
 
+@pytest.mark.slow
 def test_guide_is_handed_over_where_nothing_better_was_learned(guide_wins):
     found = report(guide_wins)
     assert found["policy"] == "guide"
@@ -92,6 +95,7 @@ def test_guide_is_handed_over_where_nothing_better_was_learned(guide_wins):
     assert "whose steps are among their frames: guide 1." in listed
 
 
+@pytest.mark.slow
 def test_controller_of_a_handed_over_guide_does_what_the_guide_does(guide_wins):
     run = open_run(guide_wins)
     controller, env = run.controller(), run.make_env(1)
@@ -101,12 +105,14 @@ def test_controller_of_a_handed_over_guide_does_what_the_guide_does(guide_wins):
     assert not isinstance(run.controller("last").policy, GuideActs)
 
 
+@pytest.mark.slow
 def test_handed_over_guide_is_not_listened_to(guide_wins, tmp_path):
     refused = called("listen", f"run={guide_wins}", cwd=tmp_path, code=2).stderr
     assert "handed over its guide, which uses no advice; write evaluation.policy=last" in refused
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_every_step_is_a_frame_and_the_log_has_the_parts(guide_wins):
     rows = rows_of(guide_wins / "metrics.csv")
     last = {name: float(value) for name, value in rows[-1].items() if name.startswith("frames")}
@@ -149,6 +155,7 @@ def test_earlier_policy_is_compared_where_its_episodes_fit(
     assert ("earlier" in returns) == is_compared
 
 
+@pytest.mark.slow
 def test_run_with_tests_takes_no_more_frames_than_one_without(tmp_path):
     small = ["method=coil_anchored", "budget.frames=700", "budget.num_envs=2"]
     rows = rows_of(trained(tmp_path / "run", ONCE, *small) / "metrics.csv")
@@ -157,6 +164,7 @@ def test_run_with_tests_takes_no_more_frames_than_one_without(tmp_path):
     assert float(rows[-1]["frames"]) <= 700
 
 
+@pytest.mark.slow
 def test_test_at_the_end_is_left_out_where_the_start_test_took_the_frames_of_both(tmp_path):
     small = ["method=coil_anchored", "degrade=[random]", "budget.frames=2400", "budget.num_envs=2"]
     run = trained(tmp_path / "run", ONCE, *small)
@@ -200,6 +208,7 @@ def test_placebo_of_other_rows_always_has_other_rows(frames, tmp_path):
     assert report(run)["cases"] in (2, 4)
 
 
+@pytest.mark.slow
 def test_learned_policy_is_handed_over_where_it_is_better(tmp_path):
     folder = trained(tmp_path / "run", "method=coil", "degrade=[random]", "guide=constant")
     found = report(folder)
@@ -213,7 +222,11 @@ def test_learned_policy_is_handed_over_where_it_is_better(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "method", ["coil", "residual", "residual_coil", "mixing", "jump_start", "policy_decorator"]
+    "method",
+    some_fast(
+        ["coil", "residual", "residual_coil", "mixing", "jump_start", "policy_decorator"],
+        ["residual"],
+    ),
 )
 def test_guide_acts_alone_also_where_actions_are_combined(method):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):

@@ -17,7 +17,7 @@ import coil_rl
 
 METHODS = shipped("method")
 WITHOUT_GUIDE = ("ppo",)
-FAST = ("coil", "residual", "mixing")
+FAST = ("coil", "residual")
 
 TINY = ["budget.num_envs=4", "budget.steps=16", "evaluation.cases=2", "logger=none"]
 TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
@@ -173,7 +173,7 @@ def test_every_method_learns_the_same_in_every_unit_of_the_reward(method, tmp_pa
     "method",
     some_fast(
         ["coil", "residual", "q_filter", "coil_anchored", "rlpd", "cheq", "ibrl", "residual_coil"],
-        ["coil", "residual", "q_filter"],
+        ["residual"],
     ),
 )
 def test_half_bounded_actions_have_equal_digits_wherever_the_bound_is(method, tmp_path):

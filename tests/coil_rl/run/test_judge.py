@@ -6,7 +6,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from coil_rl.config.assemble import about_returns, trial
+from coil_rl.config.assemble import trial
 from coil_rl.config.parts import (
     build_evaluation,
     build_guides,
@@ -19,6 +19,7 @@ from coil_rl.config.parts import (
 from coil_rl.errors import UserError
 from coil_rl.report.pictures import Picture
 from coil_rl.run.judge import evaluate_guides, judge, report_outcome
+from coil_rl.run.reasons import about_returns
 
 TINY = ["env.time_limit=1", "guide=[spline,random]", "run_dir=unused"]
 

@@ -84,7 +84,7 @@ def test_drive_is_determined_by_its_seed(both):
     assert [drive.name for drive in drives] == ["left_0", "right_0", "left_1", "right_1"]
     assert [set(drive.thick.tolist()) for drive in drives] == [{False}, {True}] * 2
     assert not torch.equal(drives[0].ranges, drives[2].ranges)
-    with pytest.raises(ValueError, match="sides='middle' must be one of left, right, both"):
+    with pytest.raises(ValueError, match="sides='middle' must be 'left', 'right' or 'both'"):
         simulated_drive("middle", 0)
 
 

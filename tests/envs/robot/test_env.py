@@ -165,7 +165,7 @@ def test_guide_completes_its_laps_on_tracks_of_both_directions():
         ({"max_steering": 100}, "max_steering="),
         ({"car_length": math.inf}, "car_length="),
         ({"tracks": []}, "tracks is empty"),
-        ({"assignment": "all"}, "assignment='all' must be one of random, drawn, cyclic"),
+        ({"assignment": "all"}, "assignment='all' must be 'random', 'drawn' or 'cyclic'"),
         ({"reward": {"speed": 1.0}}, "reward has no weight"),
     ],
 )

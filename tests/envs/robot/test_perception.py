@@ -192,7 +192,7 @@ def test_scans_are_perceived_independently_in_any_order_of_the_beams():
 def test_invalid_options_are_refused(option):
     with pytest.raises(ValueError, match=f"{next(iter(option))}="):
         Perception(simulated_cone_classifier(), **option)
-    with pytest.raises(ValueError, match="spline='linear' must be one of cubic, quadratic"):
+    with pytest.raises(ValueError, match="spline='linear' must be 'cubic' or 'quadratic'"):
         BoundaryMemory(1, spline="linear")
 
 

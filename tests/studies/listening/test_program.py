@@ -41,6 +41,7 @@ def read_csv(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_listen_prints_the_table_and_writes_maps_and_numbers(runs, tmp_path):
     out, _ = listen(tmp_path, f"run={runs / 'coil'}", *FEW, "hydra.run.dir=out")
     folder = tmp_path / "out"
@@ -53,6 +54,7 @@ def test_listen_prints_the_table_and_writes_maps_and_numbers(runs, tmp_path):
     assert {row["guide"] for row in read_csv(folder / "listening.csv")} == {"spline", "random"}
 
 
+@pytest.mark.slow
 def test_page_of_an_anchored_agent_gives_the_weights_of_its_guides(runs, tmp_path):
     listen(tmp_path, f"run={runs / 'anchored'}", *FEW, "hydra.run.dir=out")
     assert (
@@ -68,6 +70,7 @@ def test_page_of_an_anchored_agent_gives_the_weights_of_its_guides(runs, tmp_pat
     assert everywhere["random"] == 0
 
 
+@pytest.mark.slow
 def test_discrete_actions_are_equal_or_different(runs, tmp_path):
     out, _ = listen(tmp_path, f"run={runs / 'dqn'}", *FEW, "hydra.run.dir=out")
     assert out.splitlines()[-1].startswith(

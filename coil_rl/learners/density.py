@@ -1,0 +1,265 @@
+"""Distributions of actions, written out.
+
+They are light: a rollout and an update of a small network make one in each step, and the objects of
+`torch.distributions` then take longer than the arithmetic. The numbers are the same to the bit.
+TorchRL's losses take them as any other distribution.
+"""
+
+import math
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor
+from torch.distributions import Categorical, kl_divergence
+from torch.distributions import Normal as TorchNormal
+from torch.nn import functional as F
+
+LOG_ROOT = math.log(math.sqrt(2 * math.pi))  # of a normal density
+
+
+class Density(ABC):
+    """A distribution of actions for each row of a batch."""
+
+    @abstractmethod
+    def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return a sample [*batch, *event] and its logarithmic density [*batch].
+
+        Args:
+            noise: standard normal numbers of the shape of an action, which a normal distribution
+                takes; None: new random numbers.
+        """
+
+    @abstractmethod
+    def log_prob(self, sample: Tensor) -> Tensor:
+        """Return the logarithmic density [*batch] of a sample."""
+
+    @abstractmethod
+    def entropy(self) -> Tensor:
+        """Return the entropy [*batch]; where it has no formula, an estimate by one sample."""
+
+    @property
+    @abstractmethod
+    def mode(self) -> Tensor:
+        """The deterministic action."""
+
+    @abstractmethod
+    def divergence(self, other: "Density") -> Tensor:
+        """Return the divergence KL(self || other) [*batch] from a distribution of this kind."""
+
+    def rsample_and_log_prob(self, shape: torch.Size = torch.Size()) -> tuple[Tensor, Tensor]:  # noqa: B008
+        """Return what `draw` does; TorchRL's losses call it so, with an empty shape."""
+        return self.draw()
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The deterministic action, by TorchRL's name."""
+        return self.mode
+
+
+class Normal(Density):
+    """Independent normal numbers.
+
+    Args:
+        loc: means, [*batch, *event].
+        scale: standard deviations, of the same shape.
+        event_dims: number of dimensions of an action.
+    """
+
+    def __init__(self, loc: Tensor, scale: Tensor, event_dims: int) -> None:
+        self.loc, self.scale, self.event_dims = loc, scale, event_dims
+
+    def number(self, noise: Tensor | None) -> Tensor:
+        """Return normal numbers, from given standard normal ones or new ones."""
+        if noise is None:
+            noise = torch.empty(
+                self.loc.shape, dtype=self.loc.dtype, device=self.loc.device
+            ).normal_()
+        return self.loc + noise * self.scale
+
+    def density(self, number: Tensor) -> Tensor:
+        """Return the logarithmic normal density [*batch] of numbers."""
+        squares = -(number - self.loc).square() / (2 * self.scale.square())
+        return self.summed(squares - self.scale.log() - LOG_ROOT)
+
+    def summed(self, values: Tensor) -> Tensor:
+        """Return the sums over the numbers of an action."""
+        return values.flatten(-self.event_dims).sum(-1) if self.event_dims else values
+
+    def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return a sample and its logarithmic density."""
+        number = self.number(noise)
+        return number, self.density(number)
+
+    def log_prob(self, sample: Tensor) -> Tensor:
+        """Return the logarithmic density of a sample."""
+        return self.density(sample)
+
+    def entropy(self) -> Tensor:
+        """Return the entropy."""
+        return self.summed(0.5 + 0.5 * math.log(2 * math.pi) + self.scale.log())
+
+    @property
+    def mode(self) -> Tensor:
+        """The means."""
+        return self.loc
+
+    def divergence(self, other: Density) -> Tensor:
+        """Return KL(self || other); squashing both does not change it."""
+        own, others = (TorchNormal(each.loc, each.scale) for each in (self, other))  # type: ignore[attr-defined]
+        return self.summed(kl_divergence(own, others))
+
+
+class SquashedNormal(Normal):
+    """Independent normal numbers that tanh squashes to the bounds of an action.
+
+    Args:
+        loc: means before squashing, [*batch, *event].
+        scale: standard deviations before squashing.
+        event_dims: number of dimensions of an action.
+        bounds: lower and upper ones, of the shape of an action; None: -1 and 1.
+    """
+
+    def __init__(
+        self,
+        loc: Tensor,
+        scale: Tensor,
+        event_dims: int,
+        bounds: tuple[Tensor, Tensor] | None = None,
+    ) -> None:
+        super().__init__(loc, scale, event_dims)
+        self.bounds = bounds
+
+    def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return a sample and its logarithmic density."""
+        number = self.number(noise)
+        sample = self.squashed(number)
+        if noise is not None:  # as an update computes it, from the sample
+            return sample, self.log_prob(sample)
+        return sample, self.density(number) - self._stretch(number)
+
+    def log_prob(self, sample: Tensor) -> Tensor:
+        """Return the logarithmic density of a sample."""
+        number = self._clamp(self.unit(sample)).atanh()
+        return self.density(number) - self._stretch(number)
+
+    def entropy(self) -> Tensor:
+        """Return an estimate of the entropy by one sample."""
+        return -self.draw()[1]
+
+    @property
+    def mode(self) -> Tensor:
+        """The squashed means."""
+        return self.squashed(self.loc)
+
+    def squashed(self, number: Tensor) -> Tensor:
+        """Return an action from normal numbers."""
+        return self.from_unit(self._clamp(number.tanh()))
+
+    def unit(self, action: Tensor) -> Tensor:
+        """Return an action as numbers between -1 and 1."""
+        if self.bounds is None:
+            return action
+        low, high = self.bounds
+        return (action - (high + low) / 2) / ((high - low) / 2)
+
+    def from_unit(self, unit: Tensor) -> Tensor:
+        """Return an action from numbers between -1 and 1."""
+        if self.bounds is None:
+            return unit
+        low, high = self.bounds
+        return (high + low) / 2 + (high - low) / 2 * unit
+
+    def _stretch(self, number: Tensor) -> Tensor:
+        """Return the logarithmic slope of the squashing at the numbers of an action."""
+        slopes = 2.0 * (math.log(2.0) - number - F.softplus(-2.0 * number))
+        if self.bounds is not None:
+            slopes = slopes + ((self.bounds[1] - self.bounds[0]) / 2).log()
+        return self.summed(slopes)
+
+    def _clamp(self, sample: Tensor) -> Tensor:
+        """Return samples as TorchRL keeps them from the bounds."""
+        limit = 1.0 - torch.finfo(sample.dtype).resolution
+        return sample.clamp(-limit, limit)
+
+
+class Choices(Density):
+    """Independent choices, each as the index of one of several options.
+
+    Args:
+        logits: of the options, [*batch, *event, n].
+        event_dims: number of dimensions of an action; 0: it is one choice.
+    """
+
+    def __init__(self, logits: Tensor, event_dims: int = 0) -> None:
+        self.logits, self.event_dims = logits - logits.logsumexp(-1, keepdim=True), event_dims
+
+    def summed(self, values: Tensor) -> Tensor:
+        """Return the sums over the choices of an action."""
+        return values.flatten(-self.event_dims).sum(-1) if self.event_dims else values
+
+    def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return indices and their logarithmic probability; noise is not for choices."""
+        rows = self.logits.softmax(-1).reshape(-1, self.logits.shape[-1])
+        drawn = torch.multinomial(rows, 1, True).T.reshape(self.logits.shape[:-1])
+        return drawn, self.of_index(drawn)
+
+    def of_index(self, index: Tensor) -> Tensor:
+        """Return the logarithmic probability of indices."""
+        return self.summed(self.logits.gather(-1, index.long().unsqueeze(-1)).squeeze(-1))
+
+    def log_prob(self, sample: Tensor) -> Tensor:
+        """Return the logarithmic probability of a sample."""
+        return self.of_index(sample)
+
+    def entropy(self) -> Tensor:
+        """Return the entropy."""
+        floor = torch.finfo(self.logits.dtype).min
+        return self.summed(-(self.logits.clamp(min=floor) * self.logits.softmax(-1)).sum(-1))
+
+    @property
+    def mode(self) -> Tensor:
+        """The most probable options."""
+        return self.logits.softmax(-1).argmax(-1)
+
+    @property
+    def probs(self) -> Tensor:
+        """The probabilities of the options."""
+        return self.logits.softmax(-1)
+
+    @property
+    def valid(self) -> Tensor:
+        """Whether each logit is that of an option, not padding, [*event, n]."""
+        event = self.logits[(0,) * (self.logits.ndim - self.event_dims - 1)]
+        return event > padding(self.logits.dtype) / 2
+
+    def divergence(self, other: Density) -> Tensor:
+        """Return KL(self || other)."""
+        own, others = (Categorical(logits=each.logits) for each in (self, other))  # type: ignore[attr-defined]
+        return self.summed(kl_divergence(own, others))
+
+
+class OneHotChoice(Choices):
+    """One choice, one-hot.
+
+    Args:
+        logits: of the options, [*batch, n].
+    """
+
+    def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return a one-hot option and its logarithmic probability."""
+        index, log_prob = super().draw(noise)
+        return F.one_hot(index, self.logits.shape[-1]), log_prob
+
+    def log_prob(self, sample: Tensor) -> Tensor:
+        """Return the logarithmic probability of a one-hot option."""
+        return self.of_index(sample.argmax(-1))
+
+    @property
+    def mode(self) -> Tensor:
+        """The most probable option."""
+        return F.one_hot(super().mode, self.logits.shape[-1])
+
+
+def padding(dtype: torch.dtype) -> float:
+    """Return the logit of what is no option: finite, with a probability of exactly 0."""
+    return torch.finfo(dtype).min / 2

@@ -1,0 +1,59 @@
+"""What an update of PPO reports besides its losses: how far the policy moved, what the critic fits.
+
+It is computed at the end for all minibatches together, because single ones take too long.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+SEEN = ("log_ratio", "value", "value_target")  # what the losses of a minibatch return for it
+OF_POLICY = ("clip_fraction", "kl_approx")
+
+
+@torch.no_grad()
+def report_of(steps: Sequence[Mapping[str, Tensor]], clip: Sequence[float]) -> dict[str, float]:
+    """Return the means over the minibatches of what is reported, by TorchRL's names.
+
+    Args:
+        steps: the entries `SEEN` of each minibatch, [N, 1] each; N may differ.
+        clip: bounds of the logarithmic ratio.
+    """
+    of_size: dict[int, list[Mapping[str, Tensor]]] = {}
+    for step in steps:
+        of_size.setdefault(len(step["log_ratio"]), []).append(step)
+    parts = []
+    for group in of_size.values():
+        log_ratio, value, target = (torch.stack([step[name] for step in group]) for name in SEEN)
+        parts.append(of_minibatches(log_ratio, value, target, clip))
+    return {name: float(torch.cat([part[name] for part in parts]).mean()) for name in parts[0]}
+
+
+def of_minibatches(
+    log_ratio: Tensor, value: Tensor, target: Tensor, clip: Sequence[float]
+) -> dict[str, Tensor]:
+    """Return what is reported of some minibatches [S, N, 1], with one number for each."""
+    share = (log_ratio.clamp(*clip) != log_ratio).to(log_ratio.dtype).mean((-2, -1))
+    ratio = log_ratio.exp()
+    return {
+        "clip_fraction": share,
+        "kl_approx": (-log_ratio).mean((-2, -1)),
+        "explained_variance": explained_variance(target, value),
+        "ESS": effective_share(log_ratio.squeeze(-1)),
+        "max_ratio": ratio.amax((-2, -1)),
+        "mean_ratio": ratio.mean((-2, -1)),
+    }
+
+
+def explained_variance(target: Tensor, value: Tensor) -> Tensor:
+    """Return the share of the variance of targets [..., N, 1] that values explain, [..., 1]."""
+    unexplained = torch.var(target - value, correction=0, dim=-2)
+    variance = torch.var(target, correction=0, dim=-2) + torch.finfo(target.dtype).eps
+    return 1.0 - unexplained / variance
+
+
+def effective_share(log_ratio: Tensor) -> Tensor:
+    """Return the effective sample size as a share of all N, [...] from log-weights [..., N]."""
+    size = (2 * log_ratio.logsumexp(-1) - (2 * log_ratio).logsumexp(-1)).exp()
+    return size / log_ratio.shape[-1]
