@@ -189,7 +189,6 @@ def fingerprint(graph: GraphModule, arguments: Sequence[Tensor]) -> str:
     """Return a name for the compiled code of a graph on this machine.
 
     Args:
-        graph: the recorded function.
         arguments: of the shapes for which it is compiled.
     """
     parts: list[Any] = [graph.code, torch.__version__, torch.get_num_threads(), OPTIONS]
@@ -208,9 +207,7 @@ def compile_graph(graph: GraphModule, arguments: Sequence[Tensor], path: Path) -
     """Compile a graph to a library.
 
     Args:
-        graph: the recorded function.
         arguments: of the shapes for which it is compiled.
-        path: of the library.
 
     Raises:
         UserError: if there is no C++ compiler or no place for the library.

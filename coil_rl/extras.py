@@ -6,13 +6,7 @@ from coil_rl.errors import UserError
 
 
 def require(what: str, extra: str, *modules: str) -> None:
-    """Raise a `UserError` that says what to install, if a module is missing.
-
-    Args:
-        what: needs the modules, for the message.
-        extra: of coil-rl, which brings them.
-        modules: their top-level names.
-    """
+    """Raise a `UserError` that says what to install, if a module is missing."""
     missing = [name for name in modules if find_spec(name) is None]
     if missing:
         raise UserError(

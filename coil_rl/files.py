@@ -21,7 +21,6 @@ def read_file(path: str | os.PathLike[str], largest: int) -> bytes:
     """Return the bytes of a file that somebody else may have made.
 
     Args:
-        path: of the file.
         largest: allowed size, in bytes.
 
     Raises:
@@ -36,7 +35,6 @@ def read_text(path: str | os.PathLike[str], largest: int) -> str:
     """Return the text of a file in UTF-8, as `read_file`.
 
     Args:
-        path: of the file.
         largest: allowed size, in bytes.
     """
     return read_file(path, largest).decode("utf-8-sig")
@@ -48,9 +46,6 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Parents are made and an older file is replaced. If the block raises, the temporary file is
     removed.
-
-    Args:
-        path: of the file.
 
     Raises:
         UserError: if there is a folder in its place, or a file in that of a parent.
@@ -90,31 +85,19 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def temporary(path: Path) -> Path:
-    """Return the path beside `path` under which this process makes it.
-
-    Args:
-        path: of the finished file.
-    """
+    """Return the path beside `path` under which this process makes it."""
     return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove the temporary files of killed processes; no other process may be writing there.
-
-    Args:
-        folder: of the files.
-    """
+    """Remove the temporary files of killed processes; no other process may be writing there."""
     for path in folder.iterdir():
         if re.fullmatch(r"\..+\.\d+(\.\w+)?", path.name):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def folder_to_disk(folder: Path) -> None:
-    """Wait until the entries of a folder are on the disk.
-
-    Args:
-        folder: the folder.
-    """
+    """Wait until the entries of a folder are on the disk."""
     if os.name != "nt":  # Windows cannot open a folder
         _to_disk(folder)
 

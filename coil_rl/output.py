@@ -78,7 +78,6 @@ def say(text: str, *, error: bool = False) -> None:
     """Print a text.
 
     Args:
-        text: the text.
         error: whether to print on standard error.
     """
     if _quiet.get():

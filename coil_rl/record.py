@@ -84,7 +84,6 @@ def json_file(name: str, kind: type[T], remedy: str) -> File[T]:
 
     Args:
         name: as of `File`.
-        kind: of its content.
         remedy: as of `File`.
     """
     adapter = TypeAdapter(kind)

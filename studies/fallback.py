@@ -138,12 +138,7 @@ class Fallback(Beside):
 
 
 def check_cases_of_guide(make_env: EnvMaker, folder: Path) -> None:
-    """Raise a `UserError` if there are no cases in which the values of the guide's states are seen.
-
-    Args:
-        make_env: makes the envs of the run.
-        folder: of the run, for the message.
-    """
+    """Raise a `UserError` without cases in which the values of the guide's states are seen."""
     if SELECTION not in make_env.sizes:
         raise UserError(no_effect(folder, f"it has no evaluation.curve.cases.{SELECTION}"))
 
@@ -152,9 +147,7 @@ def critic_beside_guide(env: EnvBase, learner: Learner, folder: Path) -> TensorD
     """Return the critic that decides where the guide acts.
 
     Args:
-        env: of the run.
         learner: of the run, trained or not.
-        folder: of the run, for the message.
 
     Raises:
         UserError: for a run without advice or critic, or whose env does not execute the advice as

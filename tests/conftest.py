@@ -124,20 +124,18 @@ style.RESOLUTION //= 2  # most tests only look whether there is a picture
 
 # The files that take longest, one process each: begun last, one would keep the other waiting.
 LONGEST = [
-    "test_odd_inputs",
     "test_pins",
-    "test_envs",
     "test_mistakes",
-    "test_stopping",
-    "test_gradient",
-    "test_methods",
+    "test_envs",
+    "test_odd_inputs",
     "test_experiment",
-    "test_your_env",
+    "test_stopping",
+    "test_cases",
+    "test_learners",
+    "test_foreign_code",
     "test_compiled",
-    "test_packaging",
+    "test_controller",
     "test_replay",
-    "test_promise",
-    "test_readme",
 ]
 
 

@@ -24,11 +24,7 @@ HELP = """coil-demo: a picture of a trained agent beside its guide, from a shipp
 
 
 def demo(path: Path) -> None:
-    """Drive one lap with a shipped policy and with its guide, and draw both lines.
-
-    Args:
-        path: of the picture.
-    """
+    """Drive one lap with a shipped policy and with its guide, and draw both lines."""
     from coil_rl.cones.lines import draw_lines
     from coil_rl.envs import shipped_track
 
@@ -97,9 +93,6 @@ def _outcome(result: EvaluationResult) -> str:
 
 def target(arguments: Sequence[str]) -> Path:
     """Return the path of the picture.
-
-    Args:
-        arguments: of the command line.
 
     Raises:
         UserError: for anything but nothing or one name that ends with .png.

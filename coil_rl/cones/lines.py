@@ -179,7 +179,6 @@ class _Animation:
         self.times = np.linspace(0, duration, count).tolist()
 
     def frames(self) -> Iterator[Image.Image]:
-        """Yield the frames."""
         for time in progress(
             iterable=self.times, desc="animation", unit="frame", leave=False, disable=None
         ):
@@ -209,7 +208,6 @@ def draw_listening_map(
         lines: N driven lines, [T, 2] m each, T at least 1.
         values: by guide, at least one, the values at the points of each line, N times [T]; NaN is
             left out.
-        path: output file.
         label: of the colour bar, measure and unit.
         title: above the map.
     """

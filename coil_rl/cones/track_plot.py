@@ -103,8 +103,6 @@ class TrackPlot:
         """Draw the tracks with some indices side by side.
 
         Args:
-            tracks: all tracks.
-            row: indices of those to draw.
             top: distance to the upper edge of the figure, inches.
         """
         used = self.scale * self._sizes[row, 0].sum()

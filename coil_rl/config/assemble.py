@@ -140,10 +140,6 @@ def load_guides(folder: Path, config: DictConfig) -> Mapping[str, TensorDictModu
     """Return the first guides of a run that trains its guides.
 
     The proxy of a guide takes its place, if there is one.
-
-    Args:
-        folder: of the run.
-        config: of the run.
     """
     guides = build_guides(config)
     for name in guides:

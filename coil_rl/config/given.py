@@ -63,7 +63,6 @@ def kept_objects(config: DictConfig, part: str) -> list[Any]:
     """Return the Python objects that a configuration names, as they were handed over.
 
     Args:
-        config: of a run.
         part: "guide" or "env".
 
     Raises:

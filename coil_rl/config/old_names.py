@@ -27,10 +27,6 @@ GONE = {
 def renamed(node: Any, path: Path) -> Any:
     """Return nested values of a configuration with today's names of parts that moved.
 
-    Args:
-        node: as read from a folder.
-        path: of its file, for the message.
-
     Raises:
         UserError: for a part that no longer exists.
     """
@@ -47,9 +43,6 @@ def with_todays_keys(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return a configuration with today's keys.
 
     `method.run` was called `method.search`, and `evaluation.fallback` was a driver beside.
-
-    Args:
-        values: as read from a folder.
     """
     found = dict(values)
     if isinstance(method := found.get("method"), Mapping) and "search" in method:

@@ -29,7 +29,6 @@ class OwnRun(ABC):
 
         Args:
             config: of the run; it stays as it is.
-            folder: of the run.
         """
         return config
 

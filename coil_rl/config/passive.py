@@ -21,11 +21,7 @@ from coil_rl.run.parts import TRAIN, EnvMaker
 
 
 def passive(config: DictConfig) -> Any:
-    """Return the class of an env that does not react to actions; None for any other env.
-
-    Args:
-        config: with the env.
-    """
+    """Return the class of an env that does not react to actions; None for any other env."""
     try:
         kind = hydra.utils.get_object(str(config.env.get("_target_", "")))
     except Exception:  # who builds it says what is wrong
@@ -35,10 +31,6 @@ def passive(config: DictConfig) -> Any:
 
 def check_passive(config: DictConfig, make_env: EnvMaker) -> None:
     """Check a training in an env that does not react, and print what there is to learn from.
-
-    Args:
-        config: of a training.
-        make_env: makes its env.
 
     Raises:
         UserError: for a method that needs the effect of its actions, for a budget that does not

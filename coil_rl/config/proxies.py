@@ -74,12 +74,7 @@ def _drawn_anew(nodes: Mapping[str, Any], seed: int) -> dict[str, Any]:
 
 
 def _hash_of_user(config: DictConfig, name: str) -> list[str]:
-    """Return a hash of what is a user's in a guide and an env; none if there is nothing.
-
-    Args:
-        config: of the proxy.
-        name: of the guide.
-    """
+    """Return a hash of what is a user's in a guide and an env; none if there is nothing."""
     guide = config.guide[name]
     things = kept_objects(config, "env")
     if find_target(guide.get("_target_"), f"guide.{name}") is ControllerGuide:
@@ -94,8 +89,6 @@ def distil(config: DictConfig, folder: Path, run: Callable[[DictConfig], float])
     """Put a proxy of each guide without parameters into the folder of a run, unless it is there.
 
     Args:
-        config: of the run.
-        folder: of the run.
         run: does the run of a proxy, or finishes it.
 
     Returns:
@@ -114,7 +107,6 @@ def frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> int:
     """Return the frames that the proxies of the guides of a run take.
 
     Args:
-        config: of the run.
         guides: names of the guides that get a proxy.
     """
     return sum(frames_of(config.proxy.budget) for _ in guides)

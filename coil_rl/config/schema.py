@@ -389,7 +389,6 @@ def default_method(env: str, guide: Any) -> str:
     """Return the method of a run whose command names none.
 
     Args:
-        env: name of the file in conf/env.
         guide: name of the file in conf/guide, or several of them.
     """
     own = any(env == world or env.startswith(f"{world}_") for world in OWN_WORLDS)

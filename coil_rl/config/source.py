@@ -82,7 +82,6 @@ def code_of_user(config: DictConfig, keys: Iterable[str]) -> list[str]:
     """Return the identity of each class and function of the user that a configuration names.
 
     Args:
-        config: the configuration.
         keys: parts of it to look at, among them `env`, whose id may be registered with Gymnasium.
     """
     parts = OmegaConf.masked_copy(config, list(keys))

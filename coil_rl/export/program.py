@@ -39,8 +39,6 @@ def next_step(run: str, folder: str, guide: str) -> str:
     """Return what to type after an export.
 
     Args:
-        run: that was exported.
-        folder: of the files.
         guide: its place, "inside", "outside" or "absent".
     """
     if guide == "outside":

@@ -432,7 +432,6 @@ class Actions:
 
         Args:
             action: what the controller gave; the bounds of real numbers are not checked.
-            place: of the controller, for the message.
 
         Raises:
             ForeignError: for what is no action of the env.
@@ -496,12 +495,7 @@ class Codec:
         return [entry(observation) for entry in self.entries]
 
     def check_same(self, env: Env, row: int) -> None:
-        """Raise a `ValueError` for an env whose spaces are others.
-
-        Args:
-            env: of another row.
-            row: its number.
-        """
+        """Raise a `ValueError` for an env whose spaces are others."""
         for which in ("action_space", "observation_space"):
             if env is not self.env and getattr(env, which) != getattr(self.env, which):
                 raise ValueError(

@@ -284,8 +284,6 @@ def _of_model(model: Any, title: str, keys: list[NestedKey] | None) -> PerRow:
     """Return the guide of a trained model with `predict`, which has no state of its own.
 
     Args:
-        model: the model.
-        title: name of the model, for messages.
         keys: entries to read; None for those of the model's observation space.
     """
     parts = getattr(getattr(model, "observation_space", None), "spaces", None)
@@ -319,12 +317,7 @@ def _copy_of(module: nn.Module, title: str) -> nn.Module:
 
 
 def _parts_of(key: NestedKey, entry: TensorDictBase) -> str:
-    """Return the error message for a key that stands for several entries.
-
-    Args:
-        key: of the entry.
-        entry: the entries inside it.
-    """
+    """Return the error message for a key that stands for several entries."""
     inner = entry.keys(include_nested=True, leaves_only=True)
     names = [written_key(unravel_key((key, part))) for part in inner]
     return (
@@ -334,11 +327,7 @@ def _parts_of(key: NestedKey, entry: TensorDictBase) -> str:
 
 
 def load(of: str) -> Any:
-    """Return what is named by `MODULE:NAME`; raises a `ValueError` if it cannot be imported.
-
-    Args:
-        of: the name.
-    """
+    """Return what is named by `MODULE:NAME`; raises a `ValueError` if it cannot be imported."""
     module, _, names = of.partition(":")
     if not module or not names:
         raise ValueError(f"of={of} must be MODULE:NAME, such as my_package.control:MyPID")

@@ -95,7 +95,6 @@ def one_number(value: Any, what: str) -> float:
     """Return one number.
 
     Args:
-        value: what came.
         what: name of the number, for the message.
 
     Raises:
@@ -119,7 +118,6 @@ def flag(value: Any, what: str) -> bool:
     """Return a flag.
 
     Args:
-        value: what came.
         what: name of the flag, for the message.
 
     Raises:
@@ -135,9 +133,6 @@ def flag(value: Any, what: str) -> bool:
 
 def action_array(value: Any) -> NDArray[Any]:
     """Return an action of a controller as an array of at least one dimension.
-
-    Args:
-        value: what the controller returned.
 
     Raises:
         ForeignError: for what is not numbers, or not finite; also for an action with a state, as

@@ -152,7 +152,6 @@ def maker_beside(thing: Any, name: str, env: Any) -> Callable[[], Any]:
     Args:
         thing: a class, made as `THING(env)`; a function, called as `THING(env, observation)`; an
             object with `act`, or a trained model, which do not get the env.
-        name: of the controller, for messages.
         env: beside which it acts.
 
     Raises:
@@ -249,7 +248,6 @@ def check_call(
 
     Args:
         function: the function or class.
-        title: its name, for the message.
         entries: positional arguments, by the name of what they hold.
         options: arguments by name.
     """

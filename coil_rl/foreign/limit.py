@@ -80,10 +80,7 @@ def warn_of_limit(
     """Warn that the episodes of an env are truncated.
 
     Args:
-        name: of the env.
         limit: the number of steps.
-        wrapper: what could have ended the episode.
-        remedy: how to set another limit.
     """
     warnings.warn(
         f"an episode of the env {name} did not end within {limit:,} steps, and no {wrapper} ends "

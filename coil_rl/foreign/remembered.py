@@ -21,9 +21,6 @@ def maker_of_rows(thing: Any) -> partial[Any]:
     """Return a function that makes a copy of an object with `act`, for one row of the env.
 
     Copies of a network share its weights, and are in evaluation mode.
-
-    Args:
-        thing: the object.
     """
     if not isinstance(thing, nn.Module):
         return partial(copy.deepcopy, thing)
@@ -41,10 +38,6 @@ def state_of(thing: Any, make: Callable[[], Any]) -> dict[str, Any] | None:
     A network whose class leaves `state_dict` to torch may remember something in plain attributes,
     or in buffers that are not persistent. They are part of its state, but for those that cannot be
     saved and are as in a new object, such as a configuration.
-
-    Args:
-        thing: the object.
-        make: makes a new one.
     """
     state: dict[str, Any] = thing.state_dict()
     if not isinstance(thing, nn.Module) or type(thing).state_dict is not nn.Module.state_dict:
@@ -60,12 +53,7 @@ def state_of(thing: Any, make: Callable[[], Any]) -> dict[str, Any] | None:
 
 
 def restore(thing: Any, state: Mapping[str, Any]) -> None:
-    """Give an object with `load_state_dict` what `state_of` returned.
-
-    Args:
-        thing: a new object.
-        state: of one of its class.
-    """
+    """Give an object with `load_state_dict` what `state_of` returned."""
     saved = dict(state)
     plain = saved.pop(PLAIN, {}) if isinstance(thing, nn.Module) else {}
     thing.load_state_dict(saved)

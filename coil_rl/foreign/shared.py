@@ -52,7 +52,6 @@ class SharedCheck:
         Args:
             ask: returns the actions of the controller for entries.
             entries: what it reads, [*batch, ...] each.
-            dims: number of dimensions of the batch.
 
         Raises:
             ForeignError: if the controller remembers or draws something, or mixes the rows.
@@ -95,8 +94,6 @@ class SharedCheck:
 
         Args:
             ask_alone: returns the answer for the first row.
-            actions: those for all rows.
-            batch: of the rows.
         """
         if actions.shape[: len(batch)] != batch:  # refused as an action
             return
@@ -118,14 +115,7 @@ def _numbers(action: Tensor) -> Tensor:
 
 
 def _near(one: Tensor, other: Tensor, tolerance: float, actions: Tensor) -> bool:
-    """Return whether two answers differ by rounding only; true for what is refused as no number.
-
-    Args:
-        one: numbers.
-        other: as many numbers.
-        tolerance: of the largest number.
-        actions: further numbers, for their size.
-    """
+    """Return whether two answers differ by rounding only; true for what is refused as no number."""
     numbers = torch.cat([one, other, actions])
     if not numbers.isfinite().all():
         return True
@@ -317,7 +307,6 @@ class FunctionGuide(_Shared):
         Args:
             rows: entries of the rows, [n, ...].
             alone: the action of each row alone, [n, A].
-            order: of the rows.
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of NumPy, which gets tensors here
@@ -333,7 +322,6 @@ class FunctionGuide(_Shared):
         """Return whether an answer for a batch has the form of actions.
 
         Args:
-            together: the answer.
             alone: the action of each row alone, [n, A].
         """
         if together.shape == alone.shape:

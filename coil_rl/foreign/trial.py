@@ -57,11 +57,7 @@ def episodes(env: EnvBase, steps: int = STEPS) -> list[TensorDictBase]:
 
 
 def unrepeated(env: EnvBase) -> NestedKey | None:
-    """Return an entry that differs when an episode is repeated; None if none does.
-
-    Args:
-        env: the env.
-    """
+    """Return an entry that differs when an episode is repeated; None if none does."""
     return difference(*episodes(env))
 
 

@@ -67,9 +67,6 @@ def _spread(pids: Sequence[int]) -> None:
 
     They wait between two steps of the batch, and then the system may wake two of them on one core.
     Fewer processes than cores are left free, because another program may bind its own.
-
-    Args:
-        pids: of the processes.
     """
     if sys.platform != "linux":
         return
@@ -207,9 +204,7 @@ def choose(
     Args:
         workers: as a person gave it: a number, or "auto" for as many as there are cores if a step
             of all rows is long enough.
-        rows: number of rows.
         seconds: gives the duration of a step of one row; None if it cannot be timed.
-        name: of the env, for the log.
         kind: text that tells envs of one name apart.
 
     Raises:
@@ -249,12 +244,7 @@ def choose(
 
 
 def timed(make: MakeRows, draw: Callable[[], Any]) -> float | None:
-    """Return the seconds of a step of one row, measured in a process of its own; None if it fails.
-
-    Args:
-        make: makes the rows of a range.
-        draw: draws an action.
-    """
+    """Return the seconds of a step of one row, timed in a process of its own; None if it fails."""
     pipe, process = _started(_time, make, draw)
     try:
         seconds: float | None = pipe.recv()

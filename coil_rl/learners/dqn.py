@@ -45,8 +45,6 @@ class DQN(OffPolicy):
         epsilon: probability of a random action, a number or a schedule; 0 for deterministic
             actions.
         double: whether the network, not the target network, selects the next action.
-        tau: step of the target networks towards the networks after each minibatch, as a fraction.
-        ratio: how often a step is sampled, on average over the run.
         settings: further ones of `OffPolicy`.
 
     Example:

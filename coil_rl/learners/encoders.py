@@ -100,7 +100,6 @@ class ReadImage(ReadEntry):
 
     Args:
         spec: of the entry, [C, H, W], or [H, W, C] if its last dimension is the smallest.
-        batch_dims: number of batch dimensions of the spec.
         network: has the convolutions.
     """
 

@@ -85,10 +85,8 @@ def extensions_of(
 
     Args:
         env: the env; the rewards of several agents are summed.
-        in_keys: entries that the policy observes.
         scale: of the rewards; None: they stay as they are.
         normaliser: of the policy; None: it has none.
-        auxiliary: extensions that a user adds.
     """
     extensions: list[Extension] = []
     if (reward_key := unravel_key(("next", env.reward_key))) != ("next", "reward"):

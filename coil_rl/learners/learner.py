@@ -56,11 +56,7 @@ class Learner(ABC):
         """Restore a state that `state_dict` returned."""
 
     def callbacks(self, cases: "Cases") -> Sequence["Callback"]:
-        """Return what a run calls between the updates.
-
-        Args:
-            cases: in which policies can be compared.
-        """
+        """Return what a run calls between the updates."""
         return []
 
     def check_batch(self, rows: int, steps: int) -> None:  # noqa: B027  optional
@@ -127,6 +123,5 @@ class Cases(Protocol):
         """Return the returns of policies in the present cases, [C] each.
 
         Args:
-            policies: each writes the action.
             sampled: whether each samples its actions, as in training; None: none does.
         """

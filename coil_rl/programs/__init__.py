@@ -13,12 +13,7 @@ from typing import NoReturn
 
 
 def interrupted(signum: int, frame: FrameType | None) -> NoReturn:
-    """End a program at Ctrl-C during its imports, when no exception can be caught yet.
-
-    Args:
-        signum: number of the signal.
-        frame: that was interrupted.
-    """
+    """End a program at Ctrl-C during its imports, when no exception can be caught yet."""
     os.write(2, f"{Path(sys.argv[0]).stem.removeprefix('coil-')}: interrupted\n".encode())
     os._exit(130)
 

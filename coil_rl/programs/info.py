@@ -17,9 +17,6 @@ HELP = """coil-info: the versions that a bug report needs, or the command that m
 def describe(folder: Path) -> dict[str, str]:
     """Return the command that made a run, and the versions that it was begun with.
 
-    Args:
-        folder: of the run.
-
     Raises:
         UserError: if there is no run, or a file about it is damaged.
     """

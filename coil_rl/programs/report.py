@@ -93,7 +93,6 @@ def report(config: DictConfig) -> None:
 
 
 def _markdown(section: Section) -> str:
-    """Return a section as Markdown."""
     heading = [f"## {section.heading}"] if section.heading else []
     return "\n\n".join([*heading, *map(str, section.blocks)])
 

@@ -50,10 +50,6 @@ def check(config: DictConfig) -> None:
 def resume(folder: Path, frames: int | None = None) -> float:
     """Finish a run that was stopped, or train it for longer, and return the same as `train`.
 
-    Args:
-        folder: of the run.
-        frames: new length of the run.
-
     Raises:
         UserError: for a folder without a run, or one that cannot be resumed or would write outside
             of its folder.

@@ -166,11 +166,7 @@ class Group:
         return count_of_seeds(int((crashed > 0).any(axis=1).sum()), self.seeds)
 
     def has(self, measure: str) -> bool:
-        """Return whether a measure is known in all cases.
-
-        Args:
-            measure: name of the measure.
-        """
+        """Return whether a measure is known in all cases."""
         return measure in self.table and not self.table[measure].isna().to_numpy().any()
 
     def means(self, case: int | None = None) -> dict[str, float]:
@@ -297,7 +293,6 @@ class Comparison:
         With such a measure the number of all episodes is among them.
 
         Args:
-            group: the policy.
             case: index of the only case to count; None for all of them.
         """
         found = [each.counts() for each in self.groups]
@@ -401,11 +396,8 @@ def _variants(
     """Return the agent of a label, with each alteration of its advice, and with a fallback.
 
     Args:
-        label: of the runs.
-        rows: evaluations of the agent.
         references: the rewards that scores are divided by, by cases.
         measures: definitions by name.
-        guide: its best guide.
         needs_guide: whether it needs the guide during evaluation.
     """
     variants = []
@@ -478,7 +470,6 @@ def _loses(rewards: pd.Series, crashed: pd.Series, earned: float) -> bool:
     than all of it.
 
     Args:
-        rewards: of the guide in each case.
         crashed: those of the cases in which it crashes.
         earned: its mean over the cases in which it earns something.
     """
@@ -584,9 +575,5 @@ def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
 
 
 def _is_shared(other: Group) -> bool:
-    """Return whether all seeds are compared with one value: that of a guide without random actions.
-
-    Args:
-        other: the policy they are compared with.
-    """
+    """Return whether all seeds are compared with one value: of a guide without random actions."""
     return other.is_guide and other.seeds is None

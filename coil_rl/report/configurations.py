@@ -53,9 +53,6 @@ MOST_KEYS = 3  # in a label
 def distinguish(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     """Give runs of one label different labels where their configurations differ.
 
-    Args:
-        runs: finished runs.
-
     Returns:
         The runs in their order, and a sentence for each label that was divided.
     """
@@ -78,7 +75,6 @@ def _shown(keys: Sequence[str], configurations: Sequence[list[Any]]) -> list[str
     """Return a text for each configuration; different ones have different texts.
 
     Args:
-        keys: in which the configurations differ.
         configurations: the values of these keys for each run.
     """
     different: list[list[Any]] = []
@@ -96,11 +92,7 @@ def _shown(keys: Sequence[str], configurations: Sequence[list[Any]]) -> list[str
 
 
 def of_several_envs(runs: Sequence[Run]) -> list[str]:
-    """Return a warning if runs are in different envs, whose rewards cannot be compared.
-
-    Args:
-        runs: finished runs.
-    """
+    """Return a warning if runs are in different envs, whose rewards cannot be compared."""
     nodes = [run.settings.get("env") or {} for run in runs]
     names = dict.fromkeys(str(node.get("id") or node.get("_target_")) for node in nodes)
     return REPORT.said("several_envs", names=list(map(_text, names)))
@@ -110,9 +102,6 @@ def of_several_conditions(runs: Sequence[Run]) -> list[str]:
     """Return a warning if runs in one env have another task, other cases or other frames.
 
     What experiments compare, such as the method or the guide, is no such condition.
-
-    Args:
-        runs: finished runs.
     """
     if of_several_envs(runs):
         return []
@@ -128,11 +117,7 @@ def _is_condition(key: str) -> bool:
 
 
 def of_several_definitions(runs: Sequence[Run]) -> list[str]:
-    """Return a warning for each measure that runs define in different ways.
-
-    Args:
-        runs: finished runs.
-    """
+    """Return a warning for each measure that runs define in different ways."""
     labels: dict[str, dict[Measure, str]] = {}
     for run in runs:
         for name, measure in run.measures.items():
@@ -147,7 +132,6 @@ def _telling_first(keys: Sequence[str], configurations: Sequence[Mapping[str, An
     """Return keys, first those whose values distinguish the most configurations.
 
     Args:
-        keys: in which the configurations differ.
         configurations: values by key.
     """
     texts = {key: [repr(values.get(key)) for values in configurations] for key in keys}
@@ -213,11 +197,7 @@ def guide_follows_seed(runs: Sequence[Run]) -> bool:
 
 
 def of_guide(run: Run) -> dict[str, Any]:
-    """Return the values on which the returns of the guides of a run depend, by their full keys.
-
-    Args:
-        run: the run.
-    """
+    """Return the values on which the returns of the guides of a run depend, by their full keys."""
     parts = ("guide", "degrade", *TEST)
     return {
         key: value
@@ -230,7 +210,6 @@ def is_part(key: str, of: Iterable[str]) -> bool:
     """Return whether a key, or a parent of it, is one of some keys.
 
     Args:
-        key: full key of a value.
         of: full keys of values or groups.
     """
     return any(f"{key}.".startswith(f"{each}.") for each in of)
@@ -240,9 +219,6 @@ def relevant(run: Run) -> dict[str, Any]:
     """Return the values on which the numbers of a run depend, by their full keys.
 
     The seed in the path of another run, as in `seed3`, is left out.
-
-    Args:
-        run: the run.
     """
     values: dict[str, Any] = {}
     waiting = [("", run.settings)]

@@ -81,7 +81,6 @@ def draw_guides(axes: Axes, guides: Mapping[str, float]) -> None:
     Their names are beside the plot, where no curve is.
 
     Args:
-        axes: with curves, whose limits are set.
         guides: return by name.
     """
     for (name, value), colour in zip(guides.items(), cycle(style.GUIDES), strict=False):
@@ -118,10 +117,7 @@ def _draw_spread(
     """Draw what the seeds of a label differ by: few as thin lines, more as a band.
 
     Args:
-        axes: of the curves.
-        seeds: the runs of the label.
         curve: their `mean_curve`.
-        colour: of the label.
     """
     if _is_few(seeds):
         for run in seeds:
@@ -196,7 +192,6 @@ def draw_phases(
     Args:
         rows: of `metrics.csv`, at least one.
         guides: names of the guides in the order of the run.
-        path: output file.
         title: above the plot.
     """
     colours = [style.AGENTS[index % len(style.AGENTS)] for index in range(len(guides))]
@@ -262,7 +257,6 @@ def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Arr
 
     Args:
         runs: one run per seed, see `draw_learning_curves`.
-        key: column of the values.
 
     Returns:
         The frames, the mean over the runs, and the low and the high end of its 95 % t interval, [P]
@@ -339,7 +333,6 @@ def points(run: Rows, key: str) -> Array:
 
     Args:
         run: rows of `metrics.csv`.
-        key: column of the values.
     """
     table = np.stack([_column(run, "frames"), _column(run, key)], axis=1)
     known = table[np.isfinite(table).all(axis=1)]

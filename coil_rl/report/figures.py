@@ -34,7 +34,6 @@ def draw_report(
     A label has one colour in all of them.
 
     Args:
-        runs: finished runs.
         compared: the policies, by kind of actions.
         folder: where the files are written.
     """
@@ -111,9 +110,6 @@ def _cases_of_curve(run: Run) -> int | None:
 
 def films(runs: Sequence[Run]) -> list[Figure]:
     """Return the film of the first run of each label that has one, of the first `MAX_FILMS` labels.
-
-    Args:
-        runs: finished runs.
 
     Raises:
         UserError: for a file that is no WebP or GIF picture, or too large.

@@ -24,9 +24,6 @@ Use = Mapping[str, Mapping[str, Sequence[Array]]]
 def guide_use(runs: Sequence[Run]) -> Use:
     """Return what is known of the use of guides, by column and label.
 
-    Args:
-        runs: finished runs.
-
     Returns:
         For each column that any run has, and each label that has it, the points [P, 2] (frames and
         value) of each of its runs. A column with one value, such as a weight that is decided before

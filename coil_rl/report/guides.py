@@ -65,11 +65,7 @@ class Guide:
 
 
 def is_guide(frame: pd.DataFrame) -> pd.Series:
-    """Return whether the policy of each row of an evaluation is a guide.
-
-    Args:
-        frame: the evaluation.
-    """
+    """Return whether the policy of each row of an evaluation is a guide."""
     return frame["driver"].str.split().str[0] == GUIDE
 
 

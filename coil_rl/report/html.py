@@ -76,8 +76,6 @@ def html_page(title: str, sections: Sequence[Section], figures: Sequence[Figure]
     """Return a report as HTML.
 
     Args:
-        title: of the report.
-        sections: its tables and paragraphs.
         figures: its pictures, below the first section.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
@@ -111,9 +109,6 @@ def svg(draw: Callable[[io.BytesIO], None]) -> Markup:
 
 def moving(content: bytes) -> str:
     """Return a moving picture as a `data:` address.
-
-    Args:
-        content: of the file.
 
     Raises:
         ValueError: for anything but a WebP or GIF picture.

@@ -107,7 +107,6 @@ def draw_intervals(
     Args:
         panels: by heading, the rows of each panel; at least one row in all.
         path: output file, or a buffer for an SVG.
-        measure: label of the axis.
         title: above the plot.
     """
     rows = list(itertools.chain.from_iterable(panels.values()))
@@ -146,7 +145,6 @@ def draw_panel(axes: Axes, rows: Mapping[int, Interval]) -> None:
     """Draw rows at their y positions.
 
     Args:
-        axes: of the panel.
         rows: by y position.
     """
     style.lighten(axes, grid="x")

@@ -34,7 +34,6 @@ def section(
     """Return the section for one kind of actions.
 
     Args:
-        comparison: of the policies.
         rows: `comparison.table(against)`.
         against: what the policies are compared with, see `Comparison.table`.
     """
@@ -87,10 +86,6 @@ def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, A
     """Return rows of `Comparison.table` with `score cell`, `cases cell` and `difference cell`.
 
     These cells show the intervals too.
-
-    Args:
-        rows: of the table.
-        spec: format of the scores.
     """
     shown = []
     for row in rows:
@@ -109,9 +104,6 @@ def guide_training(runs: Sequence[Run]) -> list[Table]:
     """Return the table of guides' own returns before and after training.
 
     The list is empty if no guide was trained.
-
-    Args:
-        runs: finished runs.
     """
     rows: list[dict[str, Any]] = []
     columns = {"label": ("guides' own return, before to after", ""), "seeds": ("seeds", "")}
@@ -133,9 +125,6 @@ def training(runs: Sequence[Run]) -> list[Table]:
     """Return the table of evaluation curves, means over seeds.
 
     The list is empty if nothing was trained.
-
-    Args:
-        runs: finished runs.
     """
     rows: list[dict[str, Any]] = []
     for label, of_label in _trained(runs):
@@ -160,8 +149,6 @@ def _mean_of_some(
 
     Args:
         known: numbers of the seeds that have one.
-        seeds: number of all seeds.
-        spec: format of the mean.
         after: a second number of each of these seeds.
     """
     if not known:
@@ -175,7 +162,6 @@ def some_of(reached: int, seeds: int) -> str:
 
     Args:
         reached: number of seeds that the mean is of.
-        seeds: number of all seeds.
     """
     return f" ({reached} of {seeds} seeds)" if reached < seeds else ""
 
@@ -212,9 +198,6 @@ def handed_over(runs: Sequence[Run]) -> list[str]:
     """Return sentences for each label whose runs test at their end what they hand over.
 
     Runs that had no frames left for a test are in a sentence of their own.
-
-    Args:
-        runs: finished runs.
     """
     counts: dict[str, Counter[str]] = {}
     for run in runs:
@@ -225,11 +208,7 @@ def handed_over(runs: Sequence[Run]) -> list[str]:
 
 
 def begun(runs: Sequence[Run]) -> list[str]:
-    """Return a sentence for each label whose runs began with an earlier policy or data.
-
-    Args:
-        runs: finished runs.
-    """
+    """Return a sentence for each label whose runs began with an earlier policy or data."""
     sources: dict[str, dict[str, None]] = {}
     for run in runs:
         if (source := begun_with(run.settings)) is not None:
@@ -241,8 +220,6 @@ def progress(finished: int, started: int, refused: int = 0) -> list[str]:
     """Return a sentence on the runs that the tables leave out.
 
     Args:
-        finished: number of finished runs.
-        started: number of all runs.
         refused: number of jobs of sweeps that were refused or failed.
     """
     return REPORT.said("progress", finished=finished, started=started, refused=refused)
@@ -262,10 +239,8 @@ def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list
     """Return the table of the parts of the reward; no table without such columns.
 
     Args:
-        comparison: of the policies.
         prefix: of the columns, PER_STEP or TERM.
         heading: of the column with the names of the policies.
-        spec: format of the numbers.
     """
     rows: list[dict[str, Any]] = []
     columns = {"driver": (heading, "")}
@@ -282,7 +257,6 @@ def cases_table(groups: Sequence[Group], file: str) -> Block:
     """Return the table of the mean reward by policy and case, with the completed share below 1.
 
     Args:
-        groups: the policies.
         file: name of the file with these numbers, which is named instead if there are many cases.
     """
     names = dict.fromkeys(chain.from_iterable(group.cases for group in groups))

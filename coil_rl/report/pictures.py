@@ -38,7 +38,6 @@ class Picture:
         """See the env after each step; by default do nothing.
 
         Args:
-            env: of the evaluation.
             rows: the row in which each policy drives the first case, of those that still drive.
         """
 

@@ -107,11 +107,7 @@ def read_runs(folders: Sequence[Path]) -> list[Run]:
 
 
 def begun_with(settings: Mapping[str, Any]) -> str | None:
-    """Return which earlier policy or data a run began with; None if it began with neither.
-
-    Args:
-        settings: the configuration of the run.
-    """
+    """Return which earlier policy or data a run began with; None if it began with neither."""
     if init := settings.get("init"):
         return f"the policy of {init}"
     learner = settings.get("learner")
@@ -120,11 +116,7 @@ def begun_with(settings: Mapping[str, Any]) -> str | None:
 
 
 def failed_jobs(folders: Iterable[Path]) -> int:
-    """Return the number of jobs that sweeps in some folders have refused, or that failed.
-
-    Args:
-        folders: the folders, and all in them.
-    """
+    """Return the number of jobs that sweeps in some folders have refused, or that failed."""
     files = {path.resolve() for folder in folders for path in folder.rglob(FAILED_JOBS)}
     count = 0
     for path in sorted(files):
@@ -190,7 +182,6 @@ def _cases_of(rows: Sequence[record.Row], shown: Iterable[str]) -> pd.DataFrame:
     """Return the rows of an evaluation, without those of means.
 
     Args:
-        rows: of evaluation.csv.
         shown: measures that reports show, of which there must be a column.
     """
     import pandas as pd

@@ -31,12 +31,7 @@ class Sentences:
         self.package, self.file = package, file
 
     def said(self, macro: str, /, **values: Any) -> list[str]:
-        """Return the paragraphs of a macro, none if it says nothing.
-
-        Args:
-            macro: its name.
-            values: its arguments.
-        """
+        """Return the paragraphs of a macro, none if it says nothing."""
         text = str(getattr(self._macros, macro)(**values))
         paragraphs = (" ".join(part.split()) for part in re.split(r"\n\s*\n", text))
         return [part for part in paragraphs if part]
@@ -61,7 +56,6 @@ def listed(texts: Iterable[object], most: int = MOST, joint: str = ", ") -> str:
     """Return texts as one, the first ones of many.
 
     Args:
-        texts: to join.
         most: number of the texts that are shown; a single further one is shown, too.
         joint: between them.
     """

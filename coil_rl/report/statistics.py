@@ -38,9 +38,6 @@ class Estimate(NamedTuple):
         """Return mean and interval as a table cell.
 
         It is None if the mean is NaN, and without interval if that is NaN.
-
-        Args:
-            spec: format of the numbers.
         """
         if math.isnan(self.mean):
             return None
@@ -141,7 +138,6 @@ def count_of_seeds(count: int, seeds: int) -> str:
     """Return a number of seeds and the 95 % interval of its share as a table cell.
 
     Args:
-        count: number of seeds with some property.
         seeds: number of all seeds. The interval is that of Clopper and Pearson.
     """
     from scipy import stats

@@ -149,7 +149,6 @@ def picture(
     Args:
         path: output file, whose suffix decides the format; or a buffer for an SVG.
         title: above the legend; None for none.
-        handles: of the legend.
         height: of the figure, inches.
         add_header: whether the height does not count title and legend.
         h_pad: vertical padding of the layout, inches.
@@ -172,7 +171,6 @@ def save(figure: Figure, path: Target) -> None:
     """Write a figure; the file appears whole or not at all.
 
     Args:
-        figure: the figure.
         path: output file, whose suffix decides the format, PNG without a suffix; or a buffer for an
             SVG.
     """
@@ -188,7 +186,6 @@ def lighten(axes: Axes, grid: str = "y") -> None:
     """Remove the upper and right spine and draw a faint grid along one axis.
 
     Args:
-        axes: the axes.
         grid: "y" for horizontal lines, "x" for vertical ones.
     """
     axes.spines[["top", "right"]].set_visible(False)
@@ -201,7 +198,6 @@ def draw_header(figure: Figure, handles: Sequence[Artist], title: str | None) ->
 
     Args:
         figure: 8 inches wide.
-        handles: of the legend.
         title: above the legend; None for none.
 
     Returns:

@@ -146,7 +146,6 @@ def fitted(rows: Rows, columns: Columns) -> dict[str, tuple[str, str]]:
     """Return columns with a number format in place of each `AUTO_FORMAT`.
 
     Args:
-        rows: whose numbers are shown.
         columns: as `markdown_table` takes them.
     """
     specs = _specs(_values(rows, columns), columns)
@@ -194,7 +193,6 @@ def write_csv(rows: Sequence[Mapping[str, object]], path: str | os.PathLike[str]
 
     Args:
         rows: one mapping per line.
-        path: output file.
     """
     with whole_file(path) as unfinished:
         unfinished.write_text(csv_text(rows), encoding="utf-8", newline="")

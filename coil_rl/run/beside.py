@@ -38,19 +38,12 @@ class Beside(ABC):
 
     @abstractmethod
     def check(self, make_env: EnvMaker, learner: Learner, folder: Path) -> None:
-        """Raise a `UserError` for a run whose policy cannot have it, before the training.
-
-        Args:
-            make_env: makes the envs of the run.
-            learner: of the run.
-            folder: of the run, for the message.
-        """
+        """Raise a `UserError` for a run whose policy cannot have it, before the training."""
 
     @abstractmethod
     def driver(self, run: Run, policy: TensorDictModuleBase | None) -> Driver:
         """Return the driver.
 
         Args:
-            run: that is evaluated, with its weights.
             policy: of the run; None for a run without an agent.
         """

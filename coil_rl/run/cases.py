@@ -72,7 +72,6 @@ class TrainingCases:
         An env with their rows is made when a policy acts in them.
 
         Args:
-            count: number of cases.
             copies: number of rows that have each case; row i has case `i % count`. Only an env
                 for which `can_copy` holds has more than one.
         """
@@ -112,7 +111,6 @@ class TrainingCases:
         policy has a memory, and else one after the other.
 
         Args:
-            policies: each writes the action.
             sampled: whether each samples its actions, as in training; None: none does.
         """
         sampled = [False] * len(policies) if sampled is None else sampled
@@ -139,8 +137,6 @@ class TrainingCases:
         """Return a policy with the exploration noise of the training, if it samples its actions.
 
         Args:
-            env: in which it acts.
-            policy: writes the action.
             samples: whether it samples its actions.
             parts: number of equal parts of the rows, on one of which it acts.
         """
@@ -204,7 +200,6 @@ def further_cases(done: int, taken: int, frames: int) -> int:
     They are not more than those so far, because their episodes may be longer.
 
     Args:
-        done: number of cases so far.
         taken: steps of their episodes.
         frames: that the test may take.
     """

@@ -73,9 +73,7 @@ class EvaluationCurve:
         length: evenly from one end to the next.
 
         Args:
-            metrics: the log to fill.
             stages: numbers of updates at which the run ends.
-            frames: of an update.
             before: frames that were taken before the first update.
         """
         self.metrics, self.stages = metrics, list(stages)
@@ -160,7 +158,6 @@ def measures(
 
     Args:
         env: of batch size [B].
-        policy: writes the action.
         cases: number of different cases; row i has case `i % cases`. None: as many as rows.
         watch: further measures, as for `EvaluationCurve`.
         tick: called after every step.

@@ -277,9 +277,7 @@ def policy_of(state: dict[str, Any], learner: Learner, env: EnvBase) -> TensorDi
     """Return the policy that a file of weights stands for: a guide, or a copy of the learner's.
 
     Args:
-        state: of the file.
         learner: has the policy, which stays as it is.
-        env: with the transforms of the run.
     """
     guide = guide_of(state, env)
     if guide is not None:
@@ -290,10 +288,5 @@ def policy_of(state: dict[str, Any], learner: Learner, env: EnvBase) -> TensorDi
 
 
 def guide_of(state: Mapping[str, Any], env: EnvBase) -> GuideActs | None:
-    """Return the guide that a file of weights stands for; None for a file of a policy.
-
-    Args:
-        state: of the file.
-        env: with the transforms of the run.
-    """
+    """Return the guide that a file of weights stands for; None for a file of a policy."""
     return GuideActs(env, int(state[GUIDE])) if GUIDE in state else None

@@ -214,7 +214,6 @@ def _within(measure: Measure, numbers: Tensor, counts: Tensor) -> Tensor:
     """Return whether numbers are within the bound of a measure; without one the numbers.
 
     Args:
-        measure: the measure.
         numbers: of the episodes, [rows].
         counts: number of steps that each number rests on.
     """

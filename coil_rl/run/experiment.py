@@ -211,7 +211,6 @@ class Experiment:
         """Log an update.
 
         Args:
-            row: of the update.
             first: numbers of the state before the first update.
         """
         if not self.metrics.rows:
@@ -371,10 +370,7 @@ def check_identity(
     A run that was made longer has the checkpoint of the shorter one.
 
     Args:
-        saved: identity in the checkpoint.
-        ours: identity of the run.
         lengths: of the run, and earlier ones, in frames.
-        file: of the checkpoint, for messages.
 
     Raises:
         UserError: if it belongs to a run with another configuration.

@@ -62,7 +62,6 @@ def begin(folder: Path, saved: Mapping[str, Any], command: Sequence[str] = ()) -
     """Write the versions, the configuration and the command of a new run.
 
     Args:
-        folder: of the run.
         saved: the configuration, plain values only; written as `config.yaml`.
         command: what was typed; written as `command.txt`, if there is any.
 

@@ -178,10 +178,7 @@ def judge(
     finished, and then pictures. A picture that fails is a warning.
 
     Args:
-        trial: cases, measures, pictures.
         policy: of the run; None for the guides alone.
-        folder: for the files.
-        seed: of the sampled actions.
         drivers: further ones, beside the policy.
     """
     judgement = Judgement(trial.evaluation.measures)
@@ -322,10 +319,7 @@ def not_worse(
     rewards.
 
     Args:
-        policy: its episodes.
         guide: its episodes, in the same cases.
-        name: of the guide.
-        chance: mean reward of random actions.
     """
     mine, theirs = policy.rewards, guide.rewards
     found = difference(mine, theirs)
@@ -352,8 +346,6 @@ def _watch(env: EnvBase, pictures: list[Picture], rows: Mapping[str, int], runni
     """Show an env to pictures; one that fails is taken out of the list.
 
     Args:
-        env: of the evaluation.
-        pictures: those that still watch.
         rows: the row in which each policy drives the first case.
         running: whether each row was in its episode, [rows].
     """
@@ -397,11 +389,8 @@ def evaluate_guides(
     The results have the names of `guide_titles`.
 
     Args:
-        make_env: makes the env.
-        evaluation: cases and measures.
         guides: by name.
         count: number of cases, if it is not the env's own.
-        pictures: which watch the guides.
     """
     cases, titles = len(evaluation.cases), guide_titles(guides)
     rows = {title: cases * index for index, title in enumerate(titles)}

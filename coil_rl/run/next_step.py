@@ -29,8 +29,6 @@ def next_step(folder: Path, frames: int, rows: Sequence[Mapping[str, float]] = (
     """Return a line with the commands that usually follow a finished training.
 
     Args:
-        folder: of the run.
-        frames: that it has been trained for.
         rows: of `metrics.csv`.
     """
     longer = f"{resume_command(folder)} budget.frames={2 * frames}"

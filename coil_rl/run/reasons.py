@@ -26,7 +26,6 @@ def about_returns(sizes: Mapping[str, int], *, tested: bool = False) -> list[str
     """Return what the return of the progress bar, of the curve and of the table counts.
 
     Args:
-        sizes: number of cases of each set.
         tested: whether a test at the end of the run decides what is handed over.
     """
     others = 0 if tested else sizes.get(SELECTION, 0)
@@ -50,9 +49,6 @@ def start_test(row: Mapping[str, float]) -> list[str]:
 
 def handed_over(folder: Path) -> list[str]:
     """Return the sentences that say what a run handed over and why; none without a test.
-
-    Args:
-        folder: of the run.
 
     Raises:
         UserError: if the file is damaged.

@@ -391,10 +391,11 @@ class Run:
         """
         names = self.trial.guides if EVALUATION in self.make_env.sizes else ()
         saved = record.GUIDE_RETURNS.read(self.folder)
-        if saved is None or not saved.keys() >= set(names):
-            saved = guide_returns(self.make_env, self.make_env.guides())
-            record.GUIDE_RETURNS.write(self.folder, saved)
-        return {name: saved[name] for name in names}
+        if saved is not None and saved.keys() >= set(names):
+            return {name: saved[name] for name in names}
+        returns = guide_returns(self.make_env, self.make_env.guides())
+        record.GUIDE_RETURNS.write(self.folder, returns)
+        return returns
 
     def require_agent(self) -> Callable[[EnvBase], Learner]:
         """Return what makes the learner of the run for an env.
@@ -497,10 +498,6 @@ class Run:
 
 def whole(name: str, number: Any) -> int:
     """Return a number of things that somebody gave.
-
-    Args:
-        name: of the argument.
-        number: what was given.
 
     Raises:
         UserError: if it is no whole number, or below 1.

@@ -60,9 +60,7 @@ def command_of(program: str, key: str, folder: Path) -> str:
     """Return the command that takes the folder of a run, as a shell reads it.
 
     Args:
-        program: that takes it.
         key: by which it takes it.
-        folder: of the run.
     """
     trust = [f"trust=[{','.join(_trusted)}]"] if _trusted else []
     return shlex.join([program, f"{key}={folder}", *trust])

@@ -33,7 +33,6 @@ def training_of(run: Run, before: int) -> Experiment:
     """Return the training of a run, whose env and learner are made here.
 
     Args:
-        run: with an agent.
         before: frames that were taken before it.
     """
     env = run.make_env(run.budget.rows)
@@ -76,7 +75,6 @@ def _copy_of_init(folder: Path, init: Path) -> Path:
     """Return a run's own copy of the policy that it begins with.
 
     Args:
-        folder: of the run.
         init: folder of the run whose policy that is.
     """
     copy = folder / INIT

@@ -22,11 +22,6 @@ def load_weights(policy: TensorDictModuleBase, path: Path, device: str = "cpu") 
 def put_weights(policy: TensorDictModuleBase, state: Any, path: Path) -> None:
     """Put the weights that were read from a file into a policy.
 
-    Args:
-        policy: gets the weights.
-        state: what the file holds.
-        path: of the file, for messages.
-
     Raises:
         UserError: if they do not fit the policy, or are not finite.
     """

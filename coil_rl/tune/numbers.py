@@ -123,12 +123,7 @@ def _number(name: str, bounds: Any, own: float, whole: bool) -> Number:
 
 
 def numbers_of(node: Mapping[str, Any], name: str) -> dict[str, tuple[float, bool]]:
-    """Return the numbers of a guide by name: own value, and whether it is an integer.
-
-    Args:
-        node: of the guide, plain.
-        name: key of the node, for messages.
-    """
+    """Return the numbers of a guide by name: own value, and whether it is an integer."""
     target, arguments = _arguments(node, name)
     found: dict[str, tuple[float, bool]] = {}
     for key, parameter in _parameters(target).items():
@@ -147,8 +142,6 @@ def with_numbers(node: Mapping[str, Any], name: str, values: Mapping[str, float]
     """Return the node of a guide with other numbers.
 
     Args:
-        node: of the guide, plain.
-        name: key of the node, for messages.
         values: numbers by name.
     """
     changed = copy.deepcopy(dict(node))

@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 from programs import CONF, called, shipped
 
 from coil_rl import UserError, compose_train
+from coil_rl.config.compose import covers
 
 METHODS = shipped("method")
 FAST = ("coil", "dagger", "rlpd")
@@ -146,3 +147,18 @@ def test_value_that_a_learner_does_not_take_is_refused_by_its_name(tmp_path):
     arguments = ["--config-dir", str(tmp_path), "env=mine", "env.id=Pendulum-v1", "method=coil"]
     refused = called("train", *arguments, "guide=zero", "learner=sac", cwd=tmp_path, code=2).stderr
     assert "SAC takes no gae_lambda" in refused
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "is_covered"),
+    [
+        ("env.id", "env.id", True),
+        ("env", "env.options.gravity", True),
+        ("env.options.gravity", "env", True),
+        ("env.id", "env.ids", False),
+        ("env.ids", "env.id", False),
+        ("env.id", "env.rate", False),
+    ],
+)
+def test_one_of_two_keys_is_the_other_or_inside_it(one, other, is_covered):
+    assert covers(one, other) == is_covered

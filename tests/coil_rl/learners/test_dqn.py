@@ -64,6 +64,7 @@ def test_epsilon_follows_its_schedule():
     assert shares == pytest.approx([0.5, 0.5, 0.1], abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mdp", "key"),
     [

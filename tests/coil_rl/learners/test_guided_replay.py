@@ -28,6 +28,7 @@ WAYS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("shape", [(2,), (2, 3)], ids=["vector", "matrix"])
 @pytest.mark.parametrize("way", WAYS)
