@@ -11,13 +11,13 @@ from itertools import chain
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from programs import ROOT
+from programs import ROOT, shipped
 
 import coil_rl.config.schema  # noqa: F401  the types that the configurations begin with
 
 FOLDER = ROOT / "docs" / "methods"
 PAGES = sorted(FOLDER.glob("*.md"))
-METHODS = sorted(file.stem for file in (ROOT / "conf" / "method").glob("*.yaml"))
+METHODS = sorted(shipped("method"))
 
 
 def commands(page):
