@@ -115,7 +115,6 @@ class SquashedNormal(Normal):
     Args:
         loc: means before squashing, [*batch, *event].
         scale: standard deviations before squashing.
-        event_dims: number of dimensions of an action.
         bounds: lower and upper ones, of the shape of an action; None: -1 and 1.
     """
 
