@@ -79,6 +79,11 @@ def shipped(group):
     return sorted(file.stem for conf in CONFS for file in (conf / group).glob("*.yaml"))
 
 
+def shipped_file(group, name):
+    """Return the path of a file of the configuration."""
+    return next(path for conf in CONFS if (path := conf / group / f"{name}.yaml").is_file())
+
+
 def module(name):
     """Return the module of a program."""
     return GUESTS.get(name, f"coil_rl.programs.{name}")

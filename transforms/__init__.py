@@ -24,7 +24,6 @@ from coil_rl.transforms.degraded_advice import ScaledAdvice as ScaledAdvice
 from coil_rl.transforms.degraded_advice import ShuffledAdvice as ShuffledAdvice
 from coil_rl.transforms.discrete_actions import DiscreteActions as DiscreteActions
 from coil_rl.transforms.disturbance import Disturbance as Disturbance
-from coil_rl.transforms.disturbance import undisturbed as undisturbed
 from coil_rl.transforms.guide_actions import GuideActions as GuideActions
 from coil_rl.transforms.guide_actions import Guides as Guides
 from coil_rl.transforms.guide_transform import GuideTransform as GuideTransform

@@ -8,19 +8,18 @@ shuffled and removed advice are placebos.
 import math
 import warnings
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, cached_property
 from typing import Annotated, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data import Composite, TensorSpec
 
 from coil_rl.ranges import Interval, NonNegative, checked
 from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.link import Link, State
-from coil_rl.transforms.normalised_action import ActionUnits, units_of
 
 LONGEST_DELAY = 10_000  # steps, each of which is kept for every row
 CHOSEN = "action_for_advice"  # entry for the action that the agent chose, within a step
@@ -48,10 +47,6 @@ class DegradedAdvice(Link):
         out_keys = [key, memory_key] if slots else [key]
         super().__init__(in_keys=[key], out_keys=out_keys)
         self.key, self.memory_key, self.slots = key, memory_key, slots
-        self._bounds: tuple[Tensor, Tensor] | None = None
-        self._units: ActionUnits | None = None
-        self._choices: ActionSpace | None = None  # the space of the action if it is choices
-        self._bounds_known = False
 
     def degrade(self, advice: Tensor) -> Tensor:
         """Return the degraded advice, [*batch, n_guides, A]."""
@@ -62,11 +57,23 @@ class DegradedAdvice(Link):
         self._write(data, self.degrade(self._normalised(data)))
         return state
 
+    @cached_property
+    def space(self) -> ActionSpace | None:
+        """Space of the env's action; None outside an env."""
+        env = self.parent  # as slow as a step
+        if env is None:
+            return None
+        space = ActionSpace(env.full_action_spec[env.action_keys[0]], len(env.batch_size))
+        if space.choices and self.numbers_only is not None:
+            say_for_numbers(self.numbers_only, type(self).__name__)
+        return space
+
     def _normalised(self, tensordict: TensorDictBase) -> Tensor:
         """Return the advice in normalised numbers."""
-        self._know_bounds()
         advice = tensordict[self.key]
-        return advice if self._units is None else self._units.normalise(advice)
+        if self.space is None:
+            return advice
+        return self.space.normalise(advice.movedim(-2, 0)).movedim(0, -2)
 
     def _missing(self, data: TensorDictBase) -> Tensor:
         """Return NaN for all numbers of the advice, which the data need not have yet."""
@@ -76,31 +83,12 @@ class DegradedAdvice(Link):
         shape = (*data.batch_size, *spec.shape[len(self.parent.batch_size) :])
         return torch.full(shape, torch.nan, dtype=spec.dtype, device=data.device)
 
-    def _know_bounds(self) -> None:
-        """Find the bounds and the unit of the advice, once: `self.parent` is as slow as a step."""
-        if self._bounds_known or self.parent is None:
-            return
-        spec = self.parent.full_observation_spec[self.key]
-        if isinstance(spec, Bounded):
-            first = (0,) * len(self.parent.batch_size)
-            self._bounds = spec.space.low[first], spec.space.high[first]
-        keys, batch_dims = self.parent.action_keys, len(self.parent.batch_size)
-        space = ActionSpace(self.parent.full_action_spec[keys[0]], batch_dims)
-        if space.choices:
-            self._choices = space
-            if self.numbers_only is not None:
-                say_for_numbers(self.numbers_only, type(self).__name__)
-        else:
-            self._units = units_of(spec, batch_dims)
-        self._bounds_known = True
-
     def _write(self, tensordict: TensorDictBase, advice: Tensor) -> TensorDictBase:
         """Write normalised advice in its own unit and within its bounds."""
-        self._know_bounds()
-        if self._units is not None:
-            advice = self._units.denormalise(advice)
-        if self._bounds is not None:
-            advice = advice.clamp(*self._bounds)
+        if self.space is not None and self.space.choices:
+            advice = advice.clamp(0, 1)
+        elif self.space is not None:
+            advice = self.space.denormalise(advice.movedim(-2, 0)).movedim(0, -2)
         return tensordict.set(self.key, advice)
 
     @property
@@ -159,8 +147,8 @@ class ScaledAdvice(DegradedAdvice):
 
     def degrade(self, advice: Tensor) -> Tensor:
         """Return advice * gain."""
-        if self.gain < 0 and self._choices is not None:
-            return self._choices.mirrored(advice) * -self.gain
+        if self.gain < 0 and self.space is not None and self.space.choices:
+            return self.space.mirrored(advice) * -self.gain
         return advice * self.gain
 
 
@@ -264,8 +252,8 @@ class RandomAdvice(_DrawnAdvice):
 
     def changed(self, advice: Tensor, draws: Tensor) -> Tensor:
         """Return random numbers."""
-        if self._choices is not None:
-            return self._choices.random(draws).to(advice)
+        if self.space is not None and self.space.choices:
+            return self.space.random(draws).to(advice)
         return self.low + self.range * draws
 
 

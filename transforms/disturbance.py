@@ -14,7 +14,6 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
-from torchrl.envs import EnvBase
 
 from coil_rl.ranges import Interval, checked
 from coil_rl.transforms.action_space import nested_key
@@ -26,25 +25,7 @@ Lag = Annotated[int, Interval(ge=0, le=10_000)]
 
 
 class Disturbance(Link):
-    """Base class of transforms that disturb observations or actions.
-
-    Attributes:
-        active: whether it disturbs; else it passes on what comes, see `undisturbed`.
-    """
-
-    active = True
-
-
-def undisturbed(env: EnvBase) -> EnvBase:
-    """Return an env after its disturbances were taken off.
-
-    Args:
-        env: with transforms; it is changed in place, from the next reset on.
-    """
-    for module in env.modules():
-        if isinstance(module, Disturbance):
-            module.active = False
-    return env
+    """Base class of transforms that disturb observations or actions; a `Chain` leaves them out."""
 
 
 @checked
@@ -87,8 +68,8 @@ class Delay(Disturbance):
         def drawn(*shape: int, generator: torch.Generator) -> Tensor:
             return torch.randint(self.min_lag, self.max_lag + 1, shape, generator=generator)
 
-        lag = self.rng.sample(drawn, (*tensordict.batch_size, 1)).to(tensordict.device or "cpu")
-        return lag if self.active else torch.zeros_like(lag)
+        shape = (*tensordict.batch_size, 1)
+        return self.rng.sample(drawn, shape).to(tensordict.device or "cpu")
 
     def _late(self, values: Tensor, lag: Tensor) -> Tensor:
         """Return the value of each row that is `lag` [*batch, 1] steps old.

@@ -372,7 +372,6 @@ class GuideActions(ActionTransform):
     def set_container(self, container: Transform | EnvBase) -> None:
         """Set the env, which may have other rows than an earlier one."""
         super().set_container(container)
-        self.__dict__.pop("rows", None)
         self._checked = set()
 
     def train(self, mode: bool = True) -> GuideActions:

@@ -4,11 +4,15 @@ As the memory is in the data, a guide is a function without a state of its own: 
 number of rows, and a restored env restores its guides.
 """
 
+from collections.abc import Mapping
+from functools import partial
+
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import TensorSpec
-from torchrl.envs import Compose
+from torch import Tensor
+from torchrl.data import TensorSpec, Unbounded
+from torchrl.envs import Compose, TensorDictPrimer
 from torchrl.modules.utils import get_primers_from_module
 
 from coil_rl.transforms.link import State
@@ -90,3 +94,14 @@ class GuideMemory:
         """Replace the memory by what the guide has written for its next step."""
         for key in self.specs:
             memory[self.key(key)] = data["next", key]
+
+
+def primer_of(start: Mapping[str, Tensor]) -> TensorDictPrimer:
+    """Return the declaration of a memory.
+
+    Args:
+        start: what a row remembers at the start of an episode, by the name of the entry.
+    """
+    specs = {name: Unbounded(row.shape, dtype=row.dtype) for name, row in start.items()}
+    first = {name: partial(torch.clone, row) for name, row in start.items()}
+    return TensorDictPrimer(specs, default_value=first, expand_specs=True)

@@ -90,8 +90,9 @@ class Link(Transform):
     def set_container(self, container: Transform | EnvBase) -> None:
         """Set the env, which may have other rows than an earlier one."""
         super().set_container(container)
-        for name in ("_keys", "_nothing"):
-            self.__dict__.pop(name, None)
+        for name in [*self.__dict__]:
+            if isinstance(getattr(type(self), name, None), cached_property):
+                del self.__dict__[name]
 
     def _state_in(self, data: TensorDictBase) -> State:
         found = ((key, data.get(key, None)) for key in self._keys)

@@ -94,8 +94,6 @@ class ObservationNoise(Disturbance):
 
     def observe(self, data: TensorDictBase, state: State) -> State:
         """Write the noisy entries; the state is their noise."""
-        if not self.active:
-            return {}
         for key, draw in state.items():
             values = data[key]
             noisy = torch.add(values, draw.to(values), alpha=self.sigma)

@@ -3,13 +3,10 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from torchrl.data import Unbounded
 from torchrl.envs import ExplorationType, TensorDictPrimer, set_exploration_type
 
 from coil_rl.config.assemble import assemble
@@ -19,6 +16,7 @@ from coil_rl.run.parts import TRAIN
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, space_of
 from coil_rl.transforms.chain import Chain, links_of
+from coil_rl.transforms.guide_memory import primer_of
 from coil_rl.transforms.hosted import HostedGuide
 
 LONGEST_CHAIN = 4  # learned guides of learned guides
@@ -103,9 +101,7 @@ class LearnedGuide(HostedGuide):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare what is remembered."""
-        specs = {name: Unbounded(row.shape, dtype=row.dtype) for name, row in self.start.items()}
-        first = {name: partial(torch.clone, row) for name, row in self.start.items()}
-        return TensorDictPrimer(specs, default_value=first, expand_specs=True)
+        return primer_of(self.start)
 
 
 @contextmanager

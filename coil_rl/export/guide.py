@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from coil_rl.errors import UserError
 from coil_rl.export.policy import ADVICE, ExportedPolicy
 from coil_rl.transforms.action_space import ActionRange, ActionSpace, OwnChoices
+from coil_rl.transforms.guide_memory import primer_of
 from coil_rl.transforms.hosted import ToldGuide
 
 
@@ -79,13 +79,10 @@ class ExportedGuide(ToldGuide):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare what is remembered."""
-        specs, first = {}, {}
+        start = {}
         for name, entry in self.memory.items():
-            value = np.full(entry["shape"], entry["first"], entry["dtype"])
-            specs[name] = Unbounded(entry["shape"], dtype=torch.from_numpy(value).dtype)
-            one = isinstance(entry["first"], (bool, int, float))
-            first[name] = entry["first"] if one else _Constant(torch.from_numpy(value))
-        return TensorDictPrimer(specs, default_value=first, expand_specs=True)
+            start[name] = torch.from_numpy(np.full(entry["shape"], entry["first"], entry["dtype"]))
+        return primer_of(start)
 
     def _unfit(self, problem: str) -> UserError:
         title = self.exported.contract["env"]["title"]
@@ -93,20 +90,6 @@ class ExportedGuide(ToldGuide):
             f"{self.exported.file} is a policy for {title}, which this env is not: {problem}; give "
             "the env that its contract.json names"
         )
-
-
-class _Constant:
-    """A first value that is not one number.
-
-    Args:
-        value: of a row.
-    """
-
-    def __init__(self, value: Tensor) -> None:
-        self.value = value
-
-    def __call__(self) -> Tensor:
-        return self.value
 
 
 def _key(parts: list[str]) -> NestedKey:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torchrl.envs import ExplorationType, set_exploration_type
 
 from coil_rl.export.files import names_of
 from coil_rl.export.recording import Recording
@@ -50,40 +49,10 @@ class Parity:
         )
 
 
-Rows = list[list[Tensor]]  # by step, the inputs and the state
-
-
-@torch.no_grad()
-def expected(step: PolicyStep, recording: Recording, limit: float) -> Rows:
-    """Return the inputs and the state of each recorded step.
-
-    Raises:
-        NotExportableError: if the function is not what the controller does.
-    """
-    rows: Rows = []
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        state: list[Tensor] = []
-        for number in range(len(recording)):
-            if recording.first[number]:
-                state = [entry.rows(1) for entry in step.state]
-            inputs = [recording.value(number, entry.key) for entry in step.inputs]
-            rows.append([*inputs, *state])
-            action, *state = step(*rows[-1])
-            own = step.space.executed(recording.actions[number])
-            difference = float(_difference(step, action, own))
-            if not difference <= limit:
-                raise NotExportableError(
-                    f"its action depends on more than its inputs and its memory: it differs by "
-                    f"{difference:.1e} at observation {number + 1}"
-                )
-    return rows
-
-
 def compare(
     step: PolicyStep,
     content: bytes,
     recording: Recording,
-    rows: Rows,
     limit: float,
     tick: Callable[[], Any] = lambda: None,
 ) -> Parity:
@@ -93,7 +62,6 @@ def compare(
         step: the function that the file holds.
         content: of the file.
         recording: of the controller.
-        rows: of `expected`.
         limit: allowed difference.
         tick: called after every step.
 
@@ -103,18 +71,18 @@ def compare(
     session = Session(content, names_of(step)[1])
     own = step.space.executed(torch.cat(recording.actions))
     before = time.process_time()
-    one_by_one = _called(step, session, recording, tick)
+    one_by_one, inputs = _called(step, session, recording, tick)
     seconds = time.process_time() - before
     # All rows at once, as a batch of envs calls it.
-    batch = dict(zip(names_of(step)[0], (each.numpy() for each in _columns(rows)), strict=True))
+    batch = {name: np.concatenate([each[name] for each in inputs]) for name in inputs[0]}
     at_once = torch.from_numpy(session(batch)[0])
     differences = torch.maximum(_difference(step, one_by_one, own), _difference(step, at_once, own))
     worst = int(differences.argmax())
     largest = float(differences[worst])
     if not largest <= limit:
         raise NotExportableError(
-            f"the file differs from torch by {largest:.1e} at observation {worst + 1}, but must by "
-            f"at most {limit:.0e}"
+            f"its action differs by {largest:.1e} at observation {worst + 1}, but must by at most "
+            f"{limit:.0e}: it depends on more than its inputs and its memory"
         )
     return Parity(
         len(recording),
@@ -127,23 +95,19 @@ def compare(
 
 def _called(
     step: PolicyStep, session: Session, recording: Recording, tick: Callable[[], Any]
-) -> Tensor:
-    """Return the actions of a file that is called step by step, [N, *A]."""
-    actions, state = list[Tensor](), dict[str, Any]()
+) -> tuple[Tensor, list[dict[str, Any]]]:
+    """Return the actions of a file that is called step by step, [N, *A], and what it was given."""
+    actions, given, state = list[Tensor](), list[dict[str, Any]](), dict[str, Any]()
     for number in range(len(recording)):
         if recording.first[number]:
             state = {f"state.{entry.name}": entry.rows(1).numpy() for entry in step.state}
         inputs = {entry.name: recording.value(number, entry.key).numpy() for entry in step.inputs}
-        action, *after = session(inputs | state)
+        given.append(inputs | state)
+        action, *after = session(given[-1])
         state = dict(zip(state, after, strict=True))
         actions.append(torch.from_numpy(action))
         tick()
-    return torch.cat(actions)
-
-
-def _columns(rows: Rows) -> list[Tensor]:
-    """Return the inputs and the state of all steps, [N, ...] each."""
-    return [torch.cat(column) for column in zip(*rows, strict=True)]
+    return torch.cat(actions), given
 
 
 def _difference(step: PolicyStep, actions: Tensor, others: Tensor) -> Tensor:

@@ -191,8 +191,8 @@ def exportable(controller: Controller) -> list[Link]:
     links = list(links_of(controller.env.transform, tensors=True))
     for link in links:
         if isinstance(link, DegradedAdvice):
-            draws = any(isinstance(part, SeededGenerator) for part in link.modules())
-            if draws or link.slots or link.needs_past:
+            draws = any(isinstance(part, SeededGenerator) for part in link.children())
+            if draws or link.needs_past or link.slots:
                 raise NotExportableError(
                     f"{type(link).__name__} degrades the advice at random or by that of earlier "
                     "steps, which is for experiments only; train without degrade"

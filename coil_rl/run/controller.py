@@ -22,7 +22,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type
 
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
-from coil_rl.transforms import GuideActions, undisturbed
+from coil_rl.transforms import GuideActions
 from coil_rl.transforms.chain import Chain, Past
 
 
@@ -55,7 +55,7 @@ class Controller:
     ) -> None:
         if not isinstance(env, TransformedEnv) or env.batch_size.numel() != 1:
             raise ValueError(f"a controller needs an env of one row, not {list(env.batch_size)}")
-        self.env, self.policy = undisturbed(env.eval()), policy
+        self.env, self.policy = env.eval(), policy
         self.plant, self.folder, self.which = env.base_env, folder, which
         self.chain = Chain(self.env, policy)
         guides = [part for part in self.chain.links if isinstance(part, GuideActions)]

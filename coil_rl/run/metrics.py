@@ -3,8 +3,7 @@
 import csv
 import math
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +14,6 @@ from coil_rl.record import curve, table
 from coil_rl.report.runs import RETURN
 
 REMEDY = "put the whole file back, or train again in another folder"  # for a damaged log
-
-
-class NoLogger:
-    """A logger that does nothing."""
-
-    experiment = None
-
-    def log_scalar(self, name: str, value: float, step: int) -> None:
-        """Log nothing."""
-
-    def log_hparams(self, settings: Mapping[str, Any]) -> None:
-        """Log nothing."""
-
-    def close(self) -> None:
-        """Close nothing."""
 
 
 class Metrics:
@@ -63,21 +47,23 @@ class Metrics:
             key: value if isinstance(value, (bool, int, float, str)) else str(value)
             for key, value in settings.items()
         }
-        with self._using() as logger:
-            logger.log_hparams(plain)
+        self._tell(lambda logger: logger.log_hparams(plain))
 
     def close(self) -> None:
         """End the record of the TorchRL logger, so that a second run in this process has its own.
 
         What is logged later is lost.
         """
-        with self._using() as logger:
+
+        def end(logger: Any) -> None:
             # Runs of MLflow end only so, and those of others too.
-            end = getattr(logger.experiment, "__exit__", None)
-            if end is None:
+            leave = getattr(logger.experiment, "__exit__", None)
+            if leave is None:
                 logger.close()
             else:
-                end(None, None, None)
+                leave(None, None, None)
+
+        self._tell(end)
         self.logger = None
 
     def append(self, row: dict[str, float]) -> None:
@@ -110,24 +96,21 @@ class Metrics:
 
     def log(self, values: Mapping[str, float], frames: int) -> None:
         """Log values with the TorchRL logger, if there is one; NaN is left out."""
-        with self._using() as logger:
+
+        def scalars(logger: Any) -> None:
             for name, value in values.items():
                 if not math.isnan(value):
                     logger.log_scalar(name, value, step=frames)
 
-    @contextmanager
-    def _using(self) -> Iterator[Any]:
-        """Yield the TorchRL logger, or one that does nothing.
+        self._tell(scalars)
 
-        A logger that fails is left out from then on.
-        """
+    def _tell(self, use: Callable[[Any], object]) -> None:
+        """Use the TorchRL logger, if there is one. One that fails is left out from then on."""
         logger, self.logger = self.logger, None
-        if logger is None:
-            yield NoLogger()
-            return
-        with decoration(f"the logger {type(logger).__name__} of {self.path.parent}"):
-            yield logger
-            self.logger = logger
+        if logger is not None:
+            with decoration(f"the logger {type(logger).__name__} of {self.path.parent}"):
+                use(logger)
+                self.logger = logger
 
     def fill(self, results: Mapping[int, Mapping[str, float]]) -> None:
         """Put values into rows that were logged before, by their numbers.

@@ -11,7 +11,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 from hydra import compose, initialize_config_module
-from programs import TINY_ARM, called
+from programs import TINY_ARM, called, shipped
 from run_folders import driven, make_run
 
 from benchmarks.guide_benchmark import __main__ as program
@@ -137,7 +137,7 @@ def test_fingerprint_is_that_of_the_configuration_without_its_seeds():
 
 
 def test_every_task_has_a_reference_and_the_other_way_round():
-    own = {path.stem for path in (ROOT / "conf/experiment/guide_benchmark").glob("*.yaml")}
+    own = set(shipped("experiment/guide_benchmark"))
     others = {path.stem for path in (FOREIGN / "experiment/guide_benchmark").glob("*.yaml")}
     assert own | others == set(references())
     assert others == set(PACKAGES)

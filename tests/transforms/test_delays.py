@@ -20,7 +20,6 @@ from coil_rl.transforms import (
     LastAction,
     ObservationDelay,
     ObservationNoise,
-    undisturbed,
 )
 
 ACTIONS = {
@@ -191,12 +190,6 @@ def test_a_guide_sees_what_comes_before_it_in_the_chain():
     assert torch.equal(advice(guide(), ObservationDelay(2, 2)), exact)
     both = ObservationDelay(2, 2, ["observation", "guide_action"])
     assert torch.equal(advice(guide(), both), late)
-
-
-def test_a_machine_is_not_disturbed():
-    transforms = Compose(ObservationDelay(2, 2), ActionDelay(2, 2), ObservationNoise(0.5))
-    plain, off = driven(Counter()), driven(undisturbed(TransformedEnv(Counter(), transforms)))
-    assert all(torch.equal(value, off[key]) for key, value in plain.items(True, True))
 
 
 def test_noise_has_its_standard_deviation_and_stays_within_the_bounds():

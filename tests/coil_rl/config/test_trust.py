@@ -8,6 +8,7 @@ import hydra.utils
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
+from programs import shipped
 
 from coil_rl.config import assemble as assembling
 from coil_rl.config import given, trust
@@ -298,9 +299,7 @@ OF_ENV = {"gym": ["env.id=CartPole-v1"], "torchrl": ["env.of._target_=coil_rl.en
 
 
 def files(group):
-    return sorted(
-        file.stem for file in (importlib.resources.files("coil_rl.conf") / group).glob("*.yaml")
-    )
+    return shipped(group)
 
 
 @pytest.mark.slow

@@ -33,6 +33,7 @@ from coil_rl.learners import (
 )
 from coil_rl.learners.encoders import ObservationNetwork
 from coil_rl.learners.networks import FastTensorDictModule
+from coil_rl.learners.policy import Entries
 from coil_rl.programs.train import resume, train
 from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.run.parts import TEST
@@ -165,11 +166,11 @@ def test_update_sees_the_log_probabilities_and_states_of_the_rollout(action, opt
         batch["next", "policy_state"][:, :-1][goes_on], batch["policy_state"][:, 1:][goes_on]
     )
     rows = learner.prepare(batch, 0.0)
-    order = torch.randperm(len(rows))
-    steps = learner.sampler.remember(rows[order])
+    order = torch.randperm(len(batch))
+    steps = learner.sampler.remember(Entries({key: each[order] for key, each in rows.items()}))
     expected = batch[order].reshape(-1)["action_log_prob"]
     assert expected.std() > 0.1
-    torch.testing.assert_close(learner.head.get_dist(steps).log_prob(steps["action"]), expected)
+    torch.testing.assert_close(learner.head.density(steps).log_prob(steps["action"]), expected)
     assert torch.equal(steps["observation"], batch["observation"][order].flatten(0, 1))
 
 

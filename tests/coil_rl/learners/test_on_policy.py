@@ -6,10 +6,7 @@ from functools import partial
 import pytest
 import torch
 import worlds
-from any_env import AnyEnv
 from cart_poles import CartPoles
-from torchrl.data import MultiCategorical
-from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from coil_rl.envs import ConeTrackEnv
@@ -17,6 +14,7 @@ from coil_rl.guides import RandomGuide
 from coil_rl.learners import A2C, PPO, TRPO, KickstartLoss, Reinforce
 from coil_rl.learners.advantages import Advantages
 from coil_rl.learners.networks import critic
+from coil_rl.learners.policy import Entries
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
 from coil_rl.transforms import JumpStart, Takeover
@@ -83,11 +81,12 @@ def test_policy_loss_depends_on_the_steps_of_the_agent_only():
     env = worlds.cones(Takeover(0.5))
     ppo = PPO(env)
     rows = ppo.prepare(Rollout(env, ppo.policy, 16, ppo.keys).collect(), 0.0)
-    other, of_guide = rows.clone(), ~rows["agent_acts"].squeeze(-1)
+    other = Entries({key: each.clone() for key, each in rows.items()})
+    of_guide = ~rows["agent_acts"].squeeze(-1)
     other["advantage"][of_guide] = 1e6
     other["action_log_prob"][of_guide] = -1e6
     other["value_target"][of_guide] += 1
-    losses, changed = ppo.objective(rows), ppo.objective(other)
+    losses, changed = ppo.all_losses(rows), ppo.all_losses(other)
     assert torch.equal(changed["loss_objective"], losses["loss_objective"])
     assert not torch.equal(changed["loss_critic"], losses["loss_critic"])
 
@@ -138,46 +137,6 @@ def test_minibatch_of_one_frame_is_refused(kind):
     trained(kind, CartPoles(2), steps=4, minibatches=4)
     with pytest.raises(ValueError, match="minibatches=5 leaves less than 2 of 8 frames to each"):
         trained(kind, CartPoles(2), steps=4, minibatches=5)
-
-
-@pytest.mark.parametrize(
-    "make", [worlds.cones, partial(CartPoles, 6), partial(AnyEnv, 6, MultiCategorical([2, 3]))]
-)
-@pytest.mark.parametrize("entropy", [0.0, 0.01])
-def test_loss_of_ppo_is_that_of_torchrl_to_the_bit(make, entropy):
-    torch.manual_seed(0)
-    env = make()
-    ppo = PPO(env, epochs=3, minibatches=2, learning_rate=5e-2, entropy=entropy)
-    options = {
-        "entropy_bonus": entropy > 0,
-        "entropy_coeff": entropy,
-        "critic_coeff": 0.5,
-        "loss_critic_type": "l2",
-    }
-    reference = ClipPPOLoss(
-        ppo.policy,
-        ppo.critic,
-        clip_epsilon=0.2,
-        normalize_advantage=True,
-        functional=False,
-        **options,
-    )
-    batch = Rollout(env, ppo.policy, 8, ppo.keys).collect()
-    ppo.update(batch.clone())  # the ratios are no longer 1
-    rows, found = ppo.prepare(batch, 0.0), []
-    for loss in (reference, ppo.loss):
-        torch.manual_seed(1)
-        ppo.gradient.adam.zero_grad()
-        losses = loss(rows)
-        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
-        found.append(
-            (losses.detach(), [parameter.grad.clone() for parameter in ppo.gradient.parameters])
-        )
-    (losses, gradients), (our_losses, our_gradients) = found
-    assert losses["clip_fraction"] > 0
-    assert list(our_losses.keys()) == list(losses.keys())  # the columns of the log
-    assert all(torch.equal(value, our_losses[name]) for name, value in losses.items())
-    assert all(map(torch.equal, gradients, our_gradients))
 
 
 def test_advantages_equal_those_of_torchrl_with_two_evaluations_per_state(ring):

@@ -8,7 +8,7 @@ import worlds
 from any_env import AnyEnv
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.data import Unbounded
+from torchrl.data import MultiCategorical, Unbounded
 from torchrl.envs import TransformedEnv
 from torchrl.objectives import A2CLoss, ClipPPOLoss
 
@@ -40,6 +40,7 @@ KINDS = [
     pytest.param(pendulums, {"normalise": True, "squash": False}, id="normalised"),
     pytest.param(poles, {"normalise": "auto", "entropy": 0.01}, id="choice"),
     pytest.param(lambda: AnyEnv(action=Unbounded((2, 2))), {"entropy": 0.01}, id="unbounded"),
+    pytest.param(lambda: AnyEnv(6, MultiCategorical([2, 3])), {"entropy": 0.01}, id="choices"),
     pytest.param(worlds.cones, {"action_scale": 0.5, "clip": 0.01}, id="much clipped"),
     pytest.param(worlds.cones, ANCHORED | {"normalise": True}, id="anchored, normalised"),
     pytest.param(advised_poles, ANCHORED, id="anchored choice"),

@@ -5,14 +5,16 @@ from importlib.util import find_spec
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from programs import CONF, TINY_SWEEP
+from programs import CONFS, TINY_SWEEP, shipped_file
 
 from coil_rl.config.check import check
 from coil_rl.programs.train import train
 
-FOLDER = CONF / "experiment"
+FOLDERS = [conf / "experiment" for conf in CONFS]
 EXPERIMENTS = sorted(
-    file.relative_to(FOLDER).with_suffix("").as_posix() for file in FOLDER.rglob("*.yaml")
+    file.relative_to(folder).with_suffix("").as_posix()
+    for folder in FOLDERS
+    for file in folder.rglob("*.yaml")
 )
 OF_TRACKS = ("track", "env.", "evaluation.curve.env.")  # words of worlds with tracks
 NEEDS_RUNS = ["driving_tasks"]
@@ -33,12 +35,8 @@ def present(experiment):
 def first(experiment, run_dir):
     """Return a very small configuration of the first run of the sweep."""
     # A file that inherits its sweep has no params of its own.
-    params = (
-        OmegaConf.select(
-            OmegaConf.load(CONF / "experiment" / f"{experiment}.yaml"), "hydra.sweeper.params"
-        )
-        or {}
-    )
+    file = OmegaConf.load(shipped_file("experiment", experiment))
+    params = OmegaConf.select(file, "hydra.sweeper.params") or {}
     values = {key: str(value).split(",") for key, value in params.items()}
     chosen = [
         f"{key}={value[0].strip()}"

@@ -6,7 +6,7 @@ import pytest
 from gymnasium import spaces
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from programs import CONF, called, shipped
+from programs import called, shipped, shipped_file
 
 from coil_rl.config.check import check_parts
 from coil_rl.programs.sweeps import described
@@ -73,9 +73,9 @@ def repeat(observation):
 
 def jobs(experiment):
     """Return the overrides of the first seed of each job of an experiment."""
-    file = OmegaConf.load(CONF / "experiment" / f"{experiment}.yaml")
+    file = OmegaConf.load(shipped_file("experiment", experiment))
     if OmegaConf.select(file, "hydra.sweeper.params") is None:
-        file = OmegaConf.load(CONF / "experiment" / f"{file.defaults[0]}.yaml")
+        file = OmegaConf.load(shipped_file("experiment", file.defaults[0]))
     words = [[]]
     for key, value in file.hydra.sweeper.params.items():
         choices = str(value).split(",")[: 1 if key == "seed" else None]
