@@ -238,11 +238,7 @@ class Choices(Density):
 
 
 class OneHotChoice(Choices):
-    """One choice, one-hot.
-
-    Args:
-        logits: of the options, [*batch, n].
-    """
+    """One choice, one-hot; logits [*batch, n]."""
 
     def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return a one-hot option and its logarithmic probability."""
