@@ -1,6 +1,6 @@
 """What a guest needs for programs of its own, besides the other public names.
 
-A guest is a package beside coil-rl. See `coil_rl.config.guest_files` for its YAML files.
+A guest is a package beside coil-rl. See `coil_rl.config.compose` for its YAML files.
 """
 
 from typing import TYPE_CHECKING

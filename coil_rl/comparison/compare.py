@@ -284,10 +284,10 @@ class Comparison:
         say(f"{page}\nSee {self.folder}{more}.")
         return Worth(self.folder, found, pd.DataFrame(outcome.rows), command, page)
 
-    def _delayed(self, found: Verdict, outcome: Outcome, base: DictConfig) -> str:
-        """Return the sentence about a delay of a guide or policy; empty for everything else."""
+    def _delayed(self, found: Verdict, outcome: Outcome, base: DictConfig) -> list[str]:
+        """Return the sentence about a delay of a guide or policy; none for everything else."""
         if found.use in (NOTHING, *IDLE):
-            return ""
+            return []
         run = first_of(outcome, found.use)
         with decoration("the delay"):
             table = measure_delayed(found.use, None if run is None else run.folder, base)
@@ -295,7 +295,7 @@ class Comparison:
             late = Entry(found.use, table["reward"].to_numpy()[None])
             write_csv(table.to_dict("records"), self.folder / "delayed.csv")
             return delayed_sentence(entry, late, outcome.entries[RANDOM])
-        return ""
+        return []
 
     def _steps(self, outcome: Outcome) -> int:
         """Return the env steps that only measured: all episodes of the table."""

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.comparison.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, TUNE, ZERO
-from coil_rl.report.statistics import interval
+from coil_rl.report import statistics
+from coil_rl.report.statistics import Estimate
 from coil_rl.report.table import return_format
 
 Array = NDArray[np.float64]
@@ -59,37 +60,36 @@ class Difference:
     """The paired difference of two entries in the same cases.
 
     Args:
-        mean: of all cases and seeds.
-        low: lower end of its 95 % t interval over the cases; NaN for a single case.
-        high: upper end.
+        of_cases: mean of all cases and seeds, and its interval over the cases.
         seeds: means of each pair of seeds.
         spec: number format of the returns.
     """
 
-    mean: float
-    low: float
-    high: float
+    of_cases: Estimate
     seeds: tuple[float, ...]
-    spec: str = ".1f"
+    spec: str
 
     def above(self, least: float) -> bool:
         """Return whether it is clearly above 0, and at least `least`."""
-        return self.low > 0 and min(self.seeds) > 0 and self.mean >= least
+        return self.of_cases.low > 0 and min(self.seeds) > 0 and self.of_cases.mean >= least
+
+    @property
+    def one_case(self) -> bool:
+        """Whether there is no interval."""
+        return math.isnan(self.of_cases.low)
 
     def __str__(self) -> str:
-        mean, low, high = (f"{each:+{self.spec}}" for each in (self.mean, self.low, self.high))
-        if math.isnan(self.low):
-            return f"{mean} (no interval: one case)"
-        return f"{mean} ({low} to {high})"
+        unknown = " (no interval: one case)" if self.one_case else ""
+        return f"{self.of_cases.cell(f'+{self.spec}')}{unknown}"
 
 
 def difference(one: Entry, other: Entry) -> Difference:
     """Return how much more one entry has than another in the same cases."""
-    mean, low, high = interval(one.returns.mean(0) - other.returns.mean(0))[:3]
+    of_cases = statistics.difference(one.returns.mean(0), other.returns.mean(0))
     of_seeds, of_others = one.returns.mean(1), other.returns.mean(1)
     if len(of_seeds) == len(of_others):
         seeds = of_seeds - of_others
     else:
         seeds = (of_seeds[:, None] - of_others[None, :]).ravel()
     spec = return_format([one.mean, other.mean])
-    return Difference(mean, low, high, tuple(seeds.tolist()), spec)
+    return Difference(of_cases, tuple(seeds.tolist()), spec)

@@ -13,6 +13,7 @@ from hydra.errors import HydraException
 from coil_rl.comparison.arms import ANCHORED, ARMS, TUNE
 from coil_rl.comparison.entry import Entry, difference
 from coil_rl.comparison.outcome import Outcome
+from coil_rl.comparison.sentences import COMPARE
 from coil_rl.comparison.verdict import Verdict
 from coil_rl.config.compose import key_of
 from coil_rl.config.python import Named
@@ -35,7 +36,9 @@ COLUMNS = {
 }
 
 
-def page_of(verdict: Verdict, outcome: Outcome, delayed: str, measured: int, command: str) -> str:
+def page_of(
+    verdict: Verdict, outcome: Outcome, delayed: Sequence[str], measured: int, command: str
+) -> str:
     """Return the page.
 
     Args:
@@ -45,21 +48,14 @@ def page_of(verdict: Verdict, outcome: Outcome, delayed: str, measured: int, com
     columns = dict(COLUMNS)
     if all(np.isnan(row.get("failures", np.nan)) for row in outcome.rows):
         del columns["failures"]
-    seeds = "of each training the mean over its seeds"
     parts = [
         *(f"{number}. {sentence}" for number, sentence in enumerate(verdict.sentences, 1)),
         "",
         markdown_table(outcome.rows, columns),
-        "",
-        f"Deterministic episodes in the same cases, which chose nothing; {seeds}. Frames are all "
-        "env steps that a training depends on, with those of its tests. Guide calls of guide and "
-        f"opposite are those of their episodes here. {measured:,} further env steps measured these "
-        "cases.",
     ]
-    if few := few_cases(outcome.runs.get(ANCHORED, ())):
-        parts += ["", few]
-    if delayed:
-        parts += ["", delayed]
+    about = COMPARE.said("about_table", measured=measured)
+    for each in [*about, *few_cases(outcome.runs.get(ANCHORED, ())), *delayed]:
+        parts += ["", each]
     if command:
         lead = "Train it to the end"
         if verdict.use != verdict.train:
@@ -68,39 +64,26 @@ def page_of(verdict: Verdict, outcome: Outcome, delayed: str, measured: int, com
     return "\n".join(parts)
 
 
-def few_cases(runs: Sequence[Run]) -> str:
-    """Return the sentence about start tests that held no guide after few cases; empty for none."""
+def few_cases(runs: Sequence[Run]) -> list[str]:
+    """Return the sentence about start tests that held no guide after few cases; none for others."""
     *_, cases, weight = StartTest.names
     firsts = [run.curve[0] for run in runs if run.curve]
     few = [row[cases] for row in firsts if row.get(cases, np.nan) < FEW and not row[weight]]
-    if not few:
-        return ""
-    return (
-        f"The start test of {ANCHORED}, which decides whether a guide is held, had only "
-        f"{max(few):.0f} cases in the frames of a training here, and held none in {len(few)} of "
-        f"{len(runs)} seeds. So few cases do not show for sure that a guide is good, so that "
-        f"{ANCHORED} may be better in a whole training, whose test has more of them."
-    )
+    return COMPARE.said("few_cases", arm=ANCHORED, cases=few, runs=len(runs))
 
 
-def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> str:
+def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> list[str]:
     """Return the sentence about a step of delay on observation and action.
 
     Args:
         late: the same with the delay.
     """
     found = difference(late, Entry(entry.name, entry.returns[:1]))
-    own = float(entry.returns[0].mean())
-    kept = ""
+    own, kept = float(entry.returns[0].mean()), None
     if own > random.mean:  # else there is no distance to keep
-        share = (late.mean - random.mean) / (own - random.mean)
-        kept = f": it keeps {share:.0%} of its distance from random actions"
-    spec = return_format([late.mean, own])
-    which = f"{entry.name} of the first seed" if len(entry.returns) > 1 else entry.name
-    return (
-        f"With one step of delay on observation and action, which it was not trained with, "
-        f"{which} has {late.mean:{spec}} instead of {own:{spec}} ({found}){kept}."
-    )
+        kept = (late.mean - random.mean) / (own - random.mean)
+    values = {"own": own, "spec": return_format([late.mean, own]), "found": found, "kept": kept}
+    return COMPARE.said("delayed", entry=entry, late=late.mean, **values)
 
 
 def command_of(given: Named, verdict: Verdict) -> str:

@@ -20,13 +20,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf.errors import OmegaConfBaseException
 
 import coil_rl.config.schema  # noqa: F401  the types that the configurations begin with
-from coil_rl.config.compose import quoted
+from coil_rl.config.compose import compose_train, quoted
 from coil_rl.config.messages import sentence
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
@@ -47,7 +45,7 @@ def compare(arguments: Sequence[str]) -> None:
     minutes, seed = _number(own, "minutes", 2.0), _number(own, "seed", 0)
     if not isinstance(seed, int):
         raise UserError(f"seed={own['seed']} must be a whole number")
-    _check_composes(words)
+    compose_train([*words, "method=coil_anchored", "run_dir=unused"])  # mistakes, in a moment
     # They import PyTorch, which takes seconds.
     from coil_rl.comparison.compare import Comparison, new_folder
     from coil_rl.config.python import Named
@@ -91,15 +89,6 @@ def _split(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
         else:
             words.append(folders.spelled(argument))
     return own, words
-
-
-def _check_composes(words: Sequence[str]) -> None:
-    """Raise a `UserError` for a word that does not fit the configuration, in a moment."""
-    try:
-        with initialize_config_module("coil_rl.conf", version_base="1.3"):
-            compose("train", [*words, "method=coil_anchored", "run_dir=unused"])
-    except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(sentence(error)) from error
 
 
 def _number(own: dict[str, str], key: str, default: float) -> float:

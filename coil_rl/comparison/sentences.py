@@ -1,86 +1,71 @@
-"""The values of the three sentences of a comparison, whose words are in `compare.j2`."""
+"""The three sentences of a comparison: what to use; what it gained; what is undecided."""
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from coil_rl.comparison.arms import GUIDE, OPPOSITE, PPO, RANDOM, TUNE, ZERO
+from coil_rl.comparison.arms import GUIDE, PPO, RANDOM
 from coil_rl.comparison.entry import IDLE, ZERO_ACTIONS, Entry, difference
 from coil_rl.report.sentences import Sentences
 from coil_rl.report.table import return_format
 
-SENTENCES = Sentences("coil_rl.comparison", "compare.j2")
+COMPARE = Sentences("coil_rl.comparison", "compare.j2")
 AT_BEST = 0.99  # of the scale: a guide that may be left as it is
 
 
 def nothing(best: Entry, entries: Mapping[str, Entry]) -> list[str]:
     """Return the sentences where nothing is better than random actions."""
     found = difference(best, entries[RANDOM])
-    return SENTENCES.said(
-        "nothing",
-        best=best,
-        found=found,
-        trained=any(each.trained for each in entries.values()),
-        one_case=math.isnan(found.low),
-        **{name: entries[name] for name in (GUIDE, OPPOSITE, ZERO, RANDOM)},
-    )
+    finished = any(each.trained for each in entries.values())
+    return COMPARE.said("nothing", entries=entries, best=best, found=found, finished=finished)
 
 
-def what(use: Entry, entries: Mapping[str, Entry], score: float, wrong: bool) -> list[str]:
-    """Return the sentence that says which guide or policy to use."""
-    guide, random = entries[GUIDE], entries[RANDOM]
-    if use.name == GUIDE:
-        return SENTENCES.said("keep", guide=guide, score=score, is_best=score >= AT_BEST)
-    return SENTENCES.said(
-        "use",
-        kind=use.name if use.name in (OPPOSITE, TUNE) else "learned",
-        use=use,
-        guide=guide,
-        random=random,
-        wrong=wrong,
-        clear=difference(guide, random).above(0),
-        share=_share(guide, use, random),
-    )
-
-
-def idle(use: Entry, kept: Entry, entries: Mapping[str, Entry]) -> list[str]:
-    """Return the sentence where the neutral action or the untrained policy is clearly better.
+def what(
+    use: Entry, kept: Entry, entries: Mapping[str, Entry], score: float, wrong: bool
+) -> list[str]:
+    """Return the sentence that says which guide or policy to use.
 
     Args:
-        use: the neutral action or the untrained policy.
-        kept: what to use without them.
+        use: what is recommended.
+        kept: what would be without neutral action and untrained policy.
         entries: by name.
+        score: of the guide.
+        wrong: whether the guide is the wrong way round.
     """
     guide, random = entries[GUIDE], entries[RANDOM]
+    values = {"use": use, "entries": entries}
+    if use.name not in IDLE:
+        clear, share = difference(guide, random).above(0), _share(guide, use, random)
+        values |= {"score": score, "at_best": AT_BEST, "wrong": wrong}
+        return COMPARE.said("what", **values, clear=clear, share=share)
     others = [each for each in entries.values() if each is not use]
     close = [each.name for each in others if not difference(use, each).above(0)]
-    return SENTENCES.said(
+    return COMPARE.said(
         "idle",
-        use=use,
-        is_zero=use.name == ZERO,
-        is_nothing=use.action == ZERO_ACTIONS,
+        **values,
         kept=kept,
-        kept_clear=difference(kept, random).above(0),
-        close=close if set(close) <= set(IDLE) else None,
-        guide=guide,
-        random=random,
+        zero_actions=ZERO_ACTIONS,
+        close=close,
+        alone=set(close) <= set(IDLE),
+        clear=difference(kept, random).above(0),
         share=_share(guide, use, random),
     )
 
 
 def _share(entry: Entry, other: Entry, random: Entry) -> float:
     """Return the distance of an entry from random actions as a share of that of another one."""
-    whole = other.mean - random.mean
-    return (entry.mean - random.mean) / whole if whole else math.nan
+    return (entry.mean - random.mean) / (other.mean - random.mean)
 
 
 def gained(use: Entry, entries: Mapping[str, Entry]) -> list[str]:
     """Return the sentence that says what was gained over the guide and over PPO."""
-    against = {GUIDE: "the guide", PPO: "PPO"}
-    others = [name for name in against if name in entries and name != use.name]
-    parts = [(difference(use, entries[name]), against[name]) for name in others]
-    return SENTENCES.said("gained", parts=parts, cases=use.returns.shape[1])
+    titles = {GUIDE: "the guide", PPO: "PPO"}
+    found = {
+        title: difference(use, entries[name])
+        for name, title in titles.items()
+        if name in entries and name != use.name
+    }
+    return COMPARE.said("gained", found=found, cases=use.returns.shape[1])
 
 
 def undecided(
@@ -88,25 +73,25 @@ def undecided(
 ) -> list[str]:
     """Return the sentence that says what is undecided, of all entries but random actions."""
     others = [each for each in entries if each is not use]
-    widest = max(entries, key=_between_seeds)
-    spread = _between_seeds(widest)
-    return SENTENCES.said(
+    several = [each for each in entries if len(each.returns) > 1]
+    widest = max(several, key=_between_seeds, default=None)
+    spread = 0.0 if widest is None else _between_seeds(widest)
+    return COMPARE.said(
         "undecided",
         close=_listed([each.name for each in others if not difference(use, each).above(least)]),
         rising=_listed([each.name for each in entries if each.rising]),
         failed=_listed(failed),
-        trained=any(each.trained for each in entries),
-        widest=widest.name if len(widest.returns) > 1 else "",
-        seeds=len(widest.returns),
+        widest=widest,
         spread=format(spread, return_format([spread])),
+        finished=any(each.trained for each in entries),
     )
 
 
 def _between_seeds(entry: Entry) -> float:
-    """Return the difference between the best and the worst mean of a seed; -1 for one seed."""
-    return float(np.ptp(entry.returns.mean(1))) if len(entry.returns) > 1 else -1.0
+    """Return the difference between the best and the worst mean of a seed."""
+    return float(np.ptp(entry.returns.mean(1)))
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names as in a sentence."""
+    """Return names as in a sentence; empty for none."""
     return " or ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))

@@ -81,11 +81,9 @@ def verdict(entries: Mapping[str, Entry], failed: Sequence[str] = ()) -> Verdict
     wrong = difference(entries[OPPOSITE], guide).above(REVERSED * scale)
     if use.trained:
         train = use.name
-    what = sentences.what(use, entries, score, wrong)
-    if use.name in IDLE:
-        what = sentences.idle(use, kept, entries)
-    undecided = sentences.undecided(use, others, MATERIAL * scale, failed)
-    said = [*what, *sentences.gained(use, entries), *undecided]
+    said = sentences.what(use, kept, entries, score, wrong)
+    said += sentences.gained(use, entries)
+    said += sentences.undecided(use, others, MATERIAL * scale, failed)
     return Verdict(use.name, train, score, wrong, said)
 
 

@@ -23,7 +23,7 @@ from torchrl.data import (
     Unbounded,
 )
 
-from coil_rl.foreign.faults import ForeignError, plain_array, shown
+from coil_rl.foreign.faults import ForeignError, largest, plain_array, shown
 from coil_rl.foreign.makers import Env
 
 MOST_CHOICES = 32  # of a whole number that is an action
@@ -484,6 +484,7 @@ class Codec:
             )
         self.actions = Actions(name, env.action_space, dtype)
         self.fineness = Fineness(f"the env {name}", "the reward", self.floats)
+        self.largest = largest(self.floats)  # number of a reward
 
     def read(self, observation: Any) -> list[NDArray[Any]]:
         """Return copies of the entries of an observation.

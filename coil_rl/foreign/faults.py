@@ -84,26 +84,28 @@ def plain_array(value: Any, what: str) -> NDArray[Any]:
 
 
 def number(value: Any, what: str, dtype: np.dtype[Any]) -> float:
-    """Return one finite number.
-
-    Args:
-        what: name of the number, for the message.
-        dtype: in which the number must be finite.
-
-    Raises:
-        ForeignError: for None, a text, an array with a dimension, a complex number, and for a
-            number that is not finite.
-    """
-    plain = isinstance(value, (float, int))
-    if not plain and (isinstance(value, (str, bytes)) or np.ndim(value) > 0):
-        raise ForeignError(f"{what} is {shown(value)}, not one number")
-    try:
-        result = float(value)
-    except Exception as error:
-        raise ForeignError(f"{what} is {shown(value)}, not one number") from error
+    """Return one number that is finite in a dtype, see `one_number`."""
+    result = one_number(value, what)
     if not abs(result) <= largest(dtype):
         raise ForeignError(f"{what} is {result}, not a finite number of {dtype}")
     return result
+
+
+def one_number(value: Any, what: str) -> float:
+    """Return one number.
+
+    Args:
+        what: name of the number, for the message.
+
+    Raises:
+        ForeignError: for None, a text, an array with a dimension, and a complex number.
+    """
+    try:
+        if not isinstance(value, (str, bytes)) and np.ndim(value) == 0:
+            return float(value)
+    except Exception as error:
+        raise ForeignError(f"{what} is {shown(value)}, not one number") from error
+    raise ForeignError(f"{what} is {shown(value)}, not one number")
 
 
 @cache

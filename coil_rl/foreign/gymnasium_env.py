@@ -25,7 +25,6 @@ from coil_rl.foreign.codec import (
 from coil_rl.foreign.faults import ForeignError, shortened
 from coil_rl.foreign.makers import (
     Env,
-    ResetWith,
     make_env,
     maker_of,
     metadata_of,
@@ -135,18 +134,16 @@ class GymnasiumEnv(SeededRows):
         if max_steps is not None:
             settings["max_episode_steps"] = max_steps
         maker = maker_of(id)
-        if reset_options:
-            wrappers = [partial(ResetWith, options=reset_options), *wrappers]
         make = partial(make_env, maker, wrappers, settings)
         drawn, every = make, cases or num_envs
         self.shown = render and "rgb_array" in metadata_of(make(), "render_modes", ())
         if self.shown:
             drawn = partial(make_env, maker, wrappers, settings | {"render_mode": "rgb_array"})
-        name, self.floats = name_of(maker), torch.empty(0, dtype=dtype).numpy().dtype
+        name = name_of(maker)
 
         def make_plant(row: int) -> GymnasiumPlant:
             made = make if row % every else drawn
-            return GymnasiumPlant(made, makers, fresh, name, row, self.floats)
+            return GymnasiumPlant(made, makers, reset_options, fresh, name, row)
 
         self.make_plant, self.asked = make_plant, workers
         self.kind = f"{settings} {wrappers} {makers}"

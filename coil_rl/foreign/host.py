@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -145,20 +146,6 @@ def _in_space(entry: NDArray[Any], space: Any) -> Any:
     return entry
 
 
-class Function:
-    """A function of one observation as an object with `act`.
-
-    Args:
-        act: the function.
-    """
-
-    def __init__(self, act: Callable[..., Any]) -> None:
-        self.act = act
-
-    def reset(self) -> None:
-        """Begin an episode: a function remembers nothing."""
-
-
 def maker_beside(thing: Any, name: str, env: Any) -> Callable[[], Any]:
     """Return what makes the object that acts beside an env.
 
@@ -179,17 +166,13 @@ def maker_beside(thing: Any, name: str, env: Any) -> Callable[[], Any]:
     if role == "act":
         return partial(thing, env) if is_class else partial(copy.deepcopy, thing)
     if role == "predict":
-        return partial(_predictor, thing, env) if is_class else partial(Predictor, thing)
+        return lambda: Predictor(thing(env) if is_class else thing)
     if role == "function":
-        return partial(Function, partial(thing, env))
+        return partial(SimpleNamespace, act=partial(thing, env))
     raise ValueError(
         f"controller {name}: {getattr(called(thing), '__name__', type(thing).__name__)} needs a "
         "method act(observation)"
     )
-
-
-def _predictor(make: Callable[..., Any], env: Any) -> Predictor:
-    return Predictor(make(env))
 
 
 class Host:

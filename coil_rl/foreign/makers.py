@@ -21,25 +21,6 @@ EXTRAS = {"box2d": "gym", "pygame": "gym", "mujoco": "mujoco", "minigrid": "baby
 Env = gymnasium.Env[Any, Any]
 
 
-class ResetWith(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """A wrapper that gives the same options to every reset of an env.
-
-    Args:
-        env: the env.
-        options: of `reset`; those that a call gives win.
-    """
-
-    def __init__(self, env: Env, options: Mapping[str, Any]) -> None:
-        super().__init__(env)
-        self.options = dict(options)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode with the options."""
-        return self.env.reset(seed=seed, options=self.options | (options or {}))
-
-
 def maker_of(id: str | Callable[..., Env]) -> str | Callable[..., Env]:
     """Return the maker that MODULE:NAME names, if it is no registered name; else `id` itself."""
     if not isinstance(id, str) or ":" not in id:

@@ -24,8 +24,8 @@ from coil_rl.foreign.faults import (
     ForeignError,
     flag,
     foreign,
-    largest,
     number,
+    one_number,
     shortened,
     shown,
 )
@@ -90,9 +90,9 @@ class GymnasiumPlant(Plant):
     Args:
         make: makes the env.
         makers: make the controllers, by name.
+        options: of each reset.
         fresh: whether every episode has a new env.
         row: its number in a batch.
-        dtype: of numbers; rewards must be finite in it.
 
     Attributes:
         env: the present env.
@@ -110,15 +110,15 @@ class GymnasiumPlant(Plant):
     def __init__(
         self,
         make: Callable[[], Env],
-        makers: Mapping[str, Callable[..., Any]],
+        makers: Mapping[str, Any],
+        options: Mapping[str, Any] | None,
         fresh: bool,
         name: str,
         row: int,
-        dtype: np.dtype[Any],
     ) -> None:
         super().__init__(name, row)
         self.make, self.makers, self.fresh = make, makers, fresh
-        self.dtype, self.largest = dtype, largest(dtype)
+        self.options = dict(options or {})
         self.size: tuple[int, ...] | None = None  # of the pictures
         self.values: list[NDArray[Any]] = []
         self.advice: dict[str, NDArray[Any]] = {}
@@ -151,8 +151,9 @@ class GymnasiumPlant(Plant):
             self.alive.pop(id(self.env.unwrapped), None)
             self._open()
         self.seed, self.steps = seed, 0
+        given: dict[str, Any] = {"options": dict(self.options)} if self.options else {}
         with foreign(self.place, "reset"):
-            answer: Any = self.env.reset(seed=seed)
+            answer: Any = self.env.reset(seed=seed, **given)
         with self.placed():
             if not isinstance(answer, (tuple, list)) or len(answer) != 2:
                 raise ForeignError(
@@ -209,11 +210,11 @@ class GymnasiumPlant(Plant):
             isinstance(reward, float)
             and type(terminated) is type(truncated) is bool
             and type(info) is dict
-            and -self.largest <= reward <= self.largest
+            and -self.codec.largest <= reward <= self.codec.largest
         ):
             if not isinstance(info, Mapping):
                 raise ForeignError(f"info of step is {shown(info)}, not a dictionary")
-            reward = number(reward, "the reward", self.dtype)
+            reward = number(reward, "the reward", self.codec.floats)
             terminated, truncated = flag(terminated, "terminated"), flag(truncated, "truncated")
         self.reward, self.info = float(reward), info
         self.terminated, self.truncated = terminated, truncated
@@ -245,14 +246,8 @@ class GymnasiumPlant(Plant):
         value = self.info.get(name, math.nan)
         if np.ndim(value) == 1 and np.size(value) == 1:
             value = np.ravel(value)[0]
-        try:
-            if isinstance(value, (str, bytes)) or np.ndim(value) > 0:
-                raise TypeError
-            return float(value)
-        except (TypeError, ValueError) as error:
-            raise ForeignError(
-                f"{self.place}: info entry {name!r} is {shown(value)}, which is not a number"
-            ) from error
+        with self.placed():
+            return one_number(value, f"info entry {name!r}")
 
     def _begin_controllers(self) -> None:
         for host in self.controllers.values():

@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 from coil_rl.learners.encoders import entry_specs
 from coil_rl.learners.extension import Extension
 from coil_rl.output import say
-from coil_rl.transforms import GuideActions
+from coil_rl.transforms.guide_actions import GuideActions
 
 LIMIT = 10.0  # of a normalised number: an outlier must not become a huge input
 # An element is out of scale if its deviation is not between these two, or its mean is more than

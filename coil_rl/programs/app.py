@@ -277,12 +277,15 @@ def _do(
     made = _missing(Path(config.run_dir).absolute()) if has_folder else []
     try:
         check(config)
-        if has_folder and not is_sweep():
-            _make_folder(config)
+        if has_folder:
+            Path(config.run_dir).mkdir(parents=True, exist_ok=True)
         programs.imported()
         if signals.received:
             raise KeyboardInterrupt
-        return task(config)
+        result = task(config)
+        if has_folder and not is_sweep():
+            _keep_words(config)
+        return result
     except Exception:
         for folder in made:
             with contextlib.suppress(OSError):  # it is not empty, or was not made
@@ -295,15 +298,14 @@ def _missing(folder: Path) -> list[Path]:
     return [place for place in (folder, *folder.parents) if not os.path.exists(place)]
 
 
-def _make_folder(config: DictConfig) -> None:
-    """Make the folder of a run, with what Hydra keeps in it for some programs."""
-    folder, hydra_config = Path(config.run_dir), HydraConfig.get()
-    folder.mkdir(parents=True, exist_ok=True)
-    if hydra_config.output_subdir is not None:
-        place = folder / hydra_config.output_subdir
+def _keep_words(config: DictConfig) -> None:
+    """Keep what Hydra would keep of a finished program in its folder, for those that ask for it."""
+    subfolder = HydraConfig.get().output_subdir
+    if subfolder is not None:
+        place = Path(config.run_dir, subfolder)
         place.mkdir(exist_ok=True)
         OmegaConf.save(config, place / "config.yaml")
-        OmegaConf.save(hydra_config.overrides.task, place / "overrides.yaml")
+        OmegaConf.save(HydraConfig.get().overrides.task, place / "overrides.yaml")
 
 
 @contextmanager

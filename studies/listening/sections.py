@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -20,14 +20,15 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from coil_rl.cones import draw_listening_map
-from coil_rl.envs.limits import check_range
 from coil_rl.envs.track import AS_COMPLEX, Array, Track, resample
+from coil_rl.ranges import Interval, checked
 from coil_rl.report import style, write_csv
 from coil_studies.listening.measures import drawn
 
 if TYPE_CHECKING:
     from coil_studies.listening.survey import Survey
 
+Length = Annotated[float, Interval(ge=0.1, le=100)]  # m
 SECTIONS = ("straight", "left", "right", "entry", "exit")
 STRAIGHT, LEFT, RIGHT, ENTRY, EXIT = range(len(SECTIONS))
 SMOOTHING = 1.0  # m
@@ -145,6 +146,7 @@ class WholeEpisode:
         write_csv(rows, folder / "listening.csv")
 
 
+@checked
 @dataclass(eq=False)
 class TrackSections(WholeEpisode):
     """Lookup of the section of a track in which a car is, by the nearest point of the middle line.
@@ -154,9 +156,9 @@ class TrackSections(WholeEpisode):
 
     Args:
         tracks: of the env, in its order.
-        turn_radius: a turn is curved more than a circle of this radius, m, from 0.5 to 1000.
-        approach: length of the entry and of the exit of a turn, m, from 0.1 to 100.
-        bin: length of track per value of the maps, m, from 0.1 to 100; it is rounded so that their
+        turn_radius: a turn is curved more than a circle of this radius, m.
+        approach: length of the entry and of the exit of a turn, m.
+        bin: length of track per value of the maps, m; it is rounded so that their
             number on a track is whole.
     """
 
@@ -164,13 +166,11 @@ class TrackSections(WholeEpisode):
     record: ClassVar[Mapping[str, NestedKey]] = {"pose": ("info", "pose")}
     tracks: Sequence[Track]
     _: KW_ONLY
-    turn_radius: float = 10.0
-    approach: float = 4.0
-    bin: float = 1.0
+    turn_radius: Annotated[float, Interval(ge=0.5, le=1000)] = 10.0
+    approach: Length = 4.0
+    bin: Length = 1.0
 
     def __post_init__(self) -> None:
-        check_range(0.5, 1000, turn_radius=self.turn_radius)
-        check_range(0.1, 100, approach=self.approach, bin=self.bin)
         self.lines = [smooth_line(track) for track in self.tracks]  # [P, 2] m each
         # Indices in SECTIONS, [P] each.
         self.sections = [classify(line, self.turn_radius, self.approach) for line in self.lines]

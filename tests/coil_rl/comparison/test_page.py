@@ -19,13 +19,13 @@ def entry(mean):
 
 
 def test_delay_says_what_is_kept_of_the_distance_from_random_actions():
-    said = delayed_sentence(entry(100.0), entry(75.0), entry(0.0))
+    (said,) = delayed_sentence(entry(100.0), entry(75.0), entry(0.0))
     assert said.endswith("it keeps 75% of its distance from random actions.")
 
 
 @pytest.mark.parametrize("own", [-382.0, -200.0])
 def test_delay_says_nothing_of_a_distance_that_there_is_not(own):
-    said = delayed_sentence(entry(own), entry(-400.0), entry(-200.0))
+    (said,) = delayed_sentence(entry(own), entry(-400.0), entry(-200.0))
     assert "keeps" not in said
     assert said.endswith(").")
 
@@ -56,8 +56,8 @@ def anchored(seed, **first):
 def test_start_test_of_few_cases_that_held_no_guide_is_said():
     weak = anchored(0, cases=2.0, weight=0.0)
     strong = anchored(1, cases=2.0, weight=1.0), anchored(2, cases=4.0, weight=0.0), anchored(3)
-    assert few_cases(strong) == few_cases(()) == ""
-    sentence = few_cases((*strong, weak))
+    assert few_cases(strong) == few_cases(()) == []
+    (sentence,) = few_cases((*strong, weak))
     assert (
         "had only 2 cases in the frames of a training here, and held none in 1 of 4 s" in sentence
     )

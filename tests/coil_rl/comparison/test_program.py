@@ -249,7 +249,10 @@ def test_failed_training_is_one_failed_training(tmp_path):
         (["env=pendulum", "learner.gama=1"], "learner.gama"),
         (["env=pendulum", "tune={gian: [0, 1]}"], "tune.gian is no number of the guide"),
         (["env=pendulum", "tune={gain: ["], "tune="),
-        (["env=pendulum", "proxy.seed=3"], "proxy.seed=3 has no effect: method=coil_anchored"),
+        (
+            ["env=pendulum", "proxy.seed=3"],
+            "proxy.seed=3 has no effect: nothing in this run reads proxy.seed",
+        ),
         (["env=pendulum", "recording=a.mcap"], "nothing in this run reads recording; leave it out"),
         (["env=cart_pole", "training.noise_correlation=0.5"], "the actions of this env are choic"),
     ],
