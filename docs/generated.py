@@ -22,7 +22,8 @@ from sphinx.util.docutils import SphinxDirective
 import coil_rl
 
 ROOT = Path(__file__).parents[1]
-CONF = ROOT / "conf"
+# Folders with YAML files: of the library, and of the guests whose files Hydra finds beside them.
+CONFS = (ROOT / "conf", ROOT / "robot" / "conf", ROOT / "studies" / "conf")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # Headings of the API, by the beginning of the module that defines a name; the first that fits.
 PARTS = {
@@ -72,7 +73,8 @@ class Programs(Generated):
 
     def lines(self) -> Iterator[str]:
         """Yield each as a block of code."""
-        for file in sorted(CONF.glob("*.yaml")):
+        files = (file for conf in CONFS for file in conf.glob("*.yaml"))
+        for file in sorted(files, key=lambda file: file.name):
             if "hydra" in yaml.safe_load(file.read_text()):
                 yield from (f"### coil-{file.stem}", "", *block(file))
 
@@ -82,11 +84,11 @@ class Groups(Generated):
 
     def lines(self) -> Iterator[str]:
         """Yield a section for each group."""
-        for folder in sorted(CONF.iterdir()):
-            files = sorted(folder.glob("*.yaml"))
-            if not files:
-                continue
-            yield from (f"## {folder.name}", "", "| choice | what it is |", "| --- | --- |")
+        groups = {file.parent.name for conf in CONFS for file in conf.glob("*/*.yaml")}
+        for group in sorted(groups):
+            found = (file for conf in CONFS for file in (conf / group).glob("*.yaml"))
+            files = sorted(found, key=lambda file: file.name)
+            yield from (f"## {group}", "", "| choice | what it is |", "| --- | --- |")
             for file in files:
                 yield f"| `{file.stem}` | {escaped(description(file))} |"
             yield ""
@@ -134,7 +136,7 @@ def help_of(program: str) -> str:
     """Return the header of the help of a program; its docstring if it has no configuration."""
     module = PROJECT["scripts"][program].partition(":")[0]
     file = Path(program.removeprefix("coil-")).with_suffix(".yaml")
-    for folder in (CONF, ROOT / "paper" / "conf"):
+    for folder in (*CONFS, ROOT / "paper" / "conf"):
         if (folder / file).is_file():
             return str(yaml.safe_load((folder / file).read_text())["hydra"]["help"]["header"])
     return inspect.cleandoc(importlib.import_module(module).__doc__ or "")
@@ -154,7 +156,7 @@ def description(file: Path) -> str:
 
 def block(file: Path) -> Iterator[str]:
     """Yield a YAML file as a block of code, with its name."""
-    yield from ("```{code-block} yaml", f":caption: conf/{file.relative_to(CONF)}", "")
+    yield from ("```{code-block} yaml", f":caption: {file.relative_to(ROOT)}", "")
     yield from file.read_text().splitlines()
     yield from ("```", "")
 
