@@ -45,6 +45,7 @@ def test_words_that_only_the_docs_explain_are_not_in_it():
     assert [word for word in UNEXPLAINED if word in prose] == []
 
 
+@pytest.mark.slow
 def test_python_runs_as_printed(folder):
     program = PROGRAM.replace("60_000", "2048").replace("cases=100", "cases=2")
     found: dict = {}

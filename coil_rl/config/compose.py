@@ -62,11 +62,7 @@ class GuestFiles(SearchPathPlugin):
     """Lets Hydra find the files of all of them in a program whose own file is in one of them."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Append what is not there.
-
-        Args:
-            search_path: of the program.
-        """
+        """Append what is not there."""
         places = [f"pkg://{package}" for package in packages()]
         known = {element.path for element in search_path.get_path()}
         if not known.isdisjoint(places):
@@ -105,7 +101,6 @@ def keep_written(
 
     Args:
         config: composed by a Hydra that is initialised; it is changed in place.
-        hydra: its node of Hydra.
         task: overrides of the command line for the program.
         others: overrides of the command line for Hydra.
 
@@ -138,8 +133,6 @@ def _keep(config: DictConfig, values: Iterable[Written], typed: Sequence[str]) -
 
     Args:
         config: composed; it is changed in place.
-        values: in the order of composition.
-        typed: keys that the command line gives.
 
     Raises:
         UserError: for a value that two files give differently, or that has no place.
@@ -190,12 +183,7 @@ def quoted(text: str) -> str:
 
 
 def covers(one: str, other: str) -> bool:
-    """Return whether one of two keys is the other, or is inside it.
-
-    Args:
-        one: a full key.
-        other: another one.
-    """
+    """Return whether one of two keys is the other, or is inside it."""
     return one == other or other.startswith(f"{one}.") or one.startswith(f"{other}.")
 
 
@@ -248,7 +236,6 @@ def leaves(node: Any, name: str) -> Iterator[tuple[str, Any]]:
     """Yield full key and value of everything in nested mappings that is no mapping.
 
     Args:
-        node: the mapping.
         name: its own full key; empty for the whole configuration.
     """
     if not isinstance(node, Mapping):

@@ -29,7 +29,6 @@ def check_measures(measures: Any, env: EnvBase) -> None:
 
     Args:
         measures: nodes by name.
-        env: that is measured.
     """
     for name, measure in measures_of(measures).items():
         place = f"evaluation.measures.{name}"
@@ -100,7 +99,6 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
     """Check that a guide can act in an env.
 
     Args:
-        guide: the guide.
         env: of any number of rows; it is stepped once.
         name: key of the guide, for the message.
 

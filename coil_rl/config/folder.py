@@ -53,9 +53,7 @@ def read_config(
     The folder may come from anybody; `trust_packages` names packages that it may use.
 
     Args:
-        folder: of the run.
         key: of the calling program that names the folder, for the message.
-        changes: new values of top-level keys.
         goes_on: whether the run may be trained further, so that its logger is needed. A shipped one
             is taken by its name, see `coil_rl.config.trust`; another one must be trusted as any
             part, and is left out where the run is only evaluated.
@@ -158,9 +156,6 @@ def pretrained_card(name: str) -> str:
 def run_folder(text: str | Path) -> Path:
     """Return the folder that a text names: that of a shipped policy for `pretrained:NAME`.
 
-    Args:
-        text: of the user.
-
     Raises:
         UserError: for a name that does not exist, and for files that are not those that were
             shipped.
@@ -172,9 +167,6 @@ def run_folder(text: str | Path) -> Path:
 
 def folder_of(name: str) -> Path:
     """Return the folder of a shipped policy, whose files have been checked.
-
-    Args:
-        name: of the policy.
 
     Raises:
         UserError: for a name that does not exist, and for files that are not those that were

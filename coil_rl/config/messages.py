@@ -70,12 +70,7 @@ def is_no_bug(error: BaseException) -> bool:
 
 
 def refuse(name: str, error: BaseException) -> NoReturn:
-    """End a program with one sentence and exit code 2.
-
-    Args:
-        name: of the program.
-        error: with a cause outside of it.
-    """
+    """End a program with one sentence and exit code 2."""
     print(f"{name}: {sentence(error)}", file=sys.stderr)
     sys.exit(2)
 
@@ -130,12 +125,7 @@ def _not_composed(error: BaseException) -> str:
 
 
 def _wrong_kind(override: str, cause: str) -> str:
-    """Return the message for a value of another kind than its key has, or an empty string.
-
-    Args:
-        override: as typed.
-        cause: what OmegaConf says.
-    """
+    """Return the message for a value of another kind than its key has, or an empty string."""
     key, _, value = override.partition("=")
     number = NO_INTEGER.search(cause)
     if number is not None and float(number[2]).is_integer():
@@ -246,12 +236,7 @@ def _first_paragraph(error: BaseException) -> str:
 
 
 def similar(given: str, known: Iterable[str]) -> str:
-    """Return `; did you mean X?` for a name among some known ones, or an empty string.
-
-    Args:
-        given: the unknown name.
-        known: the names that exist.
-    """
+    """Return `; did you mean X?` for a name among some known ones, or an empty string."""
     if given == "run":
         return "; to go on with a run write resume=FOLDER"
     known = list(known)
@@ -263,10 +248,6 @@ def where(key: str, root: Any) -> str:
     """Return `; did you mean KEY?` for a key that is in another place of the configuration.
 
     A key that exists is in its place already: only what it is to hold does not fit.
-
-    Args:
-        key: the full key that was typed.
-        root: the whole configuration.
     """
     if not isinstance(root, DictConfig):
         return ""
@@ -320,8 +301,6 @@ def choice(group: str, name: str, options: Iterable[str]) -> str:
 
     Args:
         group: such as "env".
-        name: the choice.
-        options: the names of its files.
     """
     if group == "env" and re.search(r":|-v\d+$", name):
         return f"; for an env of Gymnasium write env=gym env.id={name}"

@@ -208,7 +208,6 @@ def converted(target: Callable[..., Any], node: Mapping[str, Any]) -> dict[str, 
 
     Args:
         target: class or function.
-        node: its checked arguments.
     """
     if not is_foreign(target):
         return dict(node)

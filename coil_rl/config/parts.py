@@ -374,10 +374,6 @@ def unread_controllers(config: DictConfig, transforms: Iterable[Transform]) -> s
 
     They are those that neither a transform reads nor any part of the configuration names: the
     observation, the method, what is logged, measures and pictures.
-
-    Args:
-        config: of a run.
-        transforms: of the env.
     """
     names = set(OmegaConf.select(config, "env.controllers") or ())
     keys = [key for part in transforms for key in (part.in_keys or ())]

@@ -174,10 +174,6 @@ def named(env: Any, guide: Any, place: str) -> Named:
 def prepared(given: Named, folder: str | Path) -> Run:
     """Return a run that is checked and ready to train.
 
-    Args:
-        given: everything that it consists of.
-        folder: of the run.
-
     Raises:
         UserError: for a mistake.
     """
@@ -194,10 +190,6 @@ def prepared(given: Named, folder: str | Path) -> Run:
 
 def composed(given: Named, folder: str | Path) -> DictConfig:
     """Return the configuration of a run.
-
-    Args:
-        given: everything that it consists of.
-        folder: of the run.
 
     Raises:
         UserError: for words that do not fit.

@@ -207,13 +207,7 @@ class _Entry(NamedTuple):
 
 
 def _check_target(target: Any, name: str, path: Path) -> None:
-    """Raise a `UserError` if an entry names something that a folder may not call.
-
-    Args:
-        target: what it names.
-        name: full key of the entry.
-        path: of the configuration, for the message.
-    """
+    """Raise a `UserError` if an entry names something that a folder may not call."""
     entry = _Entry(path, name, target)
     package = target.partition(".")[0] if isinstance(target, str) else ""
     if not package.isidentifier():
@@ -293,9 +287,6 @@ def _fits(shipped: Any, given: Any) -> bool:
 def check_logger(node: Mapping[str, Any]) -> None:
     """Check that the package of a logger is installed, before a run is begun.
 
-    Args:
-        node: of the logger.
-
     Raises:
         UserError: if it is missing.
     """
@@ -306,9 +297,6 @@ def check_logger(node: Mapping[str, Any]) -> None:
 
 def make_logger(node: Any) -> Any:
     """Return the logger of a run.
-
-    Args:
-        node: of the logger.
 
     Raises:
         UserError: for whatever the logger raises, such as without a log-in or a server.

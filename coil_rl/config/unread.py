@@ -37,10 +37,6 @@ OF_A_TRAINING = (
 def check_read(config: DictConfig, task: Iterable[str]) -> None:
     """Refuse a word of the command line that a run does not read.
 
-    Args:
-        config: of the run, composed and checked.
-        task: words for the program.
-
     Raises:
         UserError: for the first word without an effect.
     """
@@ -49,12 +45,7 @@ def check_read(config: DictConfig, task: Iterable[str]) -> None:
 
 
 def unread(config: DictConfig, task: Iterable[str]) -> Iterator[str]:
-    """Yield a sentence for each word of the command line that a run does not read.
-
-    Args:
-        config: of the run, composed and checked.
-        task: words for the program.
-    """
+    """Yield a sentence for each word of the command line that a run does not read."""
     closed = [*_unread_nodes(config)]
     references = set(_references(config, closed))
     for text in task:

@@ -137,6 +137,5 @@ def is_complete(measures: DictConfig, name: str) -> bool:
 
     Args:
         measures: of a configuration, by name.
-        name: of the measure.
     """
     return OmegaConf.get_type(measures, name) is MeasureConfig

@@ -25,13 +25,6 @@ class A2C(PPO):
     """The A2C learner: PPO with the loss above and one pass over each batch.
 
     Args:
-        env: the env, for its specs.
-        in_keys: entries that policy and critic observe.
-        learning_rate: of Adam, a number or a schedule.
-        gae_lambda: lambda of generalised advantage estimation.
-        entropy: coefficient of the entropy bonus, a number or a schedule.
-        critic: coefficient of the critic's loss.
-        compile: whether to compile the update, see `GradientStep`.
         standardise: whether to standardise the advantages of a minibatch. The coefficients of other
             losses then do not depend on the scale of the reward.
         settings: further ones of `PPO`.

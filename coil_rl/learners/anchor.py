@@ -271,8 +271,6 @@ def start_tests(anchor: Anchor | None, policy: nn.Module, cases: Cases) -> list[
 
     Args:
         anchor: the settings; None: the policy is not anchored.
-        policy: of the learner.
-        cases: in which policies are tested.
     """
     hold = hold_of(policy)
     return [] if anchor is None or hold is None else [StartTest(anchor, policy, hold, cases)]
@@ -386,7 +384,6 @@ class StartTest:
         """Return whether the frames of the test allow for further steps.
 
         Args:
-            steps: how many.
             shares: of the frames that the test may take, see `Anchor.share`.
         """
         return self.cases.steps + steps <= shares * self.anchor.share * self.cases.frames
@@ -429,8 +426,6 @@ class StartTest:
         """Return whether a paired difference is more than some standard errors.
 
         Args:
-            better: weights.
-            worse: weights.
             errors: number of standard errors; None: the bar of the number of cases.
         """
         both = torch.stack([self.returns[better], self.returns[worse]])

@@ -115,7 +115,6 @@ class SquashedNormal(Normal):
     Args:
         loc: means before squashing, [*batch, *event].
         scale: standard deviations before squashing.
-        event_dims: number of dimensions of an action.
         bounds: lower and upper ones, of the shape of an action; None: -1 and 1.
     """
 
@@ -239,11 +238,7 @@ class Choices(Density):
 
 
 class OneHotChoice(Choices):
-    """One choice, one-hot.
-
-    Args:
-        logits: of the options, [*batch, n].
-    """
+    """One choice, one-hot; logits [*batch, n]."""
 
     def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return a one-hot option and its logarithmic probability."""

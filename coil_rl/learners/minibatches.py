@@ -29,12 +29,7 @@ class Minibatches(Stateful):
         self.generator = torch.Generator().manual_seed(seed)
 
     def rows(self, batch: TensorDictBase, keys: Sequence[NestedKey]) -> Entries:
-        """Return what minibatches are drawn from: entries of the steps of a batch [B, T], [B * T].
-
-        Args:
-            batch: of any number of dimensions.
-            keys: of the entries.
-        """
+        """Return what minibatches are drawn from: entries of the steps of a batch, [B * T]."""
         return Entries({key: batch[key].flatten(0, batch.ndim - 1) for key in keys})
 
     def draw(self, rows: Entries) -> Iterator[Entries]:
@@ -62,9 +57,6 @@ class RowMinibatches(Minibatches):
     time. After that the steps are a minibatch as any other.
 
     Args:
-        epochs: passes over a batch, each in another random order.
-        count: minibatches in each pass.
-        seed: of the random orders.
         memory: the part of the policy up to its GRU; it writes `remembered`.
     """
 
@@ -88,11 +80,7 @@ class RowMinibatches(Minibatches):
         yield from map(self.remember, super().draw(rows))
 
     def check_rows(self, rows: int) -> None:
-        """Raise a `ValueError` if there are fewer rows than minibatches.
-
-        Args:
-            rows: number of them.
-        """
+        """Raise a `ValueError` if there are fewer rows than minibatches."""
         if rows < self.count:
             raise ValueError(
                 f"minibatches={self.count} are more than the {rows} envs, but with a memory each "

@@ -134,8 +134,6 @@ def actor(
     `action_log_prob`. With a memory it also writes its next state, see `Gru`.
 
     Args:
-        env: the env, for its specs.
-        in_keys: entries that the policy observes.
         network: architecture, perhaps with a memory, which the env then carries.
         scale: initial standard deviation, before squashing; for continuous actions only.
         gain: scale of the initial weights of the last layer.
@@ -180,7 +178,6 @@ def inputs_of(env: EnvBase, normaliser: Normaliser | None, anchor: Anchor | None
     """Return what the networks of a learner read in place of entries of the env, if anything.
 
     Args:
-        env: the env, for its specs.
         normaliser: of some entries; None: of none.
         anchor: the settings of an anchored policy; None: it is none.
 
@@ -379,7 +376,6 @@ def critic(
     """Return a state-value network; it writes `state_value` [*batch, 1].
 
     Args:
-        env: the env, for its specs.
         in_keys: entries that it observes; with a memory it also reads the stored state.
         network: architecture, perhaps with a memory.
         inputs: what it reads in place of some of `in_keys`.
@@ -404,11 +400,8 @@ def action_critic(
     """Return an action-value network for numbers; it writes `state_action_value` [*batch, 1].
 
     Args:
-        env: the env, for its specs.
         in_keys: entries that it observes, besides the action.
-        network: architecture.
         inputs: has written what the network reads in place of some of `in_keys` already.
-        action_key: entry of the action.
     """
     keys: list[NestedKey] = [*in_keys, action_key]
     values = ObservationNetwork(

@@ -136,8 +136,7 @@ class ByKey(TensorDictSequential):
 class Policy(ProbabilisticTensorDictSequential):
     """A policy: modules one after the other, of which the last one samples.
 
-    Args:
-        modules: each reads and writes entries; the last one is a `Sample`, or one of TorchRL.
+    Each reads and writes entries; the last one is a `Sample`, or one of TorchRL.
     """
 
     forward = ByKey.forward

@@ -18,7 +18,6 @@ def report_of(steps: Sequence[Mapping[str, Tensor]], clip: Sequence[float]) -> d
 
     Args:
         steps: the entries `SEEN` of each minibatch, [N, 1] each; N may differ.
-        clip: bounds of the logarithmic ratio.
     """
     of_size: dict[int, list[Mapping[str, Tensor]]] = {}
     for step in steps:

@@ -31,11 +31,7 @@ class Reinforce(A2C):
     """The REINFORCE learner: A2C with the whole return, lambda = 1.
 
     Args:
-        env: the env, for its specs.
-        in_keys: entries that policy and critic observe.
         baseline: "critic", a network that is trained on the returns, or "none".
-        learning_rate: of Adam, a number or a schedule.
-        compile: whether to compile the update, see `GradientStep`.
         standardise: whether to standardise G - b in a minibatch. The coefficients of other losses
             then do not depend on the scale of the reward.
         settings: further ones of `PPO`.

@@ -77,8 +77,6 @@ class SAC(OffPolicy):
         uncertainty: whether the policy writes that of the critics, see `Critics`, for
             `AdaptiveMixedAction`.
         auxiliary: extensions, such as losses of the policy (`KickstartLoss`).
-        tau: step of the target networks towards the networks after each minibatch, as a fraction.
-        ratio: how often a step is sampled, on average over the run.
         settings: further ones of `OffPolicy`. Take a large `max_grad_norm` for returns in the
             hundreds, as of a pendulum: otherwise the gradients of the critics dominate those of
             the policy.

@@ -32,15 +32,12 @@ class TRPO(PPO):
     """The TRPO learner. The optimiser, its passes and its minibatches are for the critic only.
 
     Args:
-        env: the env, for its specs.
-        in_keys: entries that policy and critic observe.
         max_kl: bound on a step, mean KL(before || after) over the batch.
         damping: added to the diagonal of the Fisher matrix, which may be singular.
         iterations: of the conjugate gradients.
         backtracks: how often the line search may shorten a step.
         shrink: factor by which it shortens a step.
         learning_rate: of the critic by Adam, a number or a schedule.
-        gae_lambda: lambda of generalised advantage estimation.
         epochs: passes of the critic over each batch.
         settings: further ones of `PPO`; a network without a memory. Minibatches and `max_grad_norm`
             are those of the critic, and losses of `auxiliary` are part of the objective.

@@ -56,7 +56,6 @@ def with_exported(config: DictConfig, file: str) -> DictConfig:
     """Return the configuration of a run in which an exported policy is a guide that acts alone.
 
     Args:
-        config: of the run.
         file: of the exported policy, or its folder.
 
     Raises:
@@ -79,10 +78,6 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
     """Return the configuration of a run with the requested evaluation.
 
     Everything is as in the run but for what the command line gives.
-
-    Args:
-        folder: of the run.
-        requested: configuration of the program.
 
     Raises:
         UserError: for a folder without a run, one without tracks although tracks are given, or an

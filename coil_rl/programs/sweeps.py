@@ -124,11 +124,7 @@ def described(frames: Sequence[int]) -> str:
 
 
 def knows_all_runs(sweeper: DictConfig) -> bool:
-    """Return whether a sweeper makes all combinations, so that the runs of a sweep are known.
-
-    Args:
-        sweeper: the node of Hydra.
-    """
+    """Return whether a sweeper makes all combinations, so that the runs of a sweep are known."""
     return str(sweeper.get("_target_")).endswith(BasicSweeper.__name__)
 
 
@@ -187,11 +183,7 @@ def _plain(config: DictConfig, kind: str) -> list[str]:
 
 
 def remove_unused(folder: Path) -> None:
-    """Remove the folder of a sweep none of whose jobs has begun.
-
-    Args:
-        folder: of the sweep.
-    """
+    """Remove the folder of a sweep none of whose jobs has begun."""
     of_sweep = ("multirun.yaml", FAILED_JOBS)
     if all(path.is_dir() or path.name in of_sweep for path in folder.rglob("*")):
         shutil.rmtree(folder, ignore_errors=True)
@@ -277,7 +269,6 @@ def command_of(arguments: Sequence[str], folder: str) -> str:
 
     Args:
         arguments: of the program that began it, its own path first.
-        folder: of the sweep.
     """
     program, *others = arguments
     if not any(argument.startswith("hydra.sweep.dir=") for argument in others):

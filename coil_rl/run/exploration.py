@@ -52,7 +52,6 @@ def noise_of(env: EnvBase, correlation: float, parts: int = 1) -> CorrelatedNois
     """Return the correlated noise of an env; None for choices, or without a correlation.
 
     Args:
-        env: whose actions are sampled.
         correlation: of consecutive steps.
         parts: see `CorrelatedNoise`.
 

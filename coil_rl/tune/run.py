@@ -247,10 +247,6 @@ class TunedRun(Run):
 def beyond_budget(folder: Path, frames: int) -> list[str]:
     """Return the sentence for a search that took more frames than its budget; none for another.
 
-    Args:
-        folder: of the run.
-        frames: the budget.
-
     Raises:
         UserError: if the file is damaged.
     """

@@ -85,11 +85,7 @@ class Search:
     share: Annotated[float, Interval(gt=0, le=0.5)] = 0.15
 
     def size(self, numbers: int) -> int:
-        """Return the number of candidates in a generation.
-
-        Args:
-            numbers: how many are searched.
-        """
+        """Return the number of candidates in a generation."""
         return self.population or max(6, 4 + math.floor(3 * math.log(numbers)))
 
 

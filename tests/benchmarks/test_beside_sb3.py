@@ -13,6 +13,7 @@ SHORT = {
 ENVS = {"ppo": "CartPole-v1", "sac": "Pendulum-v1", "dqn": "CartPole-v1"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", VALUES)
 def test_our_learner_trains_with_the_shared_values(algorithm):
     frames = 512 if algorithm == "ppo" else 40

@@ -30,6 +30,7 @@ def walked(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_compiled_function_has_the_results_the_changes_and_the_random_numbers_of_the_function(
     walked, monkeypatch
 ):
@@ -45,6 +46,7 @@ def test_compiled_function_has_the_results_the_changes_and_the_random_numbers_of
         torch.testing.assert_close([distance, drawn, found], [*reference, expected])
 
 
+@pytest.mark.slow
 def test_code_is_found_by_the_operations_and_the_shapes_and_constants(walked, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(walked))
     made = []

@@ -63,6 +63,7 @@ def used(run, which="last"):
     return bool(moments.used)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [ON_POLICY, REPLAY], ids=["ppo", "sac"])
 def test_observations_in_physical_units_are_normalised_and_it_is_said(options, tmp_path, capsys):
     run = learned(PHYSICAL, tmp_path / "run", *options)
@@ -76,6 +77,7 @@ def test_observations_in_physical_units_are_normalised_and_it_is_said(options, t
     assert np.ptp(actions) > 1e-3  # the network is not saturated
 
 
+@pytest.mark.slow
 def test_observations_in_scale_stay_as_they_are(tmp_path, capsys):
     run = learned(Reactor, tmp_path / "auto", *ON_POLICY)
     assert "normalise: observation is in scale and stays as it is" in capsys.readouterr().err
@@ -134,6 +136,7 @@ class Drifting(Reactor):
         return (10.0 ** min(self.begun - 1, 4) * self.state).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_observations_that_leave_their_scale_later_are_named_once(tmp_path):
     with pytest.warns(UserWarning, match="out of scale") as found:
         learned(Drifting, tmp_path / "run", *ON_POLICY, "budget.steps=8", frames=512)

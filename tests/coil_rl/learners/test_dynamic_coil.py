@@ -159,6 +159,7 @@ def test_each_phase_changes_its_networks_only_and_at_a_smaller_rate_than_the_las
     assert [metrics["guide_learning_rate"] for _, metrics in result] == [0, 1e-3, 0, 5e-4]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "groups"),
     [
@@ -205,6 +206,7 @@ def test_state_resumes_in_the_middle_of_a_phase():
     assert changed(weights(first), weights(second)) == [False] * 4
 
 
+@pytest.mark.slow
 def test_guide_learns_to_steer_through_a_frozen_agent():
     """Steering left is rewarded. The guide can change it only through its advice to the agent."""
     env = cars()

@@ -190,6 +190,7 @@ def test_critic_values_the_state_in_which_a_truncated_episode_ended():
     torch.testing.assert_close(batch["next", "state_value"][:, 3], batch["state_value"][:, 4])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "options"),
     [
@@ -279,6 +280,7 @@ def test_run_resumes_to_the_bit_and_is_evaluated_in_a_new_env(method, tmp_path):
     assert float(row[4]) == pytest.approx(mean)
 
 
+@pytest.mark.slow
 def test_policy_with_a_memory_is_a_guide(tmp_path):
     run = make_untrained_run(
         tmp_path / "run", *TINY, "method=ppo", "network=gru", "learner.action_gain=3"

@@ -115,6 +115,7 @@ def test_large_kickstart_loss_makes_the_policy_imitate_the_guide(kind):
     assert losses[-1] < losses[0] - 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [PPO, A2C])
 def test_entropy_bonus_keeps_the_policy_random(kind):
     def largest_probability(entropy):

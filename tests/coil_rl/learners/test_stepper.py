@@ -36,6 +36,7 @@ def made(name):
     return MAKERS[name](env), env
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_six_updates_in_their_trainer_are_six_updates(name):
     learner, env = made(name)

@@ -12,7 +12,6 @@ import kill_and_resume
 import pytest
 from hydra import compose, initialize_config_module
 from programs import called, shipped
-from slow import some_fast
 
 import coil_rl.config.schema  # noqa: F401 registers the schema
 from coil_rl.config.parts import env_maker
@@ -104,7 +103,8 @@ def test_env_takes_steps_with_the_advice_of_its_guide(env):
         assert rollout[key].float().isfinite().all(), key
 
 
-@pytest.mark.parametrize("env", some_fast([*TRACKED, *OTHERS], OTHERS))
+@pytest.mark.slow
+@pytest.mark.parametrize("env", [*TRACKED, *OTHERS])
 def test_env_trains_and_is_evaluated_in_its_own_cases(env, tmp_path):
     trained(env, "ppo", tmp_path / "run")
     with (tmp_path / "run" / "evaluation.csv").open(newline="") as file:

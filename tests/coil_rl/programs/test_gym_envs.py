@@ -53,6 +53,7 @@ def test_controller_of_an_env_is_evaluated(env, tmp_path):
     assert rewards["mean"] >= LEAST.get(env, -200)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [["env.options.continuous=false"], ["guide=none", "method=ppo"]]
 )

@@ -38,10 +38,10 @@ def start(cwd, *commands):
 
 
 # Hydra takes more than a second for each help text.
-@pytest.mark.parametrize("names", [["train"], pytest.param(PROGRAMS, marks=pytest.mark.slow)])
-def test_help_begins_with_examples_and_imports_nothing_heavy(names, tmp_path):
-    results = start(tmp_path, *([name, "--help"] for name in names))
-    for name, (code, out, _, heavy) in zip(names, results, strict=True):
+@pytest.mark.slow
+def test_help_begins_with_examples_and_imports_nothing_heavy(tmp_path):
+    results = start(tmp_path, *([name, "--help"] for name in PROGRAMS))
+    for name, (code, out, _, heavy) in zip(PROGRAMS, results, strict=True):
         assert (name, code, heavy) == (name, 0, set())
         assert out.startswith(f"coil-{name}: ")
         assert out.count(f"\n  coil-{name}") >= 2
@@ -86,6 +86,7 @@ def test_info_imports_nothing_heavy(tmp_path):
 BACKENDS = ["nonsense", "module://matplotlib_inline.backend_inline", "module://not.there", "tkagg"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_programs_draw_whatever_backend_the_environment_names(backend, tmp_path):
     # What every program does around its task, and what a task does to draw.

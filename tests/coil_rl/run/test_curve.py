@@ -119,6 +119,7 @@ def test_guide_measured_from_its_cases_does_not_crash(rings):
     assert not values["crashed"].any()
 
 
+@pytest.mark.slow
 def test_returns_are_summed_as_exactly_as_those_of_the_table():
     class Costly(gymnasium.Env):
         observation_space, action_space = spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (1,))

@@ -181,6 +181,7 @@ def test_test_at_the_end_is_left_out_where_the_start_test_took_the_frames_of_bot
     assert "1 had no frames left for a test and handed over their last policy" in page
 
 
+@pytest.mark.slow
 def test_run_without_a_start_test_knows_from_its_training_how_long_a_test_would_be(tmp_path):
     small = ["method=coil", "delivery=tested", "budget.frames=1200", "budget.num_envs=2"]
     run = trained(tmp_path / "run", ONCE, *small)
@@ -240,6 +241,7 @@ def test_guide_acts_alone_also_where_actions_are_combined(method):
     torch.testing.assert_close(combined.returns(GuideActs(combined.env)), expected)
 
 
+@pytest.mark.slow
 def test_run_without_a_guide_in_its_env_compares_its_own_policies(tmp_path):
     folder = trained(tmp_path / "run", "method=ppo", ONCE)
     assert set(report(folder)["returns"]) <= {"last", "earlier"}

@@ -54,6 +54,7 @@ def test_given_guides_are_not_cached(composed):
     assert given["guide spline"].mean_reward == cached["guide spline"].mean_reward
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["evaluation.repeats=2", "degrade=delayed", "env.time_limit=2"])
 def test_guides_beside_an_agent_drive_as_they_do_alone(composed, change, tmp_path):
     config = composed(

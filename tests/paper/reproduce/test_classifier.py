@@ -18,6 +18,7 @@ def drives(tmp_path_factory):
     return record_labelling_drives(tmp_path_factory.mktemp("drives"), pairs=2, both=1)
 
 
+@pytest.mark.slow
 def test_the_page_has_the_accuracy_of_the_saved_classifier(drives, tmp_path):
     page = Figure25(**drives).make(tmp_path / "figure_25")
     tested = labelled_drive(read_recording(drives["both"][0]))

@@ -24,6 +24,7 @@ def in_order(points):
     return np.sort_complex(points @ [1, 1j])
 
 
+@pytest.mark.slow
 def test_figure_10_is_the_clipped_term_and_red_where_it_is_flat(tmp_path):
     page, series = series_of(Figure10(), tmp_path)
     for title, sign in (("A < 0", -1), ("A > 0", 1)):
@@ -82,6 +83,7 @@ def test_figure_30_is_equation_103(tmp_path):
         assert beta == pytest.approx(160 / math.pi * np.arctan(alpha / distance**1.8))
 
 
+@pytest.mark.slow
 def test_figure_31_has_midpoints_of_pairs_and_targets_on_the_spline(tmp_path):
     page, series = series_of(Figure31(), tmp_path)
     left, right, midpoints = (

@@ -41,6 +41,7 @@ def recordings(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_measures_of_recordings_equal_those_of_the_simulation(recordings, tmp_path):
     page = Table6(recordings=[str(recordings)]).make(tmp_path / "table_6")
     rows = {line["recording"]: line for line in read_csv(tmp_path / "table_6.csv")}
@@ -102,6 +103,7 @@ def runs(tmp_path_factory):
     return {"mine": [Run(folder / f"{label}_{seed}", label, seed, None) for label, seed in made]}
 
 
+@pytest.mark.slow
 def test_without_recordings_the_guide_and_the_agents_drive_and_are_recorded_once(runs, tmp_path):
     table = Table6(["mine"], labels=["ppo", "coil"], repeats=1)
     assert table.experiments == ["mine"]
@@ -126,6 +128,7 @@ def test_without_recordings_the_guide_and_the_agents_drive_and_are_recorded_once
     assert sorted(map(str, read_csv(tmp_path / "again.csv"))) == sorted(map(str, rows))
 
 
+@pytest.mark.slow
 def test_all_drive_on_further_tracks_too(runs, tmp_path):
     worlds = {"cones missing": robot_tracks(missing=0.2, seed=1)}
     table = Table6(["mine"], labels=["ppo"], repeats=1, worlds=worlds)
@@ -144,6 +147,7 @@ def robots_of(run, folder):
     return read_recording(folder / "own_drives" / f"{run.name}_0.mcap")
 
 
+@pytest.mark.slow
 def test_own_runs_drive_with_any_label_and_again_with_other_weights(tmp_path):
     options = [
         "guide=constant",
