@@ -337,7 +337,7 @@ class PPO(Stateful, Learner):
         if SEEN[0] not in steps[0]:
             return means_of
         more = report_of(steps, self.clip_bounds)
-        first = {name: means_of.pop(name) for name in ("loss_objective",)}
+        first = {"loss_objective": means_of.pop("loss_objective")}
         first |= {name: more.pop(name) for name in OF_POLICY}
         own = ("entropy", "loss_entropy", "loss_critic")
         first |= {name: means_of.pop(name) for name in own if name in means_of}
