@@ -311,6 +311,7 @@ class Takeover(_ActionSwitch):
         return agent | (self.taken >= self.frames).to(agent.device)
 
 
+@checked
 class GradualResidual(Takeover):
     """Residual policy that is mixed in step by step: Policy Decorator (Yuan et al. 2024).
 

@@ -54,6 +54,10 @@ def choices():
     return cones(ScaledAdvice(0.5), DiscreteActions(3))
 
 
+def several_choices():
+    return TransformedEnv(AnyEnv(5, MultiCategorical([2, 3])), RewardSum())
+
+
 def collected(make_env, correlation, lean, options):
     """Three batches, with what a run logs; the last two after a restored state."""
     torch.manual_seed(0)
@@ -81,6 +85,7 @@ def collected(make_env, correlation, lean, options):
         pytest.param(cones, {"in_keys": ADVISED}, id="advice"),
         pytest.param(cones, {"in_keys": ADVISED, "squash": False}, id="clipped"),
         pytest.param(choices, {"in_keys": ADVISED}, id="choices"),
+        pytest.param(several_choices, {}, id="several choices"),
         pytest.param(advised_pendulum, {"in_keys": ADVISED, "anchor": Anchor()}, id="anchored"),
         pytest.param(partial(gym, "Pendulum-v1"), {"normalise": True}, id="pendulum"),
         pytest.param(partial(gym, "CartPole-v1"), {"normalise": "auto"}, id="cart pole"),
@@ -152,7 +157,6 @@ def test_what_lean_steps_do_not_know_keeps_the_steps_of_torchrl():
     assert not covered(bare(ObservationNoise()))
     gru = Gru(state=4)
     assert not covered(bare(*gru.env_transforms()), network=gru)
-    assert not covered(AnyEnv(action=MultiCategorical([2, 3])))
     assert not covered(AnyEnv(agents=True))
     assert not covered(worlds.carts())  # an env of TorchRL
     env = bare()

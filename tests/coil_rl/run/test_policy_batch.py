@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from worlds import cones, perturbed
 
 from coil_rl.compiled import record
-from coil_rl.imitation import Imitation, LinearRegressor
+from coil_rl.imitation import ForestRegressor, Imitation
 from coil_rl.learners import DQN, PPO, SAC, Anchor
 from coil_rl.run.policy_batch import (
     PartlySampled,
@@ -35,7 +35,7 @@ def test_batch_of_policies_acts_like_each_of_them(learner):
     env = cones(*([DiscreteActions()] if learner == "dqn" else []))
     states = []
     if learner == "forest":
-        imitation = Imitation(env, regressor=LinearRegressor(), validate=False)
+        imitation = Imitation(env, regressor=ForestRegressor(n_estimators=3), validate=False)
         policy = imitation.policy
         for seed in range(3):
             torch.manual_seed(seed)
