@@ -1,4 +1,4 @@
-"""What is left out by `make test`, and run by `make test-all` and by `.ci/run`."""
+"""What is left out by `make test`, and run by `make test-all`; most of it by `.ci/run`, too."""
 
 import pytest
 

@@ -336,12 +336,9 @@ class PPO(Stateful, Learner):
             means_of["loss_entropy"] *= weights["loss_entropy"]
         if SEEN[0] not in steps[0]:
             return means_of
-        more = report_of(steps, self.clip_bounds)
-        first = {name: means_of.pop(name) for name in ("loss_objective",)}
-        first |= {name: more.pop(name) for name in OF_POLICY}
-        own = ("entropy", "loss_entropy", "loss_critic")
-        first |= {name: means_of.pop(name) for name in own if name in means_of}
-        return first | more | means_of
+        values = report_of(steps, self.clip_bounds) | means_of
+        first = ("loss_objective", *OF_POLICY, "entropy", "loss_entropy", "loss_critic")
+        return {name: values[name] for name in first if name in values} | values
 
     def callbacks(self, cases: Cases) -> Sequence[Callback]:
         """Return the start test of an anchored policy."""

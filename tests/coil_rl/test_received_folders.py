@@ -9,7 +9,7 @@ from run_folders import driven, make_run
 from coil_rl.config.folder import read_config
 from coil_rl.config.nodes import build
 from coil_rl.errors import UserError
-from coil_rl.foreign.controllers import RecordedGuide
+from coil_rl.guides.recorded import RecordedGuide
 from coil_rl.learners.dynamic_coil import PhaseSchedule
 from coil_rl.report.runs import read_runs
 from coil_rl.run import checkpoint

@@ -55,7 +55,7 @@ def choices():
 
 
 def several_choices():
-    return TransformedEnv(AnyEnv(5, MultiCategorical([2, 3])), RewardSum())
+    return TransformedEnv(AnyEnv(action=MultiCategorical([2, 3])), Compose(RewardSum()))
 
 
 def collected(make_env, correlation, lean, options):

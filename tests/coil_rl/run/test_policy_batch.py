@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from worlds import cones, perturbed
 
 from coil_rl.compiled import record
-from coil_rl.imitation import ForestRegressor, Imitation
+from coil_rl.imitation import ForestRegressor, Imitation, LinearRegressor
 from coil_rl.learners import DQN, PPO, SAC, Anchor
 from coil_rl.run.policy_batch import (
     PartlySampled,
@@ -30,12 +30,13 @@ def observations(env):
     return TensorDict({"observation": torch.rand(15, 20), "guide_action": advice}, [15])
 
 
-@pytest.mark.parametrize("learner", ["ppo", "anchored", "sac", "dqn", "forest"])
+@pytest.mark.parametrize("learner", ["ppo", "anchored", "sac", "dqn", "linear", "forest"])
 def test_batch_of_policies_acts_like_each_of_them(learner):
     env = cones(*([DiscreteActions()] if learner == "dqn" else []))
     states = []
-    if learner == "forest":
-        imitation = Imitation(env, regressor=ForestRegressor(n_estimators=3), validate=False)
+    if learner in ("linear", "forest"):
+        regressor = LinearRegressor() if learner == "linear" else ForestRegressor(n_estimators=3)
+        imitation = Imitation(env, regressor=regressor, validate=False)
         policy = imitation.policy
         for seed in range(3):
             torch.manual_seed(seed)
