@@ -452,6 +452,11 @@ def about_choices(config: DictConfig) -> str:
     needs = f"method={config.method.name}"
     if config.method.name in WITH_CHOICES:  # then it is another learner than the method's own
         needs = f"learner={config.learner['_target_'].rpartition('.')[2].lower()}"
+    if config.action:
+        return (
+            f"{needs} needs numbers as actions, but action=choices makes choices of them; leave "
+            f"action= out, or take learner=dqn or learner=ppo with method={', '.join(WITH_CHOICES)}"
+        )
     return (
         f"{needs} needs numbers as actions, but they are choices here; with choices take "
         f"learner=ppo and method={', '.join(WITH_CHOICES)}"

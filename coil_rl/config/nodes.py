@@ -294,7 +294,8 @@ def _known(value: Any, sequence: type[list[Any]] | type[tuple[Any, ...]]) -> Any
 def _parameters(target: Callable[..., Any]) -> list[inspect.Parameter] | None:
     """Return the parameters of a target.
 
-    They include those that a class of this project passes on to its base class.
+    They include those that a class passes on to its base class: one of this project, or one that
+    says which by `Unpack`.
     """
     has_init = inspect.isclass(target) and target.__init__ is not object.__init__
     try:
@@ -308,13 +309,13 @@ def _parameters(target: Callable[..., Any]) -> list[inspect.Parameter] | None:
     passes_on = has_init and (
         "__init__" not in vars(target) or any(p.kind is p.VAR_KEYWORD for p in own)
     )
-    if not inspect.isclass(target) or not passes_on or not target.__module__.startswith("coil_rl."):
+    settings = [known for p in own if (known := settings_of(p)) is not None]
+    if not inspect.isclass(target) or not passes_on or (is_foreign(target) and not settings):
         return own
     base = _parameters(target.__bases__[0])
     if base is None:
         return own
     names = {parameter.name for parameter in own}
-    settings = [known for p in own if (known := settings_of(p)) is not None]
     return [p for p in own if p.kind is not p.VAR_KEYWORD] + [
         p for p in base if p.name not in names and all(p.name in known for known in settings)
     ]

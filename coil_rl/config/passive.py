@@ -39,6 +39,7 @@ def check_passive(config: DictConfig, make_env: EnvMaker) -> None:
     kind = passive(config)
     if kind is None:
         return
+    env: Any = make_env.bare(None, TRAIN, None)  # first, because it says if there are no data
     explores = False
     for node in config.method.transforms.values():
         probability = OmegaConf.select(node, "probability")
@@ -49,7 +50,6 @@ def check_passive(config: DictConfig, make_env: EnvMaker) -> None:
             "learn there; imitate what it shows with method=oil, and go on from there in an env "
             "that reacts: method=dagger env=ENV learner.dataset=FOLDER/dataset.pt"
         )
-    env: Any = make_env.bare(None, TRAIN, None)
     _check_pass(config, env, kind.whole_pass(config.env)[0])
     try:
         for line in env.demonstrations():

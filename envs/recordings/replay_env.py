@@ -132,7 +132,9 @@ class McapReplayEnv(EnvBase):
         else:
             sources = list(recordings or ())
         if not sources:
-            raise ValueError("recordings is empty; give at least one MCAP file or rosbag2 folder")
+            raise ValueError(
+                "recordings is empty; give at least one MCAP file or rosbag2 folder: recording=FILE"
+            )
         read = partial(
             read_recording,
             scan=scan,

@@ -142,7 +142,7 @@ def test_replay_without_a_recording_is_refused_before_the_training(env, learner,
     done = called(
         "train", f"env={env}", *LEARNERS[learner], "hydra.run.dir=run", cwd=tmp_path, code=2
     )
-    assert "recording must be an MCAP file or a rosbag2 folder" in done.stderr
+    assert "give at least one MCAP file or rosbag2 folder: recording=FILE" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not any(tmp_path.iterdir())
 

@@ -75,7 +75,8 @@ class TrainingOnly(Plant):
 class TableOnly(Plant):
     def step(self, action):
         answer = super().step(action)
-        return answer[:4] if self.np_random_seed in range(10**9, 11 * 10**8) else answer
+        of_table = self.np_random_seed in range(10**9, 11 * 10**8)
+        return answer[:4] if of_table and self.time == 11 else answer
 
 
 class Unseeded(Plant):

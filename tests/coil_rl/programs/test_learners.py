@@ -112,7 +112,7 @@ def test_compatible_method_and_learner_train(method, learner, tmp_path):
         ),
         (
             "learner=sac action=choices",
-            "learner=sac needs numbers as actions, but they are choices here",
+            "learner=sac needs numbers as actions, but action=choices makes choices of them",
         ),
         (
             "method=ppo learner=dynamic_coil",

@@ -121,15 +121,15 @@ def refusal(name, *arguments):
             "device=cuda compile=true",
             "compile=true is for the CPU only, not for device=cuda; take compile=false",
         ),
-        ("preset.rate=1e23", "env: rate=1e+23 must be at most 1000"),
-        ("env.time_limit=1e300", "env: time_limit=1e+300 must be at most 1000000"),
+        ("preset.rate=1e23", "env.rate=1e+23 must be at most 1000"),
+        ("env.time_limit=1e300", "env.time_limit=1e+300 must be at most 1000000"),
         (
             "env.laps=999999999999999999",
-            "env: laps=999999999999999999 must be at most 1000000",
+            "env.laps=999999999999999999 must be at most 1000000",
         ),
         (
             "learner.hidden=[99999999]",
-            "learner.hidden[0]=99999999 must be at most 4096",
+            "learner: hidden[0]=99999999 must be at most 4096",
         ),
         (
             f"learner.hidden={[8] * 17}".replace(" ", ""),
