@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import worlds
 from any_env import AnyEnv
 from torchrl.data import Bounded, Unbounded
 
@@ -26,7 +25,9 @@ from coil_rl.learners.extension import Extension
 from coil_rl.learners.extensions import Extensions
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.minibatches import Minibatches
+from coil_rl.learners.policy import Entries
 from coil_rl.learners.several_agents import SummedRewards
+from coil_rl.ranges import settings_of
 from coil_rl.run.rollout import Rollout
 from coil_studies import IBRL, Advisor
 
@@ -46,7 +47,7 @@ class Counting(Extension):
     def losses(self, policy, minibatch):
         self.calls.append("losses")
         distribution = policy.get_dist(minibatch.select(*policy.in_keys))
-        return {"loss_noise": distribution.base_dist.scale.mean()}
+        return {"loss_noise": distribution.scale.mean()}
 
     def weights(self, weights, progress):
         self.calls.append("weights")
@@ -138,7 +139,7 @@ def test_rewards_of_agents_are_summed():
 
 
 def test_minibatches_of_a_pass_are_all_steps_once_in_another_order_each():
-    rows = worlds.cones(cars=6).reset().select("observation").set("number", torch.arange(6))
+    rows = Entries(number=torch.arange(6), advantage=torch.rand(6, 1))
     passes = []
     for seed in range(3):
         first, second = Minibatches(1, 2, seed).draw(rows)
@@ -179,11 +180,19 @@ def test_learner_needs_only_an_update_and_a_state():
 
 @pytest.mark.parametrize("kind", [PPO, A2C, Reinforce, TRPO, DynamicCoil, SAC, DQN, Advisor, IBRL])
 def test_each_argument_of_a_learner_is_named_and_documented(kind):
-    _, *parameters = inspect.signature(kind.__init__).parameters.values()
-    assert all(each.kind is not each.VAR_KEYWORD for each in parameters)
-    described = inspect.getdoc(kind).partition("Args:\n")[2].partition("\n\n")[0]
+    _, *declared = inspect.signature(kind.__init__, eval_str=True).parameters.values()
+    settings = {name for each in declared for name in settings_of(each) or ()}
+    assert all(each.kind is not each.VAR_KEYWORD or settings_of(each) for each in declared)
+    assert documented(kind) <= {each.name for each in declared}
+    everywhere = set().union(*map(documented, kind.__mro__))
+    assert settings | {each.name for each in declared} <= everywhere
+
+
+def documented(kind):
+    """Return the arguments that the docstring of a class itself describes."""
+    described = inspect.cleandoc(kind.__doc__ or "").partition("Args:\n")[2].partition("\n\n")[0]
     lines = [line for line in described.splitlines() if not line.startswith(" " * 8)]
-    assert {line.strip().partition(":")[0] for line in lines} == {p.name for p in parameters}
+    return {line.strip().partition(":")[0] for line in lines}
 
 
 def test_no_file_of_the_learners_imports_itself_through_others():

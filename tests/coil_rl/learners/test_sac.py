@@ -41,7 +41,7 @@ def action_values(sac, parameters, states, action):
 def sample(sac, states):
     """A random action of the policy, and its log-probability."""
     distribution = sac.policy.get_dist(states.select("th", "thdot"))
-    action = distribution.rsample()
+    action, _ = distribution.draw()
     return action, distribution.log_prob(action)
 
 
