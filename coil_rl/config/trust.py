@@ -30,7 +30,6 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.config.compose import packages
-from coil_rl.config.nodes import build
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.extras import require
 from coil_rl.run.stopping import remember_trust
@@ -301,6 +300,8 @@ def make_logger(node: Any) -> Any:
     Raises:
         UserError: for whatever the logger raises, such as without a log-in or a server.
     """
+    from coil_rl.config.nodes import build  # imports torch
+
     try:
         return build(node, "logger")
     except UserError:
