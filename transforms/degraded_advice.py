@@ -180,7 +180,7 @@ class _DrawnAdvice(DegradedAdvice):
         seed: of the draws.
     """
 
-    sample: Callable[..., Tensor]  # draws numbers of a shape with a generator
+    _sample: Callable[..., Tensor]  # draws numbers of a shape with a generator
 
     def __init__(self, seed: int, key: NestedKey) -> None:
         super().__init__(key)
@@ -197,7 +197,7 @@ class _DrawnAdvice(DegradedAdvice):
     def _drawn(self, data: TensorDictBase, *, after_reset: bool = False) -> State:
         """Draw one number for each number of the advice."""
         shape = self._missing(data).shape
-        (draws,) = self.rng.draw(self.sample, [shape], after_reset=after_reset)
+        (draws,) = self.rng.draw(self._sample, [shape], after_reset=after_reset)
         return {"draws": draws}
 
     def observe(self, data: TensorDictBase, state: State) -> State:
@@ -219,7 +219,7 @@ class NoisyAdvice(_DrawnAdvice):
         sigma: standard deviation in normalised actions.
     """
 
-    sample = staticmethod(torch.randn)
+    _sample = staticmethod(torch.randn)
 
     def __init__(
         self, sigma: NonNegative = 0.3, seed: int = 0, key: NestedKey = "guide_action"
@@ -240,7 +240,7 @@ class RandomAdvice(_DrawnAdvice):
         high: largest number, in normalised actions, finite and more than `low`.
     """
 
-    sample = staticmethod(torch.rand)
+    _sample = staticmethod(torch.rand)
 
     def __init__(
         self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action"

@@ -79,11 +79,9 @@ def shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[Guide]:
     Args:
         labels: the evaluations by label.
     """
-    tables = (
-        (label, seed, rows)
-        for label, frame in labels.items()
-        for seed, rows in frame.groupby("seed", sort=False)
-    )
+    tables: list[tuple[str, int, pd.DataFrame]] = []
+    for label, frame in labels.items():
+        tables += [(label, seed, rows) for seed, rows in frame.groupby("seed", sort=False)]
     numbers, different = _numbered(tables)
     guides: list[Guide] = []
     for name, of_labels in numbers.items():

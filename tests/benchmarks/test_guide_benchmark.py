@@ -249,7 +249,7 @@ def test_versions_are_those_of_all_runs_of_a_row(made):
 
 def test_run_without_its_versions_is_one_sentence(made):
     (made / "coil_intact" / "1" / "versions.json").unlink()
-    with pytest.raises(UserError, match=r"versions.json is damaged .*; remove it"):
+    with pytest.raises(UserError, match=r"there is no file .*versions.json; put back"):
         benchmark_rows("pendulum", read_runs([made]))
 
 

@@ -159,7 +159,7 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
     assert code == 2
     assert "the sweep of paper ended with exit code 3" in error
     (command,) = started
-    words = ["-m", sweeps.FILES, "+experiment=paper", "compile=true", "seed=0"]
+    words = ["-m", "+experiment=paper", "compile=true", "seed=0"]
     assert command == [*words, "hydra/launcher=basic"]
 
 

@@ -150,7 +150,7 @@ def test_state_of_the_policy_is_complete(options):
     [
         (
             {"target_critics": 1},
-            "IBRL compares all critics; leave target_critics and uncertainty out",
+            "IBRL compares all critics; leave target_critics, uncertainty and anchor out",
         ),
         ({"uncertainty": True}, "IBRL compares all critics"),
         ({"edit": -0.1}, "edit=-0.1 must be"),

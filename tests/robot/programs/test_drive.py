@@ -111,7 +111,7 @@ def test_a_shipped_policy_completes_a_lap_of_the_robot(tmp_path):
         ([*OWN, "simulation.laps=0"], "simulation.laps=0"),
         ([*OWN, "+simulation.lap=1"], "lap"),
         ([*OWN, "limits.longest_gap=0.1"], "longest_gap=0.1 s must be more than the time"),
-        ([*OWN, "perception.scale=0"], "perception: scale=0 must be more than 0"),
+        ([*OWN, "perception.scale=0"], "perception.scale=0 must be more than 0"),
         ([*OWN, "perception.range_max=far"], "perception.range_max='far' must be"),
         ([*OWN, "smoothing=-1"], "smoothing=-1.0 must be"),
         ([*OWN, "limits.blind=-1"], "blind=-1 must be"),

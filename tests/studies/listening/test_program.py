@@ -103,7 +103,7 @@ def test_numbers_are_reproducible(runs, tmp_path):
         ("run={runs}/guide", "has no agent, only a guide"),
         (
             "run={runs}/coil evaluation.sections.bin=0",
-            "evaluation.sections: bin=0 must be at least 0.1",
+            "evaluation.sections.bin=0 must be at least 0.1",
         ),
     ],
 )
