@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from hosted_guides import cones, driven, steps_of_episode
 from sklearn.linear_model import LinearRegression
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import TransformedEnv
 from worlds import continued
 
 from coil_rl import GymnasiumEnv
-from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.host import Predictor, role_of
 from coil_rl.guides import ControllerGuide, FollowAdvice, PerRow
@@ -85,31 +85,6 @@ def control(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
         yield importlib.import_module("my_control")
-
-
-def cones(guide, cars=6, seed=0):
-    env = ConeTrackEnv(shipped_tracks("test"), cars, rate=6, seed=seed)
-    return TransformedEnv(env, Compose(GuideActions({"theirs": guide}))).train()
-
-
-def driven(env, steps=80):
-    torch.manual_seed(1)
-    rollout = env.rollout(steps, break_when_any_done=False)
-    assert rollout["next", "done"].sum() > 3, (
-        "random driving should have crashed, so that resets are covered"
-    )
-    return rollout, rollout["guide_action"][:, :, 0]
-
-
-def steps_of_episode(rollout):
-    """Number of each step in its episode, from 1, [B, T]."""
-    done, number = rollout["next", "done"].squeeze(-1), torch.zeros(len(rollout), dtype=torch.long)
-    numbers = []
-    for step in range(rollout.shape[1]):
-        number = number + 1
-        numbers.append(number)
-        number = torch.where(done[:, step], 0, number)
-    return torch.stack(numbers, 1)
 
 
 def test_class_of_guides_is_the_guide():

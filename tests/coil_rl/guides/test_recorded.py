@@ -2,37 +2,10 @@
 
 import pytest
 import torch
+from hosted_guides import cones, driven, steps_of_episode
 from tensordict import TensorDict
-from torchrl.envs import Compose, TransformedEnv
 
-from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import EntryGuide, RecordedGuide
-from coil_rl.transforms import GuideActions
-
-
-def cones(guide, cars=6, seed=0):
-    env = ConeTrackEnv(shipped_tracks("test"), cars, rate=6, seed=seed)
-    return TransformedEnv(env, Compose(GuideActions({"theirs": guide}))).train()
-
-
-def driven(env, steps=80):
-    torch.manual_seed(1)
-    rollout = env.rollout(steps, break_when_any_done=False)
-    assert rollout["next", "done"].sum() > 3, (
-        "random driving should have crashed, so that resets are covered"
-    )
-    return rollout, rollout["guide_action"][:, :, 0]
-
-
-def steps_of_episode(rollout):
-    """Number of each step in its episode, from 1, [B, T]."""
-    done, number = rollout["next", "done"].squeeze(-1), torch.zeros(len(rollout), dtype=torch.long)
-    numbers = []
-    for step in range(rollout.shape[1]):
-        number = number + 1
-        numbers.append(number)
-        number = torch.where(done[:, step], 0, number)
-    return torch.stack(numbers, 1)
 
 
 def test_entry_of_the_env_is_advice():
