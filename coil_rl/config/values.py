@@ -6,7 +6,6 @@ from dataclasses import fields
 from functools import cache
 from typing import Any
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
@@ -64,6 +63,8 @@ def _check_device(config: DictConfig, name: str, device: str) -> None:
         raise UserError(
             f"compile=true is for the CPU only, not for {name}={device}; take compile=false"
         )
+    import torch  # here, so that help and a wrong word do not wait for it
+
     try:
         torch.empty(0, device=device)
     except (AssertionError, RuntimeError) as error:
