@@ -59,6 +59,16 @@ def test_env_contract_holds(tmp_path):
     check_transform(env, GuideActions({"spline": SplineGuide()}))
 
 
+def test_length_of_a_recording_is_that_of_the_file_as_it_is_now(tmp_path, monkeypatch):
+    for folder, scans in {"one": 3, "two": 7}.items():
+        (tmp_path / folder).mkdir()
+        monkeypatch.chdir(tmp_path / folder)
+        drive(Path("a.mcap"), scans)
+        assert McapReplayEnv.whole_pass({"recordings": "a.mcap"}) == (1, scans)
+    drive(Path("a.mcap"), 5)
+    assert McapReplayEnv.whole_pass({"recordings": "a.mcap"}) == (1, 5)
+
+
 @torch.no_grad()
 def test_cones_and_guide_are_those_of_the_drive():
     """Replay recordings of the drive by a robot of a seventh of the car's size."""
