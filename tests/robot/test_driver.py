@@ -86,10 +86,8 @@ def untrained(words):
     return env, policy, Controller(own, policy)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [name if name == "coil" else pytest.param(name, marks=pytest.mark.slow) for name in POLICIES],
-)
+@pytest.mark.fast("coil")
+@pytest.mark.parametrize("name", POLICIES)
 def test_commands_are_those_of_the_closed_loop(name):
     env, policy, controller = untrained(POLICIES[name])
     # The policies are untrained: without its rules the driver goes on where they leave the track.

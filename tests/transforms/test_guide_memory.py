@@ -150,12 +150,13 @@ def inside():
     return TransformedEnv(PendulumEnv(), GuideActions({"sum": Speed()}))
 
 
+@pytest.mark.fast("inside", "around")
 @pytest.mark.parametrize(
     "make",
     [
         lambda: SerialEnv(2, inside),
         lambda: TransformedEnv(SerialEnv(2, PendulumEnv), GuideActions({"sum": Speed()})),
-        pytest.param(lambda: ParallelEnv(2, inside), marks=pytest.mark.slow),
+        lambda: ParallelEnv(2, inside),
     ],
     ids=["inside", "around", "parallel"],
 )

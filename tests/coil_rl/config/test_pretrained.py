@@ -92,6 +92,7 @@ def test_shipped_policy_is_a_guide():
     assert guide(env.reset())["action"].shape == (2, 1)
 
 
+@pytest.mark.slow
 def test_shipped_policy_is_the_first_one_of_a_run(tmp_path):
     folder = trained(tmp_path / "run", "ppo", "init=pretrained:cone_track/ppo")
     first = torch.load(folder / "policies" / "000000000000.pt", weights_only=True)

@@ -38,6 +38,7 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_nine_lines_of_the_docs(tmp_path):
     from thermostat.control import PI
 
@@ -166,6 +167,7 @@ def test_rows_of_a_guide_are_those_of_the_object_that_was_handed_over(tmp_path):
     assert rewards_of_guide(again.evaluate()) == first
 
 
+@pytest.mark.slow
 def test_controller_as_a_guide_is_the_policy_that_was_asked_for(tmp_path):
     words = [*SHORT, "delivery=tested", "learner.action_gain=1"]
     run = coil_rl.prepare(ENV, method="ppo", frames=32, folder=tmp_path / "run", overrides=words)
@@ -224,6 +226,7 @@ def make_room():
     return Room()
 
 
+@pytest.mark.slow
 def test_maker_of_an_env_is_an_env(tmp_path):
     from thermostat.room import Room
 
@@ -267,6 +270,7 @@ def test_mistake_is_one_sentence(arguments, message, tmp_path):
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_longer_run_goes_on_and_says_what_its_schedules_mean(tmp_path, capsys):
     folder = tmp_path / "run"
     run = coil_rl.train(ENV, frames=64, folder=folder, overrides=SHORT)
@@ -302,6 +306,7 @@ def test_learned_guide_of_an_action_in_another_unit_is_refused(tmp_path):
         coil_rl.train(ENV, frames=32, **options)
 
 
+@pytest.mark.slow
 def test_run_begins_from_the_policy_and_normaliser_of_another(tmp_path):
     first = coil_rl.train(
         ENV, frames=64, folder=tmp_path / "first", overrides=[*SHORT, "learner.normalise=true"]

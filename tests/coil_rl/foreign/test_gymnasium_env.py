@@ -110,12 +110,14 @@ def build(id, num_envs=3, **arguments):
     return GymnasiumEnv(id, num_envs, **(ENVS.get(id, {}) | arguments))
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("id", ENVS)
 def test_env_fits_its_specs(id, dtype):
     check_env(build(id, dtype=dtype), steps=30)
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("id", ENVS)
 def test_seed_determines_all_episodes(id):
     one, other, third = (drive(build(id, seed=seed), 60)[0] for seed in (1, 1, 2))
@@ -123,6 +125,7 @@ def test_seed_determines_all_episodes(id):
     assert not same(one, third)
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("id", ENVS)
 def test_saved_env_goes_on_to_the_bit(id):
     env = build(id, 4, seed=5)

@@ -99,6 +99,7 @@ def test_envs_of_the_project_are_left_as_they_are():
     assert not limits_of(env)
 
 
+@pytest.mark.slow
 def test_rows_of_a_batch_keep_a_longer_limit():
     env = EnvBatch(lambda: TransformedEnv(Endless(), StepCounter(1200)), num_envs=1)
     steps = evaluate_policy(env, stay(env)).episodes[0]["steps"]

@@ -77,6 +77,7 @@ def gradient_of(loss, *networks):
     return torch.cat([each.flatten() for each in found if each is not None])
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(("make_env", "options"), KINDS)
 def test_losses_and_gradients_are_those_of_torchrl(make_env, options):
     ppo, rollout = made(PPO, make_env, options)

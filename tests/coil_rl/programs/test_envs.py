@@ -86,6 +86,7 @@ def trained(env, learner, folder):
     return overrides
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize("env", [file for file in FILES if file not in REPLAYS])
 def test_env_takes_steps_with_the_advice_of_its_guide(env):
     """A new YAML file is driven, too. What it cannot do without belongs into OWN or PACKAGES."""
@@ -136,6 +137,7 @@ def test_killed_run_of_an_env_ends_like_an_uninterrupted_one(env, learner, tmp_p
         assert (resumed / name).read_bytes() == (whole / name).read_bytes(), name
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("env", REPLAYS)
 def test_replay_without_a_recording_is_refused_before_the_training(env, learner, tmp_path):

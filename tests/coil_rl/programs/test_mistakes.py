@@ -65,6 +65,7 @@ def refusal(name, *arguments):
 
 
 # Without the program, which composes the configuration twice.
+@pytest.mark.fast(15)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -303,6 +304,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
     assert not files()
 
 
+@pytest.mark.fast(6)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -373,6 +375,7 @@ def run(tmp_path_factory):
     return folder
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -410,20 +413,10 @@ def test_resume_checks_the_configuration_before_it_trains(started, run, tmp_path
 
 
 # Both programs ask the same function.
+@pytest.mark.fast(3)
+@pytest.mark.parametrize("name", ["evaluate", "listen"])
 @pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("evaluate", "env.laps=2"),
-        ("evaluate", "preset=authors"),
-        ("evaluate", "guide=random"),
-        ("evaluate", "method=ppo"),
-        ("evaluate", "+action.x=1"),
-        ("listen", "guide=random"),
-        *(
-            pytest.param("listen", change, marks=pytest.mark.slow)
-            for change in ("env.laps=2", "preset=authors", "method=ppo", "+action.x=1")
-        ),
-    ],
+    "change", ["env.laps=2", "preset=authors", "guide=random", "method=ppo", "+action.x=1"]
 )
 def test_override_of_what_a_run_provides_is_refused(started, run, name, change):
     sentence = refusal(name, *TINY[2:], f"run={run}", change)
@@ -447,6 +440,7 @@ def test_evaluation_of_a_run_refuses_what_it_does_not_read(started, run, name, c
     assert sentence == f"{change} has no effect: {reason}; leave it out"
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     "words", [["degrade=[zeroed]"], ["+degrade@evaluation.advice.zeroed=zeroed"]]
 )
@@ -489,6 +483,7 @@ def test_refused_program_leaves_no_folder_of_its_own_name(tmp_path, monkeypatch)
     assert "drive.mcap" in refusal("replay", *words)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -505,6 +500,7 @@ def test_fallback_that_cannot_be_is_refused_before_the_training(started, change,
     assert started == []
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(
     "words",
     [
@@ -577,9 +573,8 @@ def test_env_with_the_guide_of_another_one_is_refused():
 
 
 # The first is imported before the program begins, the second by its check of the configuration.
-@pytest.mark.parametrize(
-    "module", [b"omegaconf.errors", pytest.param(b"torch.nn.functional", marks=pytest.mark.slow)]
-)
+@pytest.mark.fast(1)
+@pytest.mark.parametrize("module", [b"omegaconf.errors", b"torch.nn.functional"])
 def test_interrupt_while_importing_is_one_line(tmp_path, module):
     python, *arguments = command("train", *TINY)
     verbose = [python, "-X", "importtime", *arguments]  # a line on standard error for each module

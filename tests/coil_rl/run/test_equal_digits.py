@@ -10,7 +10,6 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 from programs import shipped
-from slow import some_fast
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
@@ -144,9 +143,8 @@ def check_equal(folder, boxes, method, *overrides):
 
 
 # There is nothing to tune.
-@pytest.mark.parametrize(
-    "method", some_fast([name for name in METHODS if name not in ("guide", "tune")], FAST)
-)
+@pytest.mark.fast(*FAST)
+@pytest.mark.parametrize("method", [name for name in METHODS if name not in ("guide", "tune")])
 def test_every_method_has_equal_digits_in_every_box(method, tmp_path):
     boxes = BOXES
     if method in FAST:
@@ -198,18 +196,9 @@ def test_clipped_actions_have_equal_digits_too(squash, tmp_path):
     check_equal(tmp_path, boxes, "ppo", f"learner.squash={squash}")
 
 
-@pytest.mark.parametrize(
-    ("method", "box"),
-    [
-        pytest.param(method, box, marks=[] if fast else pytest.mark.slow)
-        for box in (*BOXES, *HALF)
-        for method, fast in (
-            ("residual", True),
-            ("residual_coil", box in ("different", "from 16")),  # the transform of residual
-            ("policy_decorator", True),
-        )
-    ],
-)
+@pytest.mark.fast(8)
+@pytest.mark.parametrize("box", [*BOXES, *HALF])
+@pytest.mark.parametrize("method", ["residual", "residual_coil", "policy_decorator"])
 def test_residual_policy_is_its_guide_at_first(method, box, tmp_path):
     box = (BOXES | HALF)[box]
     run = run_in(tmp_path / "run", box, method)
