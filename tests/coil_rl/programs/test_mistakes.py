@@ -143,7 +143,7 @@ def refusal(name, *arguments):
         ("watch.step.reward_finish=1e-300", "watch.step.reward_finish=1e-300 must be a list"),
         (
             "evaluation.measures.clearance.format=nan",
-            "format='nan' must be a format of numbers, such as .1f",
+            "format=nan must be a format of numbers, such as .1f",
         ),
         (
             "watch.step.smoothness=null",
@@ -175,7 +175,7 @@ def refusal(name, *arguments):
         ),
         (
             "evaluation.measures.laps.reduction=median",
-            "evaluation.measures.laps.reduction='median' must be 'mean'",
+            "evaluation.measures.laps: reduction=median must be one of mean",
         ),
         (
             "+evaluation.measures.laps.unit=s",
