@@ -1,5 +1,4 @@
 import copy
-import math
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +76,7 @@ def test_env_contract_holds(rings: list[Track], options: dict[str, Any]) -> None
     check_env(ConeTrackEnv(rings, 3, **options))
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
 def test_outputs_are_finite_and_within_their_specs(preset: dict) -> None:
     env = ConeTrackEnv(shipped_tracks("train"), 128, **preset)
@@ -181,6 +181,7 @@ def test_cyclic_assignment_keeps_cars_on_their_tracks(rings: list[Track]) -> Non
         assert env.reset()["info", "track"].flatten().tolist() == [0, 1, 2, 0, 1, 2, 0]
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
 def test_restored_env_continues_bit_for_bit(tracks: list[Track], preset: dict) -> None:
     env = ConeTrackEnv(tracks, 16, seed=3, **preset)
@@ -263,33 +264,7 @@ def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"spline": "linear"}, "spline='linear' must be 'cubic' or 'quadratic'"),
-        (
-            {"cone_bonus": "never"},
-            "cone_bonus='never' must be 'first_sighting' or 'every_sighting'",
-        ),
-        ({"assignment": "shuffled"}, "assignment='shuffled' must be 'random', 'drawn' or 'cyclic'"),
-        *(
-            ({name: value}, f"{name}={value} must be (more than 0|at least 1)")
-            for name in (
-                "num_envs",
-                "rate",
-                "laps",
-                "time_limit",
-                "kept_cones",
-                "speed",
-                "car_length",
-                "max_steering",
-                "sight",
-            )
-            for value in (0, -1)
-        ),
-        ({"rate": math.nan}, "rate=nan must be a finite number"),
-        ({"starts": 0}, "starts=0 must be at least 1"),
-        ({"held_steps": -1}, "held_steps=-1 must be at least 0"),
-        ({"seed": -1}, "seed=-1 must be at least 0"),
         ({"time_limit": 0.01}, "time_limit=0.01 must be at least one step"),
-        ({"max_steering": 91}, "max_steering=91 must be at most 90"),
         ({"reward": {"finish": 1e300}}, "reward.finish=1e[+]300 must be between -1e6 and 1e6"),
         (
             {"reward": {"cone": 1.0, "speed": 1.0}},
@@ -353,6 +328,7 @@ def test_env_agrees_on_a_gpu(tracks: list[Track]) -> None:
         assert torch.equal(ours["info", "track"], theirs["info", "track"].cpu())
 
 
+@pytest.mark.slow
 def test_lap_that_begins_anywhere_counts_as_driven_from_the_finish(rings):
     world = {"assignment": "cyclic", "laps": 1, "rate": 12}
     envs = ConeTrackEnv(rings, 3, **world), ConeTrackEnv(rings, 12, starts=12, **world)
