@@ -181,6 +181,7 @@ def test_recorded_command_is_the_transformed_action(tmp_path):
     assert 0 < (turn_rate - advised).abs().mean() < 0.2
 
 
+@pytest.mark.slow
 def test_run_without_an_agent_is_refused(tmp_path):
     run = make_untrained_run(
         tmp_path / "guide", "method=guide", "track=generated", "track.train.count=1"
