@@ -233,6 +233,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.fast(5)
 @pytest.mark.parametrize("name", FAULTS)
 def test_faults_stop_the_car_until_the_stop_is_lifted(name):
     options, reason, within = FAULTS[name]

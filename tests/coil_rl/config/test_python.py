@@ -97,6 +97,7 @@ def proportional_for_all(observation):
     return (-0.2 * observation[:, :1]).clamp(0, 1)
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize(
     "guide",
     [
@@ -371,6 +372,7 @@ class Proportional:
         return [self.gain * float(observation[2])]
 
 
+@pytest.mark.slow
 def test_numbers_of_a_class_are_tuned(tmp_path):
     run = coil_rl.train(
         "Pendulum-v1",

@@ -52,7 +52,7 @@ def check_same(folder):
     return observations, actions, controller
 
 
-@pytest.mark.fast("coil_anchored", "residual")
+@pytest.mark.fast("coil_anchored")
 @pytest.mark.parametrize("method", METHODS)
 def test_controller_acts_as_the_policy_does_in_an_evaluation(method, tmp_path):
     _, actions, _ = check_same(learned(tmp_path / "run", method))

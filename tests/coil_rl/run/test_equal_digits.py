@@ -177,6 +177,7 @@ def test_half_bounded_actions_have_equal_digits_wherever_the_bound_is(method, tm
     check_equal(tmp_path, boxes, method)
 
 
+@pytest.mark.slow
 def test_random_actions_earn_the_same_wherever_the_bound_is(tmp_path):
     earned = [run_in(tmp_path / name, box, "coil").trial.chance() for name, box in HALF.items()]
     assert earned == pytest.approx([earned[0]] * len(HALF), rel=1e-4)

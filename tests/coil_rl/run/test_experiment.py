@@ -252,6 +252,7 @@ def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, 
     corrected.run()
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("place", "message"),
     [

@@ -124,6 +124,7 @@ def test_policy_may_be_anchored_at_a_tuned_guide(run, tmp_path):
     assert float(start["start/guide"]) > -600
 
 
+@pytest.mark.slow
 def test_interrupted_search_ends_with_the_same_files(run, tmp_path, monkeypatch):
     generation = Tuner.generation
 

@@ -133,6 +133,7 @@ def test_topics_of_the_foxglove_layout_are_in_the_recording(done, messages):
         assert isinstance(functools.reduce(getattr, fields, messages[topic][0]), (float, bool))
 
 
+@pytest.mark.slow
 def test_same_replay_makes_the_same_bytes(done, folder):
     torch.rand(3)  # earlier draws have no effect
     replayed(folder, "runs=[coil_0,coil_1]", out="again")

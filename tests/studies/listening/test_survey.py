@@ -77,6 +77,7 @@ def test_every_state_of_every_episode_is_measured(found):
         assert (found.section[on_track] == TRACK_SECTIONS.sections[index][points]).all()
 
 
+@pytest.mark.slow
 def test_removing_an_unused_guide_costs_nothing_and_the_followed_one_the_lap(rows):
     for row in rows:
         if row["guide"] == "random":
