@@ -21,7 +21,6 @@ from coil_rl.config.parts import (
     demonstrations,
     driving_guides,
     env_maker,
-    guide_results,
     recorded,
     trains_guides,
     what_guides_see,
@@ -124,7 +123,6 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         make_env,
         pictures=pictures,
         guides=guide_titles(driving_guides(config)),
-        guide_results=partial(guide_results, config),
         together=has_agent
         and not config.method.run
         and advises_only(config)

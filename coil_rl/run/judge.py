@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -64,9 +64,6 @@ class Evaluation:
     measures: Mapping[str, Measure] = field(default_factory=dict)
     record: Mapping[str, NestedKey] = field(default_factory=dict)
 
-    def __hash__(self) -> int:
-        return hash(repr(self))
-
     def run(self, env: EnvBase, policy: TensorDictModuleBase, **options: Any) -> EvaluationResult:
         """Evaluate a policy on an env whose rows are the cases, perhaps several times.
 
@@ -75,9 +72,6 @@ class Evaluation:
         return evaluate_policy(
             env, policy, cases=self.cases, measures=self.measures, record=self.record, **options
         )
-
-
-GuideResults = Callable[[Evaluation, Sequence[Picture]], Mapping[str, EvaluationResult]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +84,6 @@ class Trial:
         make_env: makes the env of the policy in the cases of the test.
         pictures: of the deterministic episodes.
         guides: names of the guides, as in tables.
-        guide_results: evaluates the guides alone, by these names, in the sight of some pictures;
-            asked if the guides cannot act in the policy's own env.
         together: whether the policy's env is that of its guides: all that its method adds is their
             advice. Then the guides act in rows beside the policy.
         advice: names of further kinds of advice, with each of which the policy is evaluated too.
@@ -107,7 +99,6 @@ class Trial:
     _: KW_ONLY
     pictures: Sequence[Picture] = field(default_factory=lambda: [Returns()])
     guides: Sequence[str] = ()
-    guide_results: GuideResults = lambda evaluation, pictures: {}
     together: bool = False
     advice: Sequence[str] = ()
     repeats: int = 0
@@ -118,6 +109,15 @@ class Trial:
     def env(self, rows: int, advice: str = "") -> EnvBase:
         """Return the env of the policy in the cases of the test."""
         return self.make_env(rows, TEST, advice, count=self.count)
+
+    def guide_results(
+        self, evaluation: Evaluation, pictures: Sequence[Picture] = ()
+    ) -> dict[str, EvaluationResult]:
+        """Evaluate each guide alone, see `evaluate_guides`; there may be none."""
+        if not self.guides:
+            return {}
+        guides = self.make_env.guides()
+        return evaluate_guides(self.make_env, evaluation, guides, self.count, pictures)
 
     def chance(self) -> float:
         """Return the mean reward of random actions in the cases of the test.
