@@ -36,6 +36,7 @@ def step(env, action):
     return env.step(env.reset().set("action", torch.full((6, 1), action)))
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("transform", "of_guide"),
     [
@@ -153,6 +154,7 @@ COMBINED = {
 }
 
 
+@pytest.mark.fast(5)
 @pytest.mark.parametrize("name", COMBINED)
 @pytest.mark.parametrize("training", [True, False], ids=["training", "evaluation"])
 def test_executed_action_is_the_one_the_env_was_given(name, training):

@@ -55,6 +55,7 @@ FOR_NUMBERS = {
 }
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize("name", TRANSFORMS)
 def test_specs_hold_in_every_env(name):
     for world in (worlds.cones, worlds.pendulum, worlds.carts):

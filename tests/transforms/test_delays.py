@@ -131,6 +131,7 @@ def test_last_actions_are_those_that_the_agent_chose(kind):
     assert torch.equal(data["next", "last_action"][:, 1:, size:], vectors[:, :-1])
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize(
     "make",
     [

@@ -157,6 +157,7 @@ def robots(count):
     return SimulatedRobotEnv(num_envs=count, assignment="cyclic", laps=1, time_limit=20)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(("bare", "slot"), [(cars, 1), (robots, 0)], ids=["cars", "robots"])
 def test_removal_of_a_guide_that_is_not_followed_loses_nothing(bare, slot):
     """All draws, of a random guide and of a LiDAR, are the same with and without the removal."""
