@@ -191,6 +191,7 @@ def test_guide_agrees_with_the_oracle_for_coincident_midpoints(levels: list[Trac
     assert_agreement(levels[0], PRESETS["paper"], column(trace, 0))
 
 
+@pytest.mark.slow
 def test_float32_reward_agrees_with_the_oracle(ring: Track) -> None:
     preset = Preset({"laps": 1, "rate": 8.0}, {})
     trace = drive([ring], preset, "guide", 500, dtype=torch.float32)

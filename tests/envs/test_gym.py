@@ -66,6 +66,7 @@ def test_unseeded_envs_draw_different_tracks():
     assert draws[0] != draws[1]
 
 
+@pytest.mark.slow
 def test_vector_env_agrees_with_the_batched_env():
     cars = 6
     envs, guide = gymnasium.make_vec(gym.ID, num_envs=cars, advice=SplineGuide()), SplineGuide()

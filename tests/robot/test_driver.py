@@ -289,6 +289,7 @@ def test_the_car_does_not_move_before_it_has_seen_both_boundaries():
     assert torch.equal(env.pose, env.start_pose[:, :1])
 
 
+@pytest.mark.slow
 def test_a_lifted_stop_needs_a_valid_scan_before_the_car_moves():
     def gap(index, scan, now):
         return (None if FAULT <= index < FAULT + 5 else scan), now

@@ -297,6 +297,7 @@ def test_longer_run_goes_on_and_says_what_its_schedules_mean(tmp_path, capsys):
     assert "schedules over the run, such as a learning rate, go on at 80% of their way" in error
 
 
+@pytest.mark.slow
 def test_learned_guide_of_an_action_in_another_unit_is_refused(tmp_path):
     wrapper = "_target_: gymnasium.wrappers.RescaleAction, _partial_: true"
     percent = f"env.wrappers=[{{{wrapper}, min_action: 0, max_action: 100}}]"

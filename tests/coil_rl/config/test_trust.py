@@ -413,6 +413,7 @@ def test_trust_is_a_list_of_packages():
         trust.trust_packages(["a.b"])
 
 
+@pytest.mark.slow
 def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatch):
     folder = tmp_path / "run"
     folder.mkdir()

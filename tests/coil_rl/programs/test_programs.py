@@ -146,6 +146,7 @@ def test_info_prints_versions(tmp_path):
         assert name in out
 
 
+@pytest.mark.slow
 def test_part_of_another_package_is_used_by_its_name(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "their_package.py").write_text(

@@ -98,6 +98,7 @@ def test_noise_of_a_case_is_the_same_for_all_numbers(tmp_path):
     assert own == pytest.approx(found.guide_returns["guide"])  # which acts alone in its rows
 
 
+@pytest.mark.slow
 def test_tuned_guide_is_a_guide_that_acts_as_the_policy_of_its_run(run):
     opened = open_run(run)
     evaluation = opened.trial.evaluation

@@ -106,6 +106,7 @@ def test_cones_and_guide_are_those_of_the_drive():
     )
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_ten_unreadable_scans_keep_the_last_observation_and_action(tmp_path):
     save_drive(simulated_drive("both", seed=0), tmp_path / "a.mcap")

@@ -143,6 +143,7 @@ def test_same_replay_makes_the_same_bytes(done, folder):
         )
 
 
+@pytest.mark.slow
 def test_each_of_several_recordings_has_a_folder(tmp_path):
     for name, scans in (("a", 3), ("b", 5)):
         drive(tmp_path / name / "drive.mcap", scans)
@@ -189,6 +190,7 @@ def test_recording_without_boundaries_is_replayed_with_a_warning(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_recording_that_is_cut_off_is_replayed_as_far_as_it_goes(tmp_path):
     whole = uncompressed(drive(tmp_path / "whole.mcap", 200)).read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 6 // 10])

@@ -91,6 +91,7 @@ def test_removing_an_unused_guide_costs_nothing_and_the_followed_one_the_lap(row
     assert rows[0]["lost"] > 100
 
 
+@pytest.mark.slow
 def test_advice_is_replaced_in_its_section_only():
     history = []
 
