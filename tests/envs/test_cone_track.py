@@ -299,17 +299,17 @@ def test_number_of_kept_cones_changes_only_the_padding(rings: list[Track]) -> No
 
 
 @pytest.mark.slow
-def test_a_hundred_million_random_steps_are_finite_in_constant_memory() -> None:
+def test_ten_million_random_steps_are_finite_in_constant_memory() -> None:
     cars = 16_384
     env = ConeTrackEnv(shipped_tracks("all"), cars)
     draw = torch.Generator().manual_seed(0)
     state, driven, resident = env.reset(), 0, []
-    while driven < 100_000_000:
+    while driven < 10_000_000:
         noise = torch.randn(cars, 1, generator=draw)
         state["action"] = (0.9 * state["steering"] + 0.3 * noise).clamp(-1, 1)
         step, state = env.step_and_maybe_reset(state)
         driven += cars
-        if driven // cars % 100 == 0:
+        if driven // cars % 50 == 0:
             assert step["next"].isfinite().all()
             resident.append(int(Path("/proc/self/statm").read_text().split()[1]) * 4096)
     assert max(resident[len(resident) // 2 :]) < 1.02 * max(resident[: len(resident) // 2])
