@@ -210,6 +210,7 @@ def test_seeds_that_reach_the_guide_are_counted(made, tmp_path):
     assert ladder.count(" seeds)") == 1
 
 
+@pytest.mark.slow
 def test_page_names_the_returns_of_ppo_that_its_rows_are_compared_with(made, tmp_path):
     runs = read_runs([made])
     rows = benchmark_rows("pendulum", runs)

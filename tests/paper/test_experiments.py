@@ -20,6 +20,7 @@ def first(experiment, run_dir):
     return compose_train([*words, *choice, *TINY_SWEEP, f"run_dir={run_dir}"])
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiment_passes_the_check_and_can_be_resumed(experiment, tmp_path):
     config = first(experiment, tmp_path / "run")

@@ -233,6 +233,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.fast(5)
 @pytest.mark.parametrize("name", FAULTS)
 def test_faults_stop_the_car_until_the_stop_is_lifted(name):
     options, reason, within = FAULTS[name]
@@ -288,6 +289,7 @@ def test_the_car_does_not_move_before_it_has_seen_both_boundaries():
     assert torch.equal(env.pose, env.start_pose[:, :1])
 
 
+@pytest.mark.slow
 def test_a_lifted_stop_needs_a_valid_scan_before_the_car_moves():
     def gap(index, scan, now):
         return (None if FAULT <= index < FAULT + 5 else scan), now

@@ -105,6 +105,7 @@ def test_memory_begins_anew_with_every_episode_of_every_row():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [LSTMModule, GRUModule])
 def test_recurrent_networks_of_torchrl_are_guides(kind):
     guide = recurrent(kind)

@@ -97,6 +97,7 @@ def lists_its_arguments(**options):
     raise TypeError(f"unexpected {options}")
 
 
+@pytest.mark.slow
 def test_long_message_of_a_part_is_cut():
     node = {"_target_": f"{__name__}.lists_its_arguments", "numbers": list(range(9999))}
     with pytest.raises(

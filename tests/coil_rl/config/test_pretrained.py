@@ -73,6 +73,7 @@ def test_every_file_has_a_checksum():
         assert sorted(known[name]) == sorted(path.name for path in (PLACE / name).iterdir())
 
 
+@pytest.mark.slow
 def test_program_takes_a_shipped_policy(tmp_path):
     words = ["evaluation.repeats=1", "evaluation.cases=2", f"hydra.run.dir={tmp_path / 'results'}"]
     done = called("evaluate", "run=pretrained:pendulum/coil", *words)

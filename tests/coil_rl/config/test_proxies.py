@@ -70,6 +70,7 @@ def proxies(tmp_path_factory):
     return folder / "proxies"
 
 
+@pytest.mark.slow
 def test_folder_of_a_proxy_follows_from_guide_env_and_settings():
     def folder(*overrides, guide="spline"):
         config = composed("guide=[spline,constant]", "run_dir=unused", *overrides)

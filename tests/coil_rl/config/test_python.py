@@ -97,6 +97,7 @@ def proportional_for_all(observation):
     return (-0.2 * observation[:, :1]).clamp(0, 1)
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize(
     "guide",
     [
@@ -296,6 +297,7 @@ def test_longer_run_goes_on_and_says_what_its_schedules_mean(tmp_path, capsys):
     assert "schedules over the run, such as a learning rate, go on at 80% of their way" in error
 
 
+@pytest.mark.slow
 def test_learned_guide_of_an_action_in_another_unit_is_refused(tmp_path):
     wrapper = "_target_: gymnasium.wrappers.RescaleAction, _partial_: true"
     percent = f"env.wrappers=[{{{wrapper}, min_action: 0, max_action: 100}}]"
@@ -371,6 +373,7 @@ class Proportional:
         return [self.gain * float(observation[2])]
 
 
+@pytest.mark.slow
 def test_numbers_of_a_class_are_tuned(tmp_path):
     run = coil_rl.train(
         "Pendulum-v1",

@@ -10,7 +10,7 @@ from coil_rl.config.unread import check_read, check_sweep
 GUIDE = "(method=guide); leave it out"
 
 
-@pytest.mark.fast(6)
+@pytest.mark.fast(4)
 @pytest.mark.parametrize(
     ("words", "message"),
     [

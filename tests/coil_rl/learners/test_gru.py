@@ -322,8 +322,6 @@ def test_policy_with_a_memory_is_a_guide(tmp_path):
             lambda: DynamicCoil(worlds.cones(), guides={"one": one_guide()}, network=Gru()),
             "DynamicCoil cannot train a network with a memory",
         ),
-        (lambda: Gru(state=0), "state=0 must be at least 1"),
-        (lambda: Gru([0]), r"hidden\[0\]=0 must be at least 1"),
     ],
 )
 def test_unusable_memory_is_refused(make, message):

@@ -112,6 +112,7 @@ class Unclipped(PPO):
         return -ratio * minibatch["advantage"].squeeze(-1)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("options", [{}, ANCHORED, {"normalise": True}])
 def test_changed_loss_of_a_subclass_is_the_one_that_is_used(options):
     weights = []

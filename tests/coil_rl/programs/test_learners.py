@@ -64,7 +64,7 @@ WITHOUT = ("guide", "tune")
 PAIRS = [(method, learner) for method in METHODS if method not in WITHOUT for learner in GIVEN]
 
 
-@pytest.mark.fast(5)
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(("method", "learner"), [pair for pair in PAIRS if refusal(*pair)])
 def test_incompatible_method_and_learner_are_refused(method, learner, tmp_path):
     config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])
@@ -86,7 +86,7 @@ def test_compatible_method_and_learner_train(method, learner, tmp_path):
     assert method in BY_GUIDE or metrics.get("minibatches", 4) == 4
 
 
-@pytest.mark.fast(4)
+@pytest.mark.fast(2)
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [

@@ -375,7 +375,7 @@ def run(tmp_path_factory):
     return folder
 
 
-@pytest.mark.fast(3)
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -524,6 +524,7 @@ def test_run_with_a_name_that_no_file_can_have_is_refused():
         coil_rl.open_run(300 * "x")
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [

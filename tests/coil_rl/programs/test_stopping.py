@@ -105,6 +105,7 @@ def test_failed_job_leaves_the_others_alone_and_the_same_command_goes_on(tmp_pat
     assert not (tmp_path / "sweep" / "failed_jobs.txt").exists()
 
 
+@pytest.mark.slow
 def test_sweep_whose_jobs_are_all_refused_leaves_no_folder(tmp_path):
     sweep = ["-m", *SMALL, "learner.gamma=7,8", "hydra.sweep.dir=sweep"]
     error = called("train", *sweep, cwd=tmp_path, code=2).stderr

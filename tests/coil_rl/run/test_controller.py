@@ -52,14 +52,14 @@ def check_same(folder):
     return observations, actions, controller
 
 
-@pytest.mark.fast("coil_anchored", "residual")
+@pytest.mark.fast("coil_anchored")
 @pytest.mark.parametrize("method", METHODS)
 def test_controller_acts_as_the_policy_does_in_an_evaluation(method, tmp_path):
     _, actions, _ = check_same(learned(tmp_path / "run", method))
     assert np.ptp(actions) > 1e-3
 
 
-@pytest.mark.fast("coil")
+@pytest.mark.slow
 @pytest.mark.parametrize("method", sorted({*METHODS} - WITHOUT_MEMORY - {"guide"}))
 def test_controller_has_the_memory_of_its_policy(method, tmp_path):
     observations, actions, controller = check_same(
@@ -103,6 +103,7 @@ def test_env_with_several_rows_is_refused(tmp_path):
         Controller(env, run.policy(env))
 
 
+@pytest.mark.slow
 def test_cone_world_is_sent_its_steering(tmp_path):
     folder = tmp_path / "run"
     small = [word for word in TINY if not word.startswith(("env.", "evaluation.cases"))]

@@ -143,7 +143,7 @@ def check_equal(folder, boxes, method, *overrides):
 
 
 # There is nothing to tune.
-@pytest.mark.fast(*FAST)
+@pytest.mark.fast("coil")
 @pytest.mark.parametrize("method", [name for name in METHODS if name not in ("guide", "tune")])
 def test_every_method_has_equal_digits_in_every_box(method, tmp_path):
     boxes = BOXES
@@ -177,6 +177,7 @@ def test_half_bounded_actions_have_equal_digits_wherever_the_bound_is(method, tm
     check_equal(tmp_path, boxes, method)
 
 
+@pytest.mark.slow
 def test_random_actions_earn_the_same_wherever_the_bound_is(tmp_path):
     earned = [run_in(tmp_path / name, box, "coil").trial.chance() for name, box in HALF.items()]
     assert earned == pytest.approx([earned[0]] * len(HALF), rel=1e-4)
@@ -196,7 +197,7 @@ def test_clipped_actions_have_equal_digits_too(squash, tmp_path):
     check_equal(tmp_path, boxes, "ppo", f"learner.squash={squash}")
 
 
-@pytest.mark.fast(8)
+@pytest.mark.fast(4)
 @pytest.mark.parametrize("box", [*BOXES, *HALF])
 @pytest.mark.parametrize("method", ["residual", "residual_coil", "policy_decorator"])
 def test_residual_policy_is_its_guide_at_first(method, box, tmp_path):

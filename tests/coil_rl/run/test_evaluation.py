@@ -76,6 +76,7 @@ def test_return_of_several_agents_is_the_sum_of_their_rewards():
     assert rows[0]["each"] == pytest.approx(-0.75)
 
 
+@pytest.mark.slow
 def test_sampled_actions_are_less_smooth_than_deterministic_ones():
     env = ConeTrackEnv(TRACKS, 2, assignment="cyclic", rate=8)
     policy = actor(env, ["observation"])

@@ -252,6 +252,7 @@ def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, 
     corrected.run()
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("place", "message"),
     [
@@ -279,6 +280,7 @@ def test_nan_in_a_loss_or_a_weight_stops_the_run_and_keeps_the_checkpoint(tmp_pa
     assert not (tmp_path / "run" / "policy_last.pt").exists()
 
 
+@pytest.mark.slow
 def test_update_without_a_minibatch_may_have_no_loss(tmp_path):
     run = experiment(tmp_path / "run")
     update = run.learner.update
