@@ -69,7 +69,7 @@ class Measure:
         cls, entry: str | Sequence[str], where: str | Sequence[str] | None = None, **options: Any
     ) -> Measure:
         """Return a measure from values of a YAML file, in which keys are lists."""
-        typed = {
+        typed: dict[str, Any] = {
             key: None if value is None else TYPES[key](value) for key, value in options.items()
         }
         return cls(_key(entry), where=None if where is None else _key(where), **typed)
