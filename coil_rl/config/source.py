@@ -7,10 +7,8 @@ import hashlib
 import inspect
 import io
 import pickle
-import sys
 from collections.abc import Iterable
 from contextlib import suppress
-from pathlib import Path
 from types import FunctionType
 from typing import Any
 
@@ -19,8 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
 from coil_rl.config.trust import import_paths
-
-INSTALLED = {"site-packages", "dist-packages"}  # folders of libraries
+from coil_rl.foreign.host import is_of_user
 
 
 def identity_of(thing: Any) -> str:
@@ -63,19 +60,6 @@ class _State(pickle.Pickler):
             code = thing.__code__
             return list, (thing.__qualname__, code.co_firstlineno, code.co_code, closed)
         return NotImplemented
-
-
-def is_of_user(thing: Any) -> bool:
-    """Return whether a function or class is neither of Python, of a library nor of this package.
-
-    Args:
-        thing: the function or class.
-    """
-    name = str(getattr(thing, "__module__", ""))
-    if name.partition(".")[0] in (*sys.stdlib_module_names, "coil_rl"):
-        return False
-    file = getattr(sys.modules.get(name), "__file__", None)
-    return file is None or not INSTALLED & set(Path(file).parts)
 
 
 def code_of_user(config: DictConfig, keys: Iterable[str]) -> list[str]:

@@ -47,7 +47,9 @@ def evaluate(config: DictConfig) -> float:
         judge(trial(exported, env_maker(exported)), None, results, config.seed)
         return report_outcome(results)
     run = assemble(of_run, folder)
-    policy = run.policy(run.trial.env(SOME_ROWS))  # not of the training, whose env may be another
+    env = run.trial.env(SOME_ROWS)  # not of the training, whose env may be another
+    run.try_out(env)
+    policy = run.policy(env)
     judge(run.trial, policy, results, config.seed, run.drivers(policy))
     return report_outcome(results)
 

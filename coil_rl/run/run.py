@@ -17,6 +17,8 @@ from torchrl.envs import EnvBase
 
 from coil_rl import record
 from coil_rl.errors import NO_SPACE, UserError, is_outside
+from coil_rl.foreign.batch import SeededRows
+from coil_rl.foreign.controllers import PerRow
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.measures import Measure
 from coil_rl.output import decoration, say
@@ -42,7 +44,7 @@ from coil_rl.run.folder import (
 from coil_rl.run.guide_returns import guide_returns
 from coil_rl.run.judge import Trial, judge, report_outcome
 from coil_rl.run.next_step import next_step
-from coil_rl.run.parts import TRAIN, EnvMaker
+from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, try_out
 from coil_rl.run.reasons import SENTENCES, handed_over, start_test
 from coil_rl.run.stopping import resume_command
 from coil_rl.run.training import training_of
@@ -217,7 +219,9 @@ class Run:
         trial = self.trial
         if cases is not None:
             trial = trial_with_cases(trial, whole("cases", cases))
-        policy = self.policy()
+        env = self.make_env(SOME_ROWS, TEST)
+        self.try_out(env)
+        policy = self.policy(env)
         with tempfile.TemporaryDirectory() as temporary:
             place = Path(temporary) if folder is None else Path(folder).expanduser()
             judgement = judge(trial, policy, place, self.seed, self.drivers(policy))
@@ -234,11 +238,22 @@ class Run:
         """
         which = self.which if which is None else which
         self.weights(which)
-        env = self.make_env(1, TRAIN)
         if not self.has_agent:
             env, policy = self.make_env.guided(1, TRAIN)
+            self.try_out(env)
             return Controller(env, policy, self.folder)
+        env = self.make_env(1, TRAIN)
+        self.try_out(env)
         return Controller(env, self.load_policy(env, which), self.folder, which)
+
+    def try_out(self, env: EnvBase) -> None:
+        """Try what others wrote of the run, and warn of what is found; see `Trial`.
+
+        Args:
+            env: of the run, which shows whether there is anything.
+        """
+        if any(isinstance(part, (SeededRows, PerRow)) for part in env.modules()):
+            try_out(self.make_env.bare(SOME_ROWS, TEST, None), self.make_env.guides())
 
     def policy(self, env: EnvBase | None = None, which: str | None = None) -> Any:
         """Return the policy of a finished run for an env; None without an agent.
