@@ -27,6 +27,7 @@ from coil_rl.config.parts import (
     what_guides_see,
 )
 from coil_rl.config.proxies import PROXIES, distil
+from coil_rl.config.source import code_of_run
 from coil_rl.config.trust import make_logger
 from coil_rl.config.values import complete_measures
 from coil_rl.errors import UserError
@@ -87,6 +88,7 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         threads=config.threads,
         settings=settings(config),
         identity=identity(config),
+        code=partial(code_of_run, config),
     )
 
 

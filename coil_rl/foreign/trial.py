@@ -124,8 +124,7 @@ class Trial:
             state: of the transforms, which have no seed.
             pause: before each of the first steps, in seconds.
         """
-        one = len(self.env.action_keys) == 1
-        act = partial(random_action, self.env) if one else self.env.rand_action
+        act = _random(self.env)
         clock, left = _Clock(), [PAUSED if pause else 0]
 
         def policy(data: TensorDictBase) -> TensorDictBase:
@@ -170,7 +169,8 @@ class Trial:
         if not isinstance(self.base, GymnasiumEnv):
             return
         if self.base is not self.env:  # transforms may leave out entries
-            rollout = self.base.rollout(self.steps, break_when_any_done=False)
+            act = _random(self.base)
+            rollout = self.base.rollout(self.steps, act, break_when_any_done=False)
         for entry in self.base.codec.entries:
             parts = [rollout[entry.key], rollout["next", *entry.key]]
             values = torch.cat([part.reshape(-1, *entry.given) for part in parts])
@@ -185,7 +185,7 @@ class Trial:
                 )
 
     def _step_leaves_its_input(self) -> None:
-        data = self.env.rand_action(self.env.reset())
+        data = _random(self.env)(self.env.reset())
         copy = data.clone()
         self.env.step(data)
         changed = difference(copy, data)
@@ -198,7 +198,7 @@ class Trial:
         An env that draws random numbers in its steps may differ anyway: so the step is compared
         only if another seed makes no difference.
         """
-        env = self.base
+        env, act = self.base, _random(self.base)
 
         def seed(present: TensorDictBase) -> TensorDictBase:
             env.set_seed(1)
@@ -212,9 +212,9 @@ class Trial:
         def second_step(change: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:
             env.set_seed(0)
             torch.manual_seed(0)
-            present = change(env.step_mdp(env.step(env.rand_action(env.reset()))))
+            present = change(env.step_mdp(env.step(act(env.reset()))))
             torch.manual_seed(0)  # of the action
-            return env.step(env.rand_action(present))["next"]
+            return env.step(act(present))["next"]
 
         plain, seeded = second_step(lambda present: present), second_step(seed)
         changed = difference(plain[1:], second_step(reset)[1:])
@@ -239,9 +239,7 @@ class Trial:
         Raises:
             ValueError: for an env of one row.
         """
-        env, act = self.env, None
-        if len(env.action_keys) == 1:
-            act = partial(random_action, env)
+        env, act = self.env, _random(self.env)
         with torch.no_grad():
             if env.batch_size:
                 recorded: TensorDictBase = env.rollout(self.steps, act, break_when_any_done=False)
@@ -456,6 +454,11 @@ def _pickled(value: Any) -> bytes:
         return pickle.dumps(value)
     except Exception:  # whatever the pickling of somebody else's object raises
         return b""
+
+
+def _random(env: EnvBase) -> Callable[[TensorDictBase], TensorDictBase]:
+    """Return what writes a random action, also where it has no bound."""
+    return partial(random_action, env) if len(env.action_keys) == 1 else env.rand_action
 
 
 def _layers(env: Any) -> Iterator[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
@@ -31,9 +32,13 @@ from coil_rl.run.curve import Watch
 from coil_rl.run.delivery import guide_of
 from coil_rl.run.experiment import PUT_BACK
 from coil_rl.run.folder import (
+    CODE,
+    CODE_BEFORE,
     HANDED_OVER,
     begin,
+    changed_code,
     check_same,
+    code_of,
     is_begun,
     is_evaluated,
     locked,
@@ -52,6 +57,8 @@ from coil_rl.run.weights import put_weights
 
 if TYPE_CHECKING:
     import pandas as pd
+
+ACCEPT = "accept"  # what a user says to go on with changed code
 
 
 @dataclass(frozen=True)
@@ -112,6 +119,7 @@ class Run:
             `method.needs_guide` and `evaluation.measures` for reports.
         identity: values on which the numbers depend, by name; a resumed run must have the same.
         command: what was typed to make the run.
+        code: returns the SHA-256 of each file of the user that it depends on, by module.
 
     Example:
         >>> import coil_rl
@@ -143,6 +151,7 @@ class Run:
     settings: Mapping[str, Any] = field(default_factory=dict)
     identity: Mapping[str, Any] = field(default_factory=dict)
     command: Sequence[str] = ()
+    code: Callable[[], Mapping[str, str]] = dict
 
     def __post_init__(self) -> None:
         self.folder = Path(self.folder)
@@ -174,7 +183,7 @@ class Run:
             )
         return weights_file(self.folder, which if self.delivery == "tested" else "last")
 
-    def train(self, frames: int | None = None) -> Run:
+    def train(self, frames: int | None = None, *, changed: str = "") -> Run:
         """Train to the end, evaluate, and return the run.
 
         A run that was stopped, or is shorter, goes on.
@@ -182,16 +191,18 @@ class Run:
         Args:
             frames: new length of the run. Schedules over the run, such as a learning rate, then
                 refer to the new length.
+            changed: "accept" to go on although the code of the env or of another part was changed
+                since the run began.
 
         Raises:
-            UserError: if another process uses the folder, if it holds another run, if the run is
-                longer than `frames`, or if that is no whole number.
+            UserError: if another process uses the folder, if it holds another run or its code was
+                changed, if the run is longer than `frames`, or if that is no whole number.
         """
         with locked(self.folder):
             if frames is not None:
                 self.lengthen(whole("frames", frames))
             if is_begun(self.folder):
-                self.finish_begun()
+                self.finish_begun(changed)
             else:
                 self.begin()
                 self.finish()
@@ -252,6 +263,13 @@ class Run:
         Args:
             env: of the run, which shows whether there is anything.
         """
+        names = changed_code(self.folder, self.code()) if is_begun(self.folder) else ""
+        if names:
+            warnings.warn(
+                f"{self.folder} was trained with another file of {names}: what follows is of the "
+                "present one",
+                stacklevel=2,
+            )
         if any(isinstance(part, (SeededRows, PerRow)) for part in env.modules()):
             try_out(self.make_env.bare(SOME_ROWS, TEST, None), self.make_env.guides())
 
@@ -268,7 +286,8 @@ class Run:
 
     def begin(self) -> None:
         """Write the configuration of a new run; a `UserError` if the folder holds one already."""
-        begin(self.folder, self.settings, self.command)
+        code = dict(self.code())
+        begin(self.folder, {**self.settings, **({CODE: code} if code else {})}, self.command)
 
     def lengthen(self, frames: int) -> None:
         """Set a new length, before the run goes on.
@@ -292,7 +311,7 @@ class Run:
         self.identity = dict(self.identity) | {"budget.frames": frames, "budget.stages": stages}
         if not begun:
             return
-        write_config(self.folder, self.settings)
+        write_config(self.folder, {**self.settings, **code_of(self.folder)})
         for file in (record.EVALUATION, record.PAGE, record.SECONDS, record.DELIVERY):
             (self.folder / file.name).unlink(missing_ok=True)
         say(
@@ -301,18 +320,41 @@ class Run:
             error=True,
         )
 
-    def finish_begun(self) -> float:
+    def finish_begun(self, changed: str = "") -> float:
         """Finish the run in the folder, and return the mean test reward of its policy.
 
+        Args:
+            changed: as of `train`.
+
         Raises:
-            UserError: if its configuration was edited since it began.
+            UserError: if its configuration or its code was edited since it began.
         """
         if is_evaluated(self.folder):
             self.check_unchanged()
             reward = report_outcome(self.folder)
             self._say_next()
             return reward
+        self._take_code(changed)
         return self.finish(resumed=True)
+
+    def _take_code(self, changed: str) -> None:
+        """Go on with the code as it is; a `UserError` if it was changed and nobody accepts that."""
+        if changed not in ("", ACCEPT):
+            raise UserError(f"changed={changed} must be {ACCEPT}, or be left out")
+        present = dict(self.code())
+        names = changed_code(self.folder, present)
+        if names and changed != ACCEPT:
+            raise UserError(
+                f"{self.folder} was begun with another file of {names}, so one curve would be of "
+                "two tasks; put the file back, train another run, or go on with "
+                f"{resume_command(self.folder)} changed={ACCEPT}"
+            )
+        if names:
+            begun = code_of(self.folder)
+            before = begun.get(CODE_BEFORE, {}) | begun[CODE]
+            saved = {**self.settings, CODE: present, CODE_BEFORE: before}
+            write_config(self.folder, saved)
+            say(f"{self.folder} goes on with another file of {names}", error=True)
 
     def check_unchanged(self) -> None:
         """Check that the configuration of a finished run was not edited.
