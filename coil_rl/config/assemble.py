@@ -27,7 +27,6 @@ from coil_rl.config.parts import (
 )
 from coil_rl.config.proxies import PROXIES, distil
 from coil_rl.config.trust import make_logger
-from coil_rl.config.values import complete_measures
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
@@ -44,10 +43,9 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
     """Return the run that a configuration describes; nothing is built or written yet.
 
     Args:
-        config: of `coil-train`, composed or read from a folder; its measures are completed.
+        config: of `coil-train`, composed or read from a folder.
         folder: of the run, instead of `run_dir`.
     """
-    complete_measures(config)
     folder = Path(config.run_dir) if folder is None else folder
     make_env = env_maker(config, folder)
     trains = trains_guides(config)

@@ -1,7 +1,7 @@
 """The parts that a configuration describes: its envs, guides, learner and evaluation."""
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from coil_rl.config.own_run import own_run
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import MEAN_CASE, measures_of
+from coil_rl.plain_yaml import entries
 from coil_rl.report import Returns
 from coil_rl.report.pictures import Picture
 from coil_rl.run.beside import Beside
@@ -27,7 +28,7 @@ from coil_rl.transforms.action_space import nested_key
 
 # Parts of a configuration that name entries of the env of a method; its guides are parts of
 # `method.transforms`.
-READERS = ("observes", "method", "watch", "learner", "degrade", "action", "evaluation")
+READERS = ["observes", "method", "watch", "learner", "degrade", "action", "evaluation"]
 
 
 def build_evaluation(
@@ -332,25 +333,12 @@ def unread_controllers(config: DictConfig, transforms: Iterable[Transform]) -> s
     """
     names = set(OmegaConf.select(config, "env.controllers") or ())
     keys = [key for part in transforms for key in (part.in_keys or ())]
-    named = set(_texts(keys))
-    for reader in READERS:
-        node = OmegaConf.select(config, reader)
-        named |= set(_texts(OmegaConf.to_container(node) if OmegaConf.is_config(node) else node))
+    named = {part for key in keys for part in ((key,) if isinstance(key, str) else key)}
+    read = OmegaConf.to_container(OmegaConf.masked_copy(config, READERS))
+    named |= {value for _, _, value in entries(read, lists=True) if isinstance(value, str)}
     return {name for name in names if not any(_mentions(text, name) for text in named)}
 
 
 def _mentions(text: str, name: str) -> bool:
     """Return whether a text has a name as a whole word."""
     return re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) is not None
-
-
-def _texts(node: Any) -> Iterator[str]:
-    """Yield the texts in nested lists and mappings, but not the keys of mappings."""
-    if isinstance(node, str):
-        yield node
-    elif isinstance(node, dict):
-        for value in node.values():
-            yield from _texts(value)
-    elif isinstance(node, (list, tuple)):
-        for value in node:
-            yield from _texts(value)

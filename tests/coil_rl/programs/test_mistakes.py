@@ -119,7 +119,7 @@ def refusal(name, *arguments):
         ("method.observes=[lidar]", "the env has no entry lidar to observe; it has observation"),
         (
             "evaluation.measures.clearance.format=nan",
-            "format='nan' must be a format of numbers, such as .1f",
+            "format=nan must be a format of numbers, such as .1f",
         ),
         (
             "watch.step.smoothness=null",
@@ -142,7 +142,7 @@ def refusal(name, *arguments):
         ),
         (
             "evaluation.measures.laps.reduction=median",
-            "evaluation.measures.laps.reduction='median' must be 'mean'",
+            "evaluation.measures.laps: reduction=median must be one of mean",
         ),
         (
             "evaluation.measures.laps.at_least=1 evaluation.measures.laps.at_most=2",
