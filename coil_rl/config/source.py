@@ -18,6 +18,7 @@ import hydra.utils
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
+from coil_rl.config.compose import packages
 from coil_rl.config.given import PLACES, kept_objects
 from coil_rl.config.trust import import_paths
 from coil_rl.errors import UserError
@@ -96,10 +97,13 @@ def code_of_run(config: DictConfig) -> dict[str, str]:
             things += kept_objects(config, place)
     waiting = [name for thing in things for name in _modules_of(thing)]
     found: dict[str, str] = {}
+    ours = {package.partition(".")[0] for package in packages()}
     for name in waiting:  # it grows
         module = sys.modules.get(name)
         file = getattr(module, "__file__", None)
-        if name in found or file is None or not is_of_user(SimpleNamespace(__module__=name)):
+        if name in found or file is None or name.partition(".")[0] in ours:
+            continue
+        if not is_of_user(SimpleNamespace(__module__=name)):
             continue
         with suppress(OSError):  # it is gone
             found[name] = hashlib.sha256(Path(file).read_bytes()).hexdigest()

@@ -28,7 +28,6 @@ from coil_rl.foreign.faults import ForeignError, action_array, foreign
 from coil_rl.foreign.guard import Numbers
 
 INSTALLED = {"site-packages", "dist-packages"}  # folders of libraries
-OURS = ("coil_rl", "coil_robot", "coil_studies", "coil_paper")
 Role = Literal["guide", "act", "predict", "network", "function", ""]
 
 
@@ -44,7 +43,7 @@ def is_of_user(thing: Any) -> bool:
         thing: the function or class.
     """
     name = str(getattr(thing, "__module__", ""))
-    if name.partition(".")[0] in (*sys.stdlib_module_names, *OURS):
+    if name.partition(".")[0] in (*sys.stdlib_module_names, "coil_rl"):
         return False
     file = getattr(sys.modules.get(name), "__file__", None)
     return file is None or not INSTALLED & set(Path(file).parts)
