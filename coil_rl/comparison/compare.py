@@ -40,7 +40,7 @@ from coil_rl.comparison.page import command_of, delayed_sentence, draw, page_of
 from coil_rl.comparison.same import identity_of, keep_plan, known_plan
 from coil_rl.comparison.timing import Plan
 from coil_rl.comparison.verdict import NOTHING, Verdict, verdict
-from coil_rl.config.check import check_parts
+from coil_rl.config.check import check
 from coil_rl.config.parts import env_maker
 from coil_rl.config.python import Named, composed, named
 from coil_rl.config.trust import trust_own
@@ -213,11 +213,11 @@ class Comparison:
                 "or guide=controller guide.controller.of=MODULE:NAME"
             )
         trust_own(anchored)
-        check_parts(anchored)
+        check(anchored)
         # What this arm does not read, none of them reads: it has a learner, advice and tests.
         check_read(anchored, self.given.words)
         if self.tunes:
-            check_parts(self._config(TUNE))
+            check(self._config(TUNE))
         return self._config(PPO)
 
     def _config(

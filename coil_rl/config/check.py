@@ -1,11 +1,9 @@
 """Check of a configuration before a run starts: ranges, and one small build of every part.
 
-A mistake is found in seconds. Nothing is written except the folder of the run, as the last step.
+A mistake is found in seconds.
 """
 
-import errno
 import math
-import os
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -24,7 +22,6 @@ from coil_rl.config.fits import (
     check_number,
 )
 from coil_rl.config.folder import run_folder
-from coil_rl.config.messages import sentence
 from coil_rl.config.nodes import build, build_all, check_node
 from coil_rl.config.own_run import own_run
 from coil_rl.config.passive import check_passive, passive
@@ -76,16 +73,11 @@ STEPS_SAID, POINTS_SAID = 100, 8
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in a configuration.
+    """Check the configuration of a program that acts or trains; nothing is written.
 
-    It is of a program that acts or trains.
+    Raises:
+        UserError: for the first mistake.
     """
-    check_parts(config)
-    make_folder(Path(config.run_dir))
-
-
-def check_parts(config: DictConfig) -> None:
-    """Do the checks of `check` without making the folder of the run."""
     check_values(config)
     trains = OmegaConf.get_type(config) is TrainConfig
     has_agent = trains and config.method.observes is not None
@@ -384,7 +376,7 @@ def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
     """Raise a `UserError` for the first mistake in the training of the proxies of guides."""
     for name in guides:
         try:
-            check_parts(proxy_config(config, name))
+            check(proxy_config(config, name))
         except UserError as error:
             raise UserError(f"proxy of guide.{name}: {error}") from error
 
@@ -398,16 +390,6 @@ def _check_frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> None:
             f"guides take {taken} frames; give at least "
             f"{taken + budget.num_envs * budget.steps}, or a smaller proxy.budget.frames"
         )
-
-
-def make_folder(folder: Path) -> None:
-    """Make the folder of a run, or raise a `UserError` if nothing can be written there."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK):
-            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
-    except OSError as error:
-        raise UserError(sentence(error)) from error
 
 
 def needs_numbers(error: BaseException | None) -> bool:

@@ -5,8 +5,10 @@ opened by its name. Wherever a program takes the folder of a run to read, `pretr
 one. Its files are checked by their SHA-256 before any of them is read.
 """
 
+import errno
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -121,6 +123,16 @@ def _values(config: DictConfig) -> dict[str, Any]:
     measures = measures_of(values["evaluation"]["measures"])
     values["evaluation"]["measures"] = {name: each.node() for name, each in measures.items()}
     return dict(values)
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder of a run, or raise a `UserError` if nothing can be written there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+    except OSError as error:
+        raise UserError(sentence(error)) from error
 
 
 def pretrained_names() -> list[str]:

@@ -153,10 +153,7 @@ def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> l
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in the configuration.
-
-    Otherwise make the folder of the results.
-    """
+    """Raise a `UserError` for the first mistake in the configuration."""
     given = config.run is not None
     if config.exported is not None and not given:
         raise UserError(
