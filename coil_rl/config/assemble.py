@@ -25,6 +25,7 @@ from coil_rl.config.parts import (
     trains_guides,
 )
 from coil_rl.config.proxies import PROXIES, distil
+from coil_rl.config.source import code_of_run
 from coil_rl.config.trust import make_logger, to_trust
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
@@ -84,6 +85,7 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         settings=settings(config),
         identity=identity(config),
         trust=to_trust(config),
+        code=partial(code_of_run, config),
     )
 
 

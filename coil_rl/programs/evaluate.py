@@ -47,7 +47,9 @@ def evaluate(config: DictConfig) -> float:
         judge(trial(alone, env_maker(alone)), None, results, config.seed)
     else:
         run = assemble(alone, folder)
-        policy = run.policy(run.trial.env(SOME_ROWS))  # the env of the training may be another
+        env = run.trial.env(SOME_ROWS)  # not of the training, whose env may be another
+        run.try_out(env)
+        policy = run.policy(env)
         judge(run.trial, policy, results, config.seed, run.drivers(policy))
     return report_outcome(results)
 

@@ -13,9 +13,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from programs import called, command, environment
 from run_folders import make_untrained_run
@@ -77,12 +75,7 @@ def refusal(name, *arguments):
             "no key budget.step; budget has frames, num_envs, steps, minibatches, stages; "
             "did you mean steps?",
         ),
-        (
-            "learner.learning_rat=1",
-            "did you mean learning_rate?",
-        ),
         ("+env.sped=3", "env: ConeTrackEnv takes no sped; it takes tracks, num_envs"),
-        ("+evaluation.env.lap=3", "dtype; did you mean laps?"),
         (
             "+budget.frame=1",
             "there is no key frame; budget has frames, num_envs, steps, minibatches",
@@ -105,12 +98,7 @@ def refusal(name, *arguments):
             "method.observes=5 must be a list; write method.observes=[5]",
         ),
         ("learner.gamma=abc", "learner.gamma='abc' must be a valid number"),
-        ("learner.gamma=nan", "learner.gamma=nan must be a finite number"),
         ("learner.hidden=[64,a]", "learner.hidden[1]='a' must be a valid integer"),
-        (
-            "proxy.method=x",
-            "proxy.method=x: Invalid type assigned: str is not a subclass of MethodConfig",
-        ),
         # values
         ("seed=-1", "seed=-1 must be at least 0"),
         (
@@ -123,24 +111,12 @@ def refusal(name, *arguments):
             "compile=true is for the CPU only, not for device=cuda; take compile=false",
         ),
         ("preset.rate=1e23", "env.rate=1e+23 must be at most 1000"),
-        ("env.time_limit=1e300", "env.time_limit=1e+300 must be at most 1000000"),
-        (
-            "env.laps=999999999999999999",
-            "env.laps=999999999999999999 must be at most 1000000",
-        ),
         (
             "learner.hidden=[99999999]",
             "learner: hidden[0]=99999999 must be at most 4096",
         ),
-        (
-            f"learner.hidden={[8] * 17}".replace(" ", ""),
-            "must be at most 16 long",
-        ),
-        ("proxy.budget.frames=-5", "proxy.budget.frames=-5 must be at least 1"),
-        ("env.cone_bonus=all", "env.cone_bonus='all' must be 'first_sighting' or 'every_sighting'"),
         ("track.train.count=0", "count=0 of random_tracks must be from 1 to 10000"),
         ("method.observes=[lidar]", "the env has no entry lidar to observe; it has observation"),
-        ("watch.step.reward_finish=1e-300", "watch.step.reward_finish=1e-300 must be a list"),
         (
             "evaluation.measures.clearance.format=nan",
             "format=nan must be a format of numbers, such as .1f",
@@ -149,16 +125,11 @@ def refusal(name, *arguments):
             "watch.step.smoothness=null",
             "watch.step.smoothness=None must be a list, such as [info, lap]",
         ),
-        ("+watch.step.r=reward", "watch.step.r=reward must be a list"),
         ("watch.step.smoothness=[info,smoothnes]", "is no entry of the env; it has cone_count"),
         ("watch.episode.laps=[info,pose]", "watch.episode.laps=info.pose has 3 numbers a row"),
         (
             "evaluation.measures.laps.entry=[info,pose]",
             "evaluation.measures.laps=info.pose has 3 numbers a row, and one is needed",
-        ),
-        (
-            "evaluation.measures.laps.entry=[info,reward]",
-            "evaluation.measures.laps=info.reward has no number a row, and one is needed",
         ),
         (
             "evaluation.measures.laps.where=[info,lap]",
@@ -170,24 +141,12 @@ def refusal(name, *arguments):
             "evaluation.measures.crashed=info.crash is no entry of the",
         ),
         (
-            "evaluation.measures.laps.where=[info,flag]",
-            "evaluation.measures.laps=info.flag is no entry of the env",
-        ),
-        (
             "evaluation.measures.laps.reduction=median",
             "evaluation.measures.laps: reduction=median must be one of mean",
         ),
         (
-            "+evaluation.measures.laps.unit=s",
-            "there is no key unit; evaluation.measures.laps has entry, red",
-        ),
-        (
             "evaluation.measures.laps.at_least=1 evaluation.measures.laps.at_most=2",
             "at_least and at_most cannot both",
-        ),
-        (
-            "evaluation.pictures.lines._target_=coil_rl.report.Nope",
-            "evaluation.pictures.lines: there is no 'coil_rl",
         ),
         (
             "~evaluation.curve.cases.selection",
@@ -228,33 +187,17 @@ def refusal(name, *arguments):
         ("experiment=coil_vs_ppo", "To append to your default list use +experiment=coil_vs_ppo"),
         # combinations
         (
-            "evaluation.measures.laps.entry=1",
-            "evaluation.measures.laps: 1 is no entry; name one, as in reward or",
-        ),
-        (
             "guide=linear_feedback",
             "guide.linear_feedback: it cannot act on the observations of this env (The size of",
-        ),
-        (
-            "degrade=[noisy] degrade.noisy.sigma=-1",
-            "degrade.noisy.sigma=-1 must be at least 0",
         ),
         (
             "method=coil degrade=[shuffled] track.train.count=2",
             "each case of the evaluation has one row, 1 in all: ",
         ),
         (
-            "method=coil +degrade@evaluation.advice.other=shuffled",
-            "1 in all: method.transforms: ShuffledAdvice",
-        ),
-        (
             "method=oil",
             "track.train gives one track, which cannot be left out to validate; "
             "set learner.group_key=null",
-        ),
-        (
-            "method=dynamic_coil_joint proxy.learner.regressor.epochs=-1",
-            "guide.spline: learner: epochs=-1 must",
         ),
         (
             "method=dynamic_coil_joint proxy.method.observes=null",
@@ -590,71 +533,6 @@ def test_interrupt_while_importing_is_one_line(tmp_path, module):
     assert started.returncode == 130, error
     assert error.splitlines()[-1] == b"train: interrupted"
     assert b"Traceback" not in error
-
-
-def leaves(node, path=""):
-    """Yield the full keys of the values of a configuration."""
-    for key in node:
-        name = f"{path}.{key}".lstrip(".")
-        value = node._get_node(key)
-        if isinstance(value, DictConfig) and not value._is_interpolation():
-            yield from leaves(value, name)
-        else:
-            yield name
-
-
-with initialize_config_module("coil_rl.conf", version_base="1.3"):
-    LEAVES = sorted(leaves(compose("train", TINY)))
-
-JUNK = [
-    "abc",
-    "''",
-    "null",
-    "true",
-    "-1",
-    "0",
-    "1.5",
-    "nan",
-    "inf",
-    "-inf",
-    "1e400",
-    "1e-300",
-    "123456789012345678901234",
-    "[]",
-    "[1,a]",
-    "{}",
-    "{a:1}",
-    "???",
-    "${seed}",
-    "${nope}",
-    "${env}",
-    "{_target_:subprocess.run}",
-    "../..",
-]
-VALUES = st.sampled_from(JUNK) | st.text(max_size=8).filter(lambda text: "\0" not in text)
-
-
-# All examples of a test share its folder.
-@pytest.mark.slow
-def test_any_value_is_accepted_or_refused_in_one_sentence(started):
-    @settings(
-        max_examples=150, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow]
-    )
-    @given(
-        key=st.sampled_from(LEAVES) | st.sampled_from(LEAVES).map(lambda key: key + "x"),
-        value=VALUES,
-    )
-    def change_one_value(key, value):
-        before = files()
-        done = called("train", *TINY, f"{key}={value}", code=None)
-        if done.returncode == 0:
-            return
-        assert done.returncode == 2
-        assert len(done.stderr.splitlines()) == 1, done.stderr
-        assert "Traceback" not in done.stderr
-        assert files() == before
-
-    change_one_value()
 
 
 def test_folder_in_place_of_the_lock_is_named(tmp_path):
