@@ -21,7 +21,12 @@ TINY = [
     "budget.num_envs=4",
     "budget.steps=8",
 ]
-OFF_POLICY = ["learner.starts=16", "learner.batch_size=8", "learner.ratio=1", "learner.hidden=[8]"]
+OFF_POLICY = [
+    "learner.starts=16",
+    "learner.batch_size=8",
+    "learner.updates_per_step=0.125",
+    "learner.hidden=[8]",
+]
 GIVEN = {
     "dqn": OFF_POLICY,
     "sac": OFF_POLICY,
