@@ -27,7 +27,7 @@ from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.statistics import interval
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.parts import SOME_ROWS, TEST
-from coil_rl.run.policy_batch import PoliciesBeside
+from coil_rl.run.policy_batch import Acting, OnRows
 from coil_rl.run.run import Run
 
 LAGS = {"0": (0, 0), "0.5": (0, 1), "1": (1, 1), "2": (2, 2)}  # least and most steps, by turns
@@ -94,7 +94,7 @@ def driven(
     runs = [late_run(folder, lags, missing, count) for folder in folders]
     trial = runs[0].trial
     policies = [run.policy(trial.env(SOME_ROWS)) for run in runs]
-    beside = PoliciesBeside(policies, [False] * len(policies))
+    beside = OnRows(list(map(Acting, policies)))
     result = trial.evaluation.run(trial.env(len(runs) * count), beside)
     return [result[index * count : (index + 1) * count] for index in range(len(runs))]
 

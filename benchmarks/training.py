@@ -86,11 +86,7 @@ class Training:
             if isinstance(transform, GuideActions):
                 stopwatch.wrap(transform, "_call", "guide")
                 stopwatch.wrap(transform, "_reset", "guide")
-        lean = self.experiment.rollout.lean
-        if lean is None:
-            stopwatch.wrap(learner.policy, "forward", "policy")
-        else:
-            stopwatch.wrap(lean.policy, "act", "policy")
+        stopwatch.wrap(learner.policy, "forward", "policy")
         stopwatch.wrap(learner, "update", "update")
 
 

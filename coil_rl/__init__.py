@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from coil_rl.envs import load_tracks as load_tracks
     from coil_rl.envs import random_tracks as random_tracks
     from coil_rl.envs import shipped_tracks as shipped_tracks
-    from coil_rl.envs.limits import check_range as check_range
     from coil_rl.errors import UserError as UserError
     from coil_rl.errors import did_you_mean as did_you_mean
     from coil_rl.export import ExportedGuide as ExportedGuide

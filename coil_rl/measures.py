@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from itertools import compress
 from statistics import fmean
 from typing import Any
 
-from coil_rl.errors import UserError
+from coil_rl.errors import UserError, did_you_mean
 
 MEAN_CASE = "mean"  # in the column `case`: the means over the cases
 # Reductions of the steps of an episode to one number.
 REDUCTIONS = ("mean", "sum", "min", "max", "last", "any", "count", "mean_nonzero")
+# Columns that evaluation.csv and episodes.csv have besides the measures.
+TAKEN = ("driver", "advice", "actions", "case", "reward", "steps", "episodes", "seed")
+TYPES = {"at_least": float, "at_most": float, "reduction": str, "title": str, "format": str}
+FORMAT = r"[+,]?\d{0,2}(\.\d)?[efg%]?"  # of numbers; its width has at most two digits
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,7 @@ class Measure:
         format: of its numbers in tables; "auto": as they need.
 
     Raises:
-        ValueError: for another reduction, or two bounds.
+        ValueError: for another reduction or format, or two bounds.
     """
 
     entry: str | tuple[str, ...]
@@ -56,13 +61,23 @@ class Measure:
             raise ValueError(f"reduction={self.reduction} must be one of {', '.join(REDUCTIONS)}")
         if self.at_least is not None and self.at_most is not None:
             raise ValueError("at_least and at_most cannot both be given; give one")
+        if self.format != "auto" and not re.fullmatch(FORMAT, self.format):
+            raise ValueError(f"format={self.format} must be a format of numbers, such as .1f")
 
     @classmethod
     def of(
         cls, entry: str | Sequence[str], where: str | Sequence[str] | None = None, **options: Any
     ) -> Measure:
         """Return a measure from values of a YAML file, in which keys are lists."""
-        return cls(_key(entry), where=None if where is None else _key(where), **options)
+        typed: dict[str, Any] = {
+            key: None if value is None else TYPES[key](value) for key, value in options.items()
+        }
+        return cls(_key(entry), where=None if where is None else _key(where), **typed)
+
+    def node(self) -> dict[str, Any]:
+        """Return the values for a YAML file."""
+        values = asdict(self).items()
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in values}
 
     def pool(self, values: Sequence[float], episodes: Sequence[float] | None = None) -> float:
         """Return the mean of the episodes that have a number, see `denominators`.
@@ -101,14 +116,31 @@ def in_info(key: str | tuple[str, ...]) -> bool:
 def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
     """Return measures by name from the key `evaluation.measures` of a configuration.
 
-    Errors are `UserError`s.
+    Raises:
+        UserError: for a node that is no measure, one with an unknown key or a value that does not
+            fit, and for the name of another column of the tables.
     """
-    measures = {}
+    measures, known = {}, [each.name for each in fields(Measure)]
     for name, node in nodes.items():
+        key = f"evaluation.measures.{name}"
+        if name in TAKEN:
+            raise UserError(
+                f"{key}: {name} is already a column of the tables; give the measure another name"
+            )
+        if not isinstance(node, Mapping) or ("entry" not in node and node.keys() <= set(known)):
+            raise UserError(
+                f"{key}={node} is no measure; write {key}.entry=ENTRY and, where it is not the "
+                "mean over the steps, its reduction"
+            )
+        for unknown in node.keys() - set(known):
+            raise UserError(
+                f"there is no key {unknown}; {key} has {', '.join(known)}"
+                f"{did_you_mean(str(unknown), known)}"
+            )
         try:
             measures[name] = Measure.of(**node)
-        except ValueError as error:
-            raise UserError(f"evaluation.measures.{name}: {error}") from error
+        except (TypeError, ValueError) as error:
+            raise UserError(f"{key}: {error}") from error
     return measures
 
 

@@ -5,7 +5,7 @@ the disk. Numbers are read and written as OmegaConf does, to which 1e-3 is a num
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -85,6 +85,39 @@ def read_yaml(path: Path) -> Any:
         if depth > DEEPEST:
             raise UserError(f"{path} has more than {DEEPEST} levels; no configuration of a run has")
     return yaml.load(text, Loader=_Loader)
+
+
+def entries(node: Any, name: str = "", *, lists: bool = False) -> Iterator[tuple[str, Any, Any]]:
+    """Yield full key, key and value of each entry of nested mappings, a node before its entries.
+
+    Args:
+        name: full key of the node; empty for the whole.
+        lists: whether lists are nodes too; the full keys in them have indices, as in `key[0]`.
+    """
+    if isinstance(node, Mapping):
+        inner = [(f"{name}.{key}" if name else str(key), key, node[key]) for key in node]
+    elif lists and isinstance(node, list):
+        inner = [(f"{name}[{index}]", index, value) for index, value in enumerate(node)]
+    else:
+        return
+    for full, key, value in inner:
+        yield full, key, value
+        yield from entries(value, full, lists=lists)
+
+
+def leaves(node: Any) -> dict[str, Any]:
+    """Return what is no mapping, or an empty one, in nested mappings, by its full key."""
+    found = ((key, value) for key, _, value in entries(node))
+    return {key: value for key, value in found if not (isinstance(value, Mapping) and value)}
+
+
+def is_part(key: str, of: Iterable[str]) -> bool:
+    """Return whether a key, or a parent of it, is one of some keys.
+
+    Args:
+        of: full keys of values or groups.
+    """
+    return any(f"{key}.".startswith(f"{each}.") for each in of)
 
 
 def yaml_of(values: Mapping[str, Any]) -> str:

@@ -139,8 +139,20 @@ LONGEST = [
 ]
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Begin with the longest files; the order of all others stays."""
+    """Mark slow what is not among the fast cases of its table; begin with the longest files."""
+    tables = {}
+    for item in items:
+        if mark := item.get_closest_marker("fast"):
+            tables.setdefault((item.path, item.function), (mark.args, []))[1].append(item)
+    for fast, cases in tables.values():
+        if isinstance(fast[0], int):
+            step = -(-len(cases) // fast[0])
+            fast = [case.callspec.id for case in cases[::step]]
+        for case in cases:
+            if case.callspec.id not in fast:
+                case.add_marker("slow")
 
     def place(item):
         return LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST)

@@ -4,6 +4,7 @@ import re
 import traceback
 from pathlib import Path
 
+import pytest
 import torch
 from programs import TINY, called
 
@@ -30,6 +31,7 @@ def files_on_the_stack():
     return [file for file in inside if file.startswith(PACKAGES)]
 
 
+@pytest.mark.slow
 def test_walks_name_every_file_between_the_command_and_the_optimiser_step_and_the_advice(
     tmp_path, monkeypatch
 ):

@@ -1,4 +1,5 @@
 import ast
+import functools
 import graphlib
 import sys
 import tomllib
@@ -40,6 +41,7 @@ PUBLIC = [
 
 # Public modules of theirs, with all that they hold.
 MODULES = [
+    "coil_rl.ranges",
     "coil_rl.envs.recordings.bearings",
     "coil_rl.envs.recordings.mcap_files",
     "coil_rl.envs.recordings.messages",
@@ -70,12 +72,18 @@ def package_of(path: Path) -> list[str]:
     return [*LINKED.get(folder, folder).split("."), *rest]
 
 
-def imported_modules(source: str, package: list[str]) -> Iterator[str]:
-    """Yield the absolute names of all imported modules of a source.
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def imported_modules(path: Path, tree: ast.Module | None = None) -> Iterator[str]:
+    """Yield the absolute names of all imported modules of a file, or of a part of it.
 
     `from a import b` gives `a.b`, because b may be a module.
     """
-    for node in ast.walk(ast.parse(source)):
+    package = package_of(path)
+    for node in ast.walk(tree or tree_of(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -88,12 +96,12 @@ def is_inside(module: str, package: str) -> bool:
     return module == package or module.startswith(package + ".")
 
 
-def forbidden_imports(source: str, package: list[str], folder: str) -> list[str]:
-    """Return the imports of a source that are not allowed in its folder."""
+def forbidden_imports(path: Path, folder: str) -> list[str]:
+    """Return the imports of a file that are not allowed in its folder."""
     libraries = ALLOWED[folder] | sys.stdlib_module_names
     return [
         module
-        for module in imported_modules(source, package)
+        for module in imported_modules(path)
         if module.split(".")[0] not in libraries
         and not is_inside(module, LINKED[folder])
         and not any(is_inside(module, each) for each in BELOW)
@@ -104,7 +112,7 @@ def forbidden_imports(source: str, package: list[str], folder: str) -> list[str]
 def test_folder_imports_only_what_the_design_allows(folder: str) -> None:
     wrong = {}
     for path in source_files(folder):
-        bad = forbidden_imports(path.read_text(encoding="utf-8"), package_of(path), folder)
+        bad = forbidden_imports(path, folder)
         if bad:
             wrong[str(path.relative_to(ROOT))] = bad
     assert not wrong, (
@@ -132,7 +140,7 @@ def test_guest_imports_only_what_is_public(guest: str) -> None:
     wrong = [
         f"{path.relative_to(ROOT)}: {module}"
         for path in source_files(guest)
-        for module in imported_modules(path.read_text(encoding="utf-8"), package_of(path))
+        for module in imported_modules(path)
         if module.startswith("coil_") and module not in public
         if not any(is_inside(module, each) for each in own)
     ]
@@ -150,10 +158,7 @@ def test_library_does_not_name_its_guests(guest: str) -> None:
 
 
 def test_only_modules_of_that_name_import_gymnasium() -> None:
-    found = {
-        path.stem: list(imported_modules(path.read_text(), package_of(path)))
-        for path in source_files("envs")
-    }
+    found = {path.stem: list(imported_modules(path)) for path in source_files("envs")}
     users = [
         stem for stem, names in found.items() if any(is_inside(name, "gymnasium") for name in names)
     ]
@@ -171,7 +176,7 @@ def test_folders_are_not_imported_by_their_bare_names(folder: str) -> None:
     # one's.
     wrong = []
     for path in source_files(folder):
-        for module in imported_modules(path.read_text(encoding="utf-8"), package_of(path)):
+        for module in imported_modules(path):
             if module.split(".")[0] in LINKED:
                 wrong.append(f"{path.relative_to(ROOT)}: {module}")
     assert not wrong, f"write {', '.join(LINKED.values())}"
@@ -217,10 +222,10 @@ def test_no_files_import_each_other() -> None:
     files = [path for folder in ["coil_rl", *LINKED] for path in source_files(folder)]
     modules = {path: ".".join([*package_of(path), path.stem]) for path in files}
     modules = {path: name.removesuffix(".__init__") for path, name in modules.items()}
-    graph = {}
+    graph, known = {}, {*modules.values()}
     for path, module in modules.items():
-        tree = WithoutTypes().visit(ast.parse(path.read_text(encoding="utf-8")))
-        found = imported_modules(ast.unparse(tree), package_of(path))
-        names = {name if name in modules.values() else name.rpartition(".")[0] for name in found}
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        found = imported_modules(path, WithoutTypes().visit(tree))
+        names = {name if name in known else name.rpartition(".")[0] for name in found}
         graph[module] = names - {module}
     graphlib.TopologicalSorter(graph).prepare()  # a circle is a CycleError

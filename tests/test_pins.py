@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 from programs import LAP, called
-from slow import some_fast
 
 PINS = Path(__file__).parent / "pins"
 FILES = ("metrics.csv", "evaluation.csv")
@@ -69,9 +68,8 @@ def same(one: str, other: str) -> bool:
         return False
 
 
-@pytest.mark.parametrize(
-    "name", some_fast(RUNS, [name for name in RUNS if not name.startswith("dynamic")])
-)
+@pytest.mark.fast("coil")
+@pytest.mark.parametrize("name", RUNS)
 def test_short_run_gives_the_pinned_numbers(name: str, tmp_path: Path) -> None:
     folder = run(name, tmp_path)
     for file in FILES:

@@ -1,6 +1,5 @@
-"""The rules of style that a formatter and a linter do not check, for each room of the project.
+"""The rules of style that a formatter and a linter do not check.
 
-A room is a folder: `envs`, `transforms`, `benchmarks`, a package of `coil_rl`, or `coil_rl` itself.
 Code that breaks a rule hides something from its reader: which of several values is meant, or which
 sentence a user sees.
 """
@@ -12,6 +11,7 @@ import os
 import tokenize
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -31,11 +31,6 @@ def python_files() -> Iterator[Path]:
             for name in sorted(names):
                 if name.endswith(".py"):
                     yield Path(parent, name)
-
-
-def room_of(file: Path) -> str:
-    first, *others = file.relative_to(ROOT).parts
-    return others[0] if first == "coil_rl" and len(others) > 1 else first
 
 
 def own_nodes(function: ast.AST) -> Iterator[ast.AST]:
@@ -149,31 +144,21 @@ RULES: tuple[Callable[[ast.AST, str], Iterator[int]], ...] = (
     formatter_switches,
     glued_messages,
 )
-ROOMS = sorted({room_of(file) for file in python_files()})
 
 
-def faults(room: str, rule: Callable[[ast.AST, str], Iterator[int]]) -> list[str]:
-    """Return the places in a room that break a rule, as FILE:LINE."""
-    places = []
-    for file in python_files():
-        if room_of(file) == room:
-            source = file.read_text(encoding="utf-8")
-            lines = sorted(set(rule(ast.parse(source), source)))
-            places += [f"{file.relative_to(ROOT)}:{line}" for line in lines]
-    return places
+@cache
+def sources() -> dict[Path, tuple[ast.AST, str]]:
+    texts = {file: file.read_text(encoding="utf-8") for file in python_files()}
+    return {file: (ast.parse(text), text) for file, text in texts.items()}
 
 
-def cases() -> list[object]:
-    found = []
-    for room in ROOMS:
-        for rule in RULES:
-            found.append(pytest.param(room, rule, id=f"{room}-{rule.__name__}"))
-    return found
-
-
-@pytest.mark.parametrize(("room", "rule"), cases())
-def test_code_of_a_room_keeps_the_rules_of_style(room, rule):
-    places = faults(room, rule)
+@pytest.mark.parametrize("rule", RULES)
+def test_code_keeps_the_rules_of_style(rule):
+    places = [
+        f"{file.relative_to(ROOT)}:{line}"
+        for file, source in sources().items()
+        for line in sorted(set(rule(*source)))
+    ]
     assert not places, "\n".join([inspect.getdoc(rule), *places])
 
 

@@ -60,9 +60,9 @@ def driven() -> EvaluationResult:
     from coil_rl.config.assemble import assemble
     from coil_rl.config.folder import folder_of, read_config
     from coil_rl.config.parts import build_evaluation
-    from coil_rl.run.judge import PolicyAndGuides
+    from coil_rl.guides.simple import FollowAdvice
     from coil_rl.run.parts import TEST
-    from coil_rl.run.policy_batch import TracedPolicy
+    from coil_rl.run.policy_batch import Acting, OnRows, traced
 
     folder = folder_of(POLICY)
     config = read_config(folder, "run")
@@ -74,7 +74,7 @@ def driven() -> EvaluationResult:
     config.evaluation.cases = [TRACK]
     run = assemble(config, folder)
     env = run.make_env(2, TEST)
-    policy = PolicyAndGuides(env, TracedPolicy(run.policy(env)), 1, 1)
+    policy = OnRows([Acting(traced(run.policy(env)), whole=True), Acting(FollowAdvice(env))])
     evaluation = build_evaluation(config, {"pose": ("info", "pose")})
     return evaluation.run(env, policy)
 

@@ -21,14 +21,12 @@ from coil_rl.config.parts import (
     demonstrations,
     driving_guides,
     env_maker,
-    guide_results,
     recorded,
     trains_guides,
     what_guides_see,
 )
 from coil_rl.config.proxies import PROXIES, distil
 from coil_rl.config.trust import make_logger
-from coil_rl.config.values import complete_measures
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
@@ -45,10 +43,9 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
     """Return the run that a configuration describes; nothing is built or written yet.
 
     Args:
-        config: of `coil-train`, composed or read from a folder; its measures are completed.
+        config: of `coil-train`, composed or read from a folder.
         folder: of the run, instead of `run_dir`.
     """
-    complete_measures(config)
     folder = Path(config.run_dir) if folder is None else folder
     make_env = env_maker(config, folder)
     trains = trains_guides(config)
@@ -124,7 +121,6 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         make_env,
         pictures=pictures,
         guides=guide_titles(driving_guides(config)),
-        guide_results=partial(guide_results, config),
         together=has_agent
         and not config.method.run
         and advises_only(config)

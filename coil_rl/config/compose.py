@@ -37,6 +37,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.config.messages import SEVERAL, sentence
 from coil_rl.errors import UserError
+from coil_rl.plain_yaml import entries
 
 CORE = "coil_rl.conf"  # the package of our own files, and the group of the entry points
 
@@ -209,8 +210,9 @@ def _written(defaults: Iterable[Any], places: Sequence[str]) -> Iterator[Written
         lists = frozenset(f"{path}.yaml" for path in _ancestors(default, parents))
         content = OmegaConf.create(found[0][1].read_text(encoding="utf-8"))
         values: Any = OmegaConf.to_container(content, resolve=False)
-        for key, value in leaves(values, default.package or ""):
-            if key.partition(".")[0] not in ("hydra", "defaults"):
+        for key, _, value in entries(values, default.package or ""):
+            is_node = isinstance(value, Mapping)
+            if not is_node and key.partition(".")[0] not in ("hydra", "defaults"):
                 yield Written(key, value, name, lists)
 
 
@@ -230,19 +232,6 @@ def _ancestors(default: Any, parents: Mapping[str, str | None]) -> set[str]:
         paths.add(path)
         path = parents.get(path)
     return paths
-
-
-def leaves(node: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Yield full key and value of everything in nested mappings that is no mapping.
-
-    Args:
-        name: its own full key; empty for the whole configuration.
-    """
-    if not isinstance(node, Mapping):
-        yield name, node
-        return
-    for key, value in node.items():
-        yield from leaves(value, f"{name}.{key}" if name else str(key))
 
 
 def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConfig:

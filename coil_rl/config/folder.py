@@ -5,7 +5,6 @@ opened by its name. Wherever a program takes the folder of a run to read, `pretr
 one. Its files are checked by their SHA-256 before any of them is read.
 """
 
-import copy
 import hashlib
 import json
 from collections.abc import Mapping
@@ -21,10 +20,10 @@ from coil_rl.config.messages import sentence
 from coil_rl.config.old_names import renamed, with_todays_keys
 from coil_rl.config.schema import IGNORED_KEYS, TrainConfig
 from coil_rl.config.trust import check_config, shipped_logger
-from coil_rl.config.values import complete_measures, is_complete
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.files import LARGEST_NUMBERS, read_file, read_text
-from coil_rl.plain_yaml import read_yaml
+from coil_rl.measures import measures_of
+from coil_rl.plain_yaml import is_part, leaves, read_yaml
 from coil_rl.run.folder import CONFIG, check_same, is_begun
 
 PREFIX = "pretrained:"
@@ -34,11 +33,11 @@ LARGEST = 200_000  # bytes of a file of a shipped policy
 
 def settings(config: DictConfig) -> dict[str, Any]:
     """Return what is saved of a configuration: plain values, without references."""
-    saved: Any = OmegaConf.to_container(config, resolve=True)
+    saved = _values(config)
     saved.pop("trust", None)  # it holds for one command
     # Loggers write into `run_dir`, which may be another folder when the run is resumed.
     saved["logger"] = OmegaConf.to_container(config.logger) if config.logger else None
-    return dict(saved)
+    return saved
 
 
 def read_config(
@@ -86,7 +85,7 @@ def read_config(
         for name, value in (changes or {}).items():
             saved[name] = value
         config: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), saved)
-        complete_measures(config)
+        measures_of(config.evaluation.measures)
         OmegaConf.to_container(config, throw_on_missing=True)
     except (OmegaConfBaseException, yaml.YAMLError, ValueError, OSError) as error:
         raise UserError(f"{path} is not the configuration of a run ({sentence(error)})") from error
@@ -109,30 +108,18 @@ def identity(config: DictConfig) -> dict[str, Any]:
     Args:
         config: composed, or read from a folder; it stays as it is.
     """
-    measures: Any = OmegaConf.select(config, "evaluation.measures")
-    if not all(is_complete(measures, name) for name in measures or ()):
-        config = copy.deepcopy(config)  # which takes longer than all else here
-        complete_measures(config)
-    values: Any = OmegaConf.to_container(config, resolve=True)
+    values = _values(config)
     if values.get("recording") is None:  # of all envs but one
         values.pop("recording", None)
-    flat = _flat(values)
-    ignored = set(IGNORED_KEYS)
-    return {
-        key: value
-        for key, value in flat.items()
-        if key not in ignored and key.split(".")[0] not in ignored
-    }
+    return {key: value for key, value in leaves(values).items() if not is_part(key, IGNORED_KEYS)}
 
 
-def _flat(node: Any, name: str = "") -> dict[str, Any]:
-    """Return the values of nested mappings by their full keys."""
-    if not isinstance(node, Mapping) or not node:
-        return {name: node}
-    result: dict[str, Any] = {}
-    for key, value in node.items():
-        result |= _flat(value, f"{name}.{key}" if name else str(key))
-    return result
+def _values(config: DictConfig) -> dict[str, Any]:
+    """Return the plain values of a configuration; its measures have all of theirs."""
+    values: Any = OmegaConf.to_container(config, resolve=True)
+    measures = measures_of(values["evaluation"]["measures"])
+    values["evaluation"]["measures"] = {name: each.node() for name, each in measures.items()}
+    return dict(values)
 
 
 def pretrained_names() -> list[str]:

@@ -3,7 +3,7 @@
 import errno
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -22,6 +22,7 @@ from omegaconf.errors import (
 
 from coil_rl import conf
 from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean, is_outside
+from coil_rl.plain_yaml import entries
 from coil_rl.run.folder import is_begun
 
 # Launchers of Hydra, and the extra of the package that installs each.
@@ -57,6 +58,7 @@ OTHER_NAMES = {
 }
 SEVERAL = ("guide", "disturb", "degrade")  # groups of which several files may be chosen
 OF_ENVS = {"env.id": "gym", "env.of": "torchrl", "env.options": "gym", "env.wrappers": "gym"}
+ELSEWHERE = ("hydra", "defaults", "proxy", "preset")  # nodes with keys that a hint leaves out
 MOST = 2  # places that a hint names
 
 
@@ -253,28 +255,15 @@ def where(key: str, root: Any) -> str:
         return ""
     group, _, last = key.rpartition(".")
     wanted = {last, OTHER_NAMES.get(last, last)}
-    found = [full for full in _keys(root) if full.rpartition(".")[2] in wanted]
+    values: Any = OmegaConf.to_container(root, resolve=False)
+    kept = {name: values[name] for name in values if name not in ELSEWHERE}
+    found = [full for full, last, _ in entries(kept) if last in wanted]
     if key in found:
         return ""
     # A key of the group that was typed is more likely than one of another.
     first = group.partition(".")[0]
     found.sort(key=lambda full: (full.partition(".")[0] != first, full.count(".")))
     return f"; did you mean {' or '.join(found[:MOST])}?" if found else ""
-
-
-def _keys(root: DictConfig) -> Iterator[str]:
-    """Yield the full keys of a configuration, but those of Hydra and of proxies."""
-    values: Any = OmegaConf.to_container(root, resolve=False)
-    for key, value in values.items():
-        if key not in ("hydra", "defaults", "proxy", "preset"):
-            yield from _keys_of(str(key), value)
-
-
-def _keys_of(name: str, node: Any) -> Iterator[str]:
-    yield name
-    if isinstance(node, Mapping):
-        for key, value in node.items():
-            yield from _keys_of(f"{name}.{key}", value)
 
 
 def unchosen(key: str, typed: str) -> str:

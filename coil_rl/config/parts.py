@@ -1,8 +1,8 @@
 """The parts that a configuration describes: its envs, guides, learner and evaluation."""
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from functools import lru_cache, partial
+from collections.abc import Collection, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +12,23 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, Transform
 
-from coil_rl.config import given
 from coil_rl.config.nodes import build, build_all, find_target
 from coil_rl.config.own_run import own_run
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import MEAN_CASE, measures_of
+from coil_rl.plain_yaml import entries
 from coil_rl.report import Returns
 from coil_rl.report.pictures import Picture
 from coil_rl.run.beside import Beside
-from coil_rl.run.evaluation import EvaluationResult
-from coil_rl.run.judge import Evaluation, evaluate_guides
+from coil_rl.run.judge import Evaluation
 from coil_rl.run.parts import TEST, TESTS, TRAIN, EnvMaker
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
 
 # Parts of a configuration that name entries of the env of a method; its guides are parts of
 # `method.transforms`.
-READERS = ("observes", "method", "watch", "learner", "degrade", "action", "evaluation")
+READERS = ["observes", "method", "watch", "learner", "degrade", "action", "evaluation"]
 
 
 def build_evaluation(
@@ -91,49 +90,6 @@ def advises_only(config: DictConfig) -> bool:
 def _added(config: DictConfig) -> set[Any]:
     """Return the classes of the transforms of a method."""
     return {get_object(node["_target_"]) for node in config.method.transforms.values()}
-
-
-def guide_results(
-    config: DictConfig, evaluation: Evaluation, pictures: Sequence[Picture] = ()
-) -> Mapping[str, EvaluationResult]:
-    """Evaluate each guide of a configuration alone, in the cases of the evaluation.
-
-    The runs of a sweep share the results, unless there are `pictures` that watch the guides, or a
-    part is an object of this process: its name tells nothing about its state.
-    """
-    nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
-    nodes["disturb"] = disturbances(config, TEST)
-    nodes["guide"] = driving_guides(config)
-    if not nodes["guide"]:
-        return {}
-    node = env_node(config, config.evaluation.env)
-    if "cases" in config.evaluation.env:
-        node["cases"] = len(evaluation.cases)  # which may be another number than that of the run
-    text = OmegaConf.to_yaml({"env": node, **nodes})
-    if pictures or given.TARGET in text:
-        return _new_guide_results(text, evaluation, pictures)
-    return dict(_guide_results(text, evaluation))
-
-
-@lru_cache(maxsize=64)
-def _guide_results(nodes: str, evaluation: Evaluation) -> dict[str, EvaluationResult]:
-    return _new_guide_results(nodes, evaluation, [])
-
-
-def _new_guide_results(
-    nodes: str, evaluation: Evaluation, pictures: Sequence[Picture]
-) -> dict[str, EvaluationResult]:
-    config: Any = OmegaConf.create(nodes)
-
-    def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
-        return build_bare_env(config, {"num_envs": rows})
-
-    make_env = EnvMaker(
-        bare,
-        disturb=lambda cases: build_all(config.disturb, "disturb"),
-        degrade=partial(build_all, config.degrade, "degrade"),
-    )
-    return evaluate_guides(make_env, evaluation, build_guides(config), pictures=pictures)
 
 
 def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
@@ -377,25 +333,12 @@ def unread_controllers(config: DictConfig, transforms: Iterable[Transform]) -> s
     """
     names = set(OmegaConf.select(config, "env.controllers") or ())
     keys = [key for part in transforms for key in (part.in_keys or ())]
-    named = set(_texts(keys))
-    for reader in READERS:
-        node = OmegaConf.select(config, reader)
-        named |= set(_texts(OmegaConf.to_container(node) if OmegaConf.is_config(node) else node))
+    named = {part for key in keys for part in ((key,) if isinstance(key, str) else key)}
+    read = OmegaConf.to_container(OmegaConf.masked_copy(config, READERS))
+    named |= {value for _, _, value in entries(read, lists=True) if isinstance(value, str)}
     return {name for name in names if not any(_mentions(text, name) for text in named)}
 
 
 def _mentions(text: str, name: str) -> bool:
     """Return whether a text has a name as a whole word."""
     return re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) is not None
-
-
-def _texts(node: Any) -> Iterator[str]:
-    """Yield the texts in nested lists and mappings, but not the keys of mappings."""
-    if isinstance(node, str):
-        yield node
-    elif isinstance(node, dict):
-        for value in node.values():
-            yield from _texts(value)
-    elif isinstance(node, (list, tuple)):
-        for value in node:
-            yield from _texts(value)

@@ -7,17 +7,14 @@ The types of the fields are checked by OmegaConf, their ranges by pydantic
 import hashlib
 import json
 import os
-import re
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Annotated, Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
-from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema
-from pydantic_core import PydanticCustomError, core_schema
-
-from coil_rl.measures import REDUCTIONS
+from pydantic import ConfigDict, Field, GetPydanticSchema
+from pydantic_core import core_schema
 
 LARGEST = 2**63 - 1
 GRU = "coil_rl.learners.Gru"
@@ -41,16 +38,6 @@ def one_of(*choices: str) -> GetPydanticSchema:
 def typed_as(kind: Any) -> GetPydanticSchema:
     """Return the schema of another type than the one that OmegaConf is told."""
     return GetPydanticSchema(lambda _, handler: handler(kind))
-
-
-def format_of_numbers(spec: str) -> str:
-    """Return a format for numbers, as Python's `format` takes it, or auto: as they need.
-
-    Its width has at most two digits.
-    """
-    if spec != "auto" and not re.fullmatch(r"[+,]?\d{0,2}(\.\d)?[efg%]?", spec):
-        raise PydanticCustomError("format", "a format of numbers, such as .1f")
-    return spec
 
 
 # Most upper limits only prevent that a typing error fills the memory.
@@ -121,19 +108,6 @@ class TrainingConfig(NodeConfig):
 
 
 @dataclass
-class MeasureConfig(NodeConfig):
-    """A measure of an episode, see `coil_rl.measures.Measure`."""
-
-    entry: Any = MISSING
-    reduction: Annotated[str, one_of(*REDUCTIONS)] = "mean"
-    where: Any = None
-    at_least: float | None = None
-    at_most: float | None = None
-    title: str = ""
-    format: Annotated[str, AfterValidator(format_of_numbers)] = "auto"
-
-
-@dataclass
 class EvaluationConfig(NodeConfig):
     """Evaluation of a policy; `cases` is their number, or a node that gives their names.
 
@@ -141,10 +115,7 @@ class EvaluationConfig(NodeConfig):
     """
 
     cases: Any = 1
-    # OmegaConf adds no typed node by an override, so these get their types in `measured`.
-    measures: Annotated[dict[str, Any], typed_as(dict[str, MeasureConfig])] = field(
-        default_factory=dict
-    )
+    measures: dict[str, Any] = field(default_factory=dict)  # see `coil_rl.Measure`
     pictures: dict[str, Any] = field(default_factory=dict)
     sections: dict[str, Any] | None = None  # of coil-listen
     env: dict[str, Any] = field(default_factory=dict)

@@ -19,7 +19,7 @@ on the list may read a file that its arguments name, but must not write one.
 
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
@@ -32,6 +32,7 @@ from omegaconf import DictConfig, OmegaConf
 from coil_rl.config.compose import packages
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.extras import require
+from coil_rl.plain_yaml import entries
 from coil_rl.run.stopping import remember_trust
 
 ENTRY_POINTS = (
@@ -126,7 +127,7 @@ def import_paths(config: DictConfig) -> frozenset[str]:
     """
     paths = (
         _import_path(name, key, value)
-        for name, key, value in _entries(OmegaConf.to_container(config))
+        for name, key, value in entries(OmegaConf.to_container(config), lists=True)
     )
     return frozenset(path for path in paths if isinstance(path, str))
 
@@ -150,7 +151,7 @@ def check_config(config: DictConfig, path: Path) -> None:
 
     Nothing is resolved, and nothing is imported but packages that the user trusts.
     """
-    for name, key, value in _entries(OmegaConf.to_container(config)):
+    for name, key, value in entries(OmegaConf.to_container(config), lists=True):
         named = (
             key if not name.startswith("defaults[") else ""
         )  # Hydra's list names groups by paths
@@ -171,19 +172,6 @@ def check_config(config: DictConfig, path: Path) -> None:
             raise UserError(
                 f"{path}: {name:.100}={value!r:.100} is a reference; put the value in its place"
             )
-
-
-def _entries(node: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield full key, key and value of each entry of nested mappings and lists."""
-    parent: Mapping[Any, Any] = {}
-    if isinstance(node, Mapping):
-        parent = node
-    elif isinstance(node, list):
-        parent = dict(enumerate(node))
-    for key, value in parent.items():
-        full = f"{name}[{key}]" if isinstance(node, list) else f"{name}.{key}".lstrip(".")
-        yield full, key, value
-        yield from _entries(value, full)
 
 
 def _import_path(name: str, key: Any, value: Any) -> Any:

@@ -10,10 +10,10 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config.compose import REFERENCE, covers, key_of, leaves
+from coil_rl.config.compose import REFERENCE, covers, key_of
 from coil_rl.config.parts import advises, env_maker, learner_kind, trains_guides
 from coil_rl.errors import UserError
-from coil_rl.report.configurations import is_part
+from coil_rl.plain_yaml import is_part, leaves
 
 # Nodes that other values refer to, and that nothing else reads.
 REFERRED = (
@@ -84,7 +84,7 @@ def _references(config: DictConfig, closed: Sequence[str]) -> Iterator[str]:
     """
     left_out = (*closed, "env.num_envs") if "learner" in closed else closed
     values: Any = OmegaConf.to_container(config, resolve=False)
-    for key, value in leaves(values, ""):
+    for key, value in leaves(values).items():
         if isinstance(value, (str, list)) and not is_part(key, left_out):
             yield from (name for name in REFERENCE.findall(str(value)) if name != key)
 

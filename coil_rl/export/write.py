@@ -8,9 +8,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
 from coil_rl.export.contract import CONTRACT, DRIVER, ONNX, TORCH
 from coil_rl.export.describe import LEARNED, describe
@@ -25,6 +24,7 @@ from coil_rl.foreign.controllers import PerRow
 from coil_rl.foreign.shared import FunctionGuide
 from coil_rl.guides.simple import EntryGuide
 from coil_rl.output import progress, say
+from coil_rl.ranges import Interval, checked
 from coil_rl.run.controller import Controller
 from coil_rl.run.folder import HANDED_OVER
 from coil_rl.run.run import Run
@@ -32,12 +32,13 @@ from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 
+@checked
 def export_policy(
     run: Run,
     folder: str | Path,
     *,
     which: str = HANDED_OVER,
-    observations: int = 1_000,
+    observations: Annotated[int, Interval(ge=1, le=1_000_000)] = 1_000,
     seed: int = 0,
     meanings: Mapping[str, Any] | None = None,
 ) -> ExportedPolicy:
@@ -61,7 +62,6 @@ def export_policy(
             that acts differently.
     """
     require("an exported policy", "export", "onnx", "onnxscript", "onnxruntime")
-    check_range(1, 1_000_000, observations=observations)
     controller = run.controller(which)
     try:
         exportable(controller)

@@ -9,7 +9,7 @@ import importlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import torch
@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
-from coil_rl.envs.limits import check_choice
+from coil_rl.ranges import checked
 
 
 def lander(observation: Tensor, continuous: bool = False) -> Tensor:
@@ -102,24 +102,30 @@ def swing_tip(observation: Tensor) -> Tensor:
     return 2 * (observation[..., 5] > 0).long()
 
 
+FUNCTIONS: dict[str, Callable[..., Tensor]] = {
+    each.__name__: each for each in (lander, energy_pump, swing_up, linear_feedback, swing_tip)
+}
+
+
+@checked
 class ClassicGuide(TensorDictModuleBase):
     """Guide that acts by one of the functions above.
 
     Args:
-        controller: "lander", "energy_pump", "swing_up", "linear_feedback" or "swing_tip"; else a
-            `ValueError`.
+        controller: name of the function.
         options: arguments of the function after the observation, by name.
     """
 
     in_keys, out_keys = ["observation"], ["action"]
     pure = True
 
-    def __init__(self, controller: str, options: Mapping[str, Any] | None = None) -> None:
-        functions = (lander, energy_pump, swing_up, linear_feedback, swing_tip)
-        known = {each.__name__: each for each in functions}
-        check_choice(tuple(known), controller=controller)
+    def __init__(
+        self,
+        controller: Literal["lander", "energy_pump", "swing_up", "linear_feedback", "swing_tip"],
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
         super().__init__()
-        self.function: Callable[..., Tensor] = partial(known[controller], **(options or {}))
+        self.function = partial(FUNCTIONS[controller], **(options or {}))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import os
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
 from coil_rl.extras import require
 from coil_rl.imitation.regressors import Regressor
+from coil_rl.ranges import Count, Interval, checked
 
 MOST_TREES = 10_000
 AT_ONCE = 16_384  # rows times trees, whose nodes fit into the cache
@@ -27,6 +27,7 @@ ARRAYS = {
 }
 
 
+@checked
 class ForestRegressor(Regressor):
     """A random forest (Breiman 2001), with the fit and the predictions of scikit-learn.
 
@@ -53,15 +54,12 @@ class ForestRegressor(Regressor):
 
     def __init__(
         self,
-        n_estimators: int = 200,
-        max_depth: int | None = 20,
-        random_state: int = 0,
+        n_estimators: Annotated[int, Interval(ge=1, le=MOST_TREES)] = 200,
+        max_depth: Count | None = 20,
+        random_state: Annotated[int, Interval(ge=0, le=2**32 - 1)] = 0,
         n_jobs: int = 1,
     ) -> None:
         super().__init__()
-        check_range(1, MOST_TREES, n_estimators=n_estimators)
-        check_range(1, max_depth=1 if max_depth is None else max_depth)
-        check_range(0, 2**32 - 1, random_state=random_state)
         self.options: dict[str, Any] = {
             "n_estimators": n_estimators,
             "max_depth": max_depth,

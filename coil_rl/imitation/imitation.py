@@ -9,24 +9,25 @@ states that the policy itself reaches.
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
 from coil_rl.imitation.regressors import Regressor
 from coil_rl.imitation.validation import cross_validate, scores
 from coil_rl.learners.encoders import ConcatObservations
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.networks import FastTensorDictModule
+from coil_rl.ranges import Interval, checked
 from coil_rl.run import checkpoint
 from coil_rl.transforms.action_space import ActionSpace, nested_key
 
 
+@checked
 class Imitation(Learner):
     """The imitation learner.
 
@@ -84,7 +85,7 @@ class Imitation(Learner):
         kept_key: str | Sequence[str] | None = ("info", "usable"),
         validate: bool = True,
         dataset: str | os.PathLike[str] | None = None,
-        seed: int = 0,
+        seed: Annotated[int, Interval(ge=0, le=2**32 - 1)] = 0,
     ) -> None:
         in_keys = [nested_key(key) for key in in_keys]
         spec, batch_dims = env.observation_spec, len(env.batch_size)
@@ -99,7 +100,6 @@ class Imitation(Learner):
             raise ValueError(
                 f"guide={guide} must be at least 0 and less than {guides}, the number of guides"
             )
-        check_range(0, 2**32 - 1, seed=seed)
         self.concat = ConcatObservations(env, in_keys)
         self.regressor = regressor.fresh(self.concat.width, size).to(env.device)
         action = _Action(self.concat, self.regressor, ActionSpace(env.action_spec, batch_dims))

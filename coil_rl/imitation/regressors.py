@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.modules import MLP
 
-from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.learners.encoders import Mlp
+from coil_rl.ranges import Count, NonNegative, Seed, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 
 
@@ -48,6 +48,7 @@ class Regressor(nn.Module, ABC):
         """Predict y [*batch, outputs] for x [*batch, inputs]."""
 
 
+@checked
 class NetworkRegressor(Regressor):
     """A tanh network, fitted to standardised inputs and outputs by least squares with Adam.
 
@@ -72,17 +73,16 @@ class NetworkRegressor(Regressor):
         self,
         hidden: Sequence[int] = (64, 64),
         *,
-        epochs: int = 100,
-        minibatch: int = 256,
-        learning_rate: float | Schedule = Linear(3e-3, 0.0),
-        seed: int = 0,
+        epochs: Count = 100,
+        minibatch: Count = 256,
+        learning_rate: NonNegative | Schedule = Linear(3e-3, 0.0),
+        seed: Seed = 0,
     ) -> None:
         super().__init__()
         self.learning_rate = schedule(learning_rate)
         Mlp(hidden)  # checks the widths
-        check_range(1, epochs=epochs, minibatch=minibatch)
-        check_range(0, above=True, learning_rate=self.learning_rate(0))
-        check_range(0, LARGEST_SEED, seed=seed)
+        if self.learning_rate(0) == 0:
+            raise ValueError("learning_rate=0 must be more than 0 at the start of a fit")
         self.hidden, self.epochs, self.minibatch, self.seed = tuple(hidden), epochs, minibatch, seed
 
     def fresh(self, inputs: int, outputs: int) -> NetworkRegressor:

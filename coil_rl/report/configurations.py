@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from coil_rl.measures import Measure
+from coil_rl.plain_yaml import is_part, leaves
 from coil_rl.report.runs import FALLBACK, Run
 from coil_rl.report.sentences import REPORT
 
@@ -206,32 +207,17 @@ def of_guide(run: Run) -> dict[str, Any]:
     }
 
 
-def is_part(key: str, of: Iterable[str]) -> bool:
-    """Return whether a key, or a parent of it, is one of some keys.
-
-    Args:
-        of: full keys of values or groups.
-    """
-    return any(f"{key}.".startswith(f"{each}.") for each in of)
-
-
 def relevant(run: Run) -> dict[str, Any]:
     """Return the values on which the numbers of a run depend, by their full keys.
 
     The seed in the path of another run, as in `seed3`, is left out.
     """
     values: dict[str, Any] = {}
-    waiting = [("", run.settings)]
-    while waiting:
-        name, node = waiting.pop()
-        if name in IRRELEVANT:
+    for name, value in leaves(run.settings).items():
+        if is_part(name, IRRELEVANT):
             continue
-        if isinstance(node, Mapping) and node:
-            waiting += [(f"{name}.{key}".lstrip("."), node[key]) for key in reversed(list(node))]
-        elif isinstance(node, str):
-            values[name] = re.sub(rf"seed{run.seed}(?!\d)", "seed", node)
-        else:
-            values[name] = node
+        is_text = isinstance(value, str)
+        values[name] = re.sub(rf"seed{run.seed}(?!\d)", "seed", value) if is_text else value
     return values
 
 

@@ -16,7 +16,7 @@ from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, totals_of
 from coil_rl.run.exploration import Exploring, noise_of
 from coil_rl.run.parts import SOME_ROWS
-from coil_rl.run.policy_batch import PoliciesBeside, memory_keys, traced
+from coil_rl.run.policy_batch import Acting, OnRows, memory_keys, traced
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_transform import SeededGenerator
 
@@ -117,10 +117,10 @@ class TrainingCases:
         if len(policies) > 1 and self._can_act_beside(policies):
             env = self._copy(len(policies))
             beside = [
-                self._exploring(env, traced(policy), samples, len(policies))
+                Acting(self._exploring(env, traced(policy), samples, len(policies)), samples)
                 for policy, samples in zip(policies, sampled, strict=True)
             ]
-            totals = self._acted(env, PoliciesBeside(beside, sampled), sampled=False)
+            totals = self._acted(env, OnRows(beside), sampled=False)
             self.taken = [int(part.sum()) for part in totals.steps.split(self.count)]
             return list(totals.results()["return"].split(self.count))
         env = self._copy(1)

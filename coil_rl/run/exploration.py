@@ -7,8 +7,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.limits import check_range
 from coil_rl.learners.policy import NOISE
+from coil_rl.ranges import Share, checked
 
 
 class CorrelatedNoise:
@@ -48,20 +48,20 @@ class CorrelatedNoise:
         return entries.set(NOISE, self.last)
 
 
-def noise_of(env: EnvBase, correlation: float, parts: int = 1) -> CorrelatedNoise | None:
+@checked
+def noise_of(env: EnvBase, noise_correlation: Share, parts: int = 1) -> CorrelatedNoise | None:
     """Return the correlated noise of an env; None for choices, or without a correlation.
 
     Args:
-        correlation: of consecutive steps.
+        noise_correlation: of consecutive steps.
         parts: see `CorrelatedNoise`.
 
     Raises:
         ValueError: if the correlation is below 0 or above 1.
     """
-    check_range(0, 1, noise_correlation=correlation)
-    if correlation == 0 or not env.full_action_spec[env.action_key].dtype.is_floating_point:
+    if noise_correlation == 0 or not env.full_action_spec[env.action_key].dtype.is_floating_point:
         return None
-    return CorrelatedNoise(env, correlation, parts)
+    return CorrelatedNoise(env, noise_correlation, parts)
 
 
 class Exploring(TensorDictModuleBase):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -35,7 +35,7 @@ from coil_rl.report.table import AUTO_FORMAT, fitted, return_format
 from coil_rl.run.beside import Driver
 from coil_rl.run.evaluation import EvaluationResult, evaluate_policy
 from coil_rl.run.parts import TEST, EnvMaker
-from coil_rl.run.policy_batch import PartlySampled, traced
+from coil_rl.run.policy_batch import Acting, OnRows, traced
 from coil_rl.run.reasons import SENTENCES
 from coil_rl.transforms.action_space import random_action
 
@@ -64,9 +64,6 @@ class Evaluation:
     measures: Mapping[str, Measure] = field(default_factory=dict)
     record: Mapping[str, NestedKey] = field(default_factory=dict)
 
-    def __hash__(self) -> int:
-        return hash(repr(self))
-
     def run(self, env: EnvBase, policy: TensorDictModuleBase, **options: Any) -> EvaluationResult:
         """Evaluate a policy on an env whose rows are the cases, perhaps several times.
 
@@ -75,9 +72,6 @@ class Evaluation:
         return evaluate_policy(
             env, policy, cases=self.cases, measures=self.measures, record=self.record, **options
         )
-
-
-GuideResults = Callable[[Evaluation, Sequence[Picture]], Mapping[str, EvaluationResult]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +84,6 @@ class Trial:
         make_env: makes the env of the policy in the cases of the test.
         pictures: of the deterministic episodes.
         guides: names of the guides, as in tables.
-        guide_results: evaluates the guides alone, by these names, in the sight of some pictures;
-            asked if the guides cannot act in the policy's own env.
         together: whether the policy's env is that of its guides: all that its method adds is their
             advice. Then the guides act in rows beside the policy.
         advice: names of further kinds of advice, with each of which the policy is evaluated too.
@@ -107,7 +99,6 @@ class Trial:
     _: KW_ONLY
     pictures: Sequence[Picture] = field(default_factory=lambda: [Returns()])
     guides: Sequence[str] = ()
-    guide_results: GuideResults = lambda evaluation, pictures: {}
     together: bool = False
     advice: Sequence[str] = ()
     repeats: int = 0
@@ -118,6 +109,15 @@ class Trial:
     def env(self, rows: int, advice: str = "") -> EnvBase:
         """Return the env of the policy in the cases of the test."""
         return self.make_env(rows, TEST, advice, count=self.count)
+
+    def guide_results(
+        self, evaluation: Evaluation, pictures: Sequence[Picture] = ()
+    ) -> dict[str, EvaluationResult]:
+        """Evaluate each guide alone, see `evaluate_guides`; there may be none."""
+        if not self.guides:
+            return {}
+        guides = self.make_env.guides()
+        return evaluate_guides(self.make_env, evaluation, guides, self.count, pictures)
 
     def chance(self) -> float:
         """Return the mean reward of random actions in the cases of the test.
@@ -209,14 +209,12 @@ def judge(
 def _evaluate(trial: Trial, policy: TensorDictModuleBase, judgement: Judgement, bar: Any) -> None:
     """Add the episodes of a policy with each kind of advice, and of the guides beside it."""
     samples = isinstance(policy, ProbabilisticTensorDictSequential)
-    deterministic = traced(policy)
+    policy = traced(policy)
     for advice in ("", *trial.advice):
         bar.set_postfix_str(", ".join(filter(None, (trial.label, advice))))
-        beside = list(trial.guides) if trial.together and not advice else []
-        if samples and trial.repeats and not advice:
-            _evaluate_with(trial, policy, judgement, bar, advice, beside, trial.repeats)
-        else:
-            _evaluate_with(trial, deterministic, judgement, bar, advice, beside, 0)
+        beside = trial.guides if trial.together and not advice else ()
+        repeats = trial.repeats if samples and not advice else 0
+        _evaluate_with(trial, policy, judgement, bar, advice, beside, repeats)
 
 
 def _evaluate_with(
@@ -234,23 +232,22 @@ def _evaluate_with(
     """
     count = len(trial.evaluation.cases)
     own = (1 + repeats) * count
-    total = own + len(beside) * count
-    env = trial.env(total, advice)
+    guides = {name: slice(own + n * count, own + (n + 1) * count) for n, name in enumerate(beside)}
+    env = trial.env(own + len(guides) * count, advice)
     if trial.compiled:
         compile_steps(env)
     watching = [] if advice else [picture for picture in trial.pictures if picture.watches]
-    shown = {trial.label: 0} | {name: own + count * index for index, name in enumerate(beside)}
+    shown = {trial.label: 0} | {name: rows.start for name, rows in guides.items()}
+    acting = [Acting(policy, rows=slice(count), whole=True)]
     if repeats:
-        rows = torch.arange(total, device=env.device)
-        sampled = (rows >= count) & (rows < own)
-        policy = traced(PartlySampled(policy, sampled))
-    if beside:
-        policy = PolicyAndGuides(env, policy, own, len(beside))
+        acting.append(Acting(policy, sampled=True, rows=slice(count, own), whole=True))
+    for number, rows in enumerate(guides.values()):
+        acting.append(Acting(FollowAdvice(env, number), rows=rows))
     watch = partial(_watch, env, watching, shown) if watching else None
-    result = trial.evaluation.run(env, policy, tick=bar.update, watch=watch)
-    if beside:
-        for name, of_guide in zip(beside, result[own:].split(len(beside)), strict=True):
-            judgement.add(of_guide, name)
+    drives = OnRows(acting) if len(acting) > 1 else policy
+    result = trial.evaluation.run(env, drives, tick=bar.update, watch=watch)
+    for name, rows in guides.items():
+        judgement.add(result[rows], name)
     judgement.add(result[:count], trial.label, advice)
     if repeats:
         judgement.add(result[count:own], trial.label, advice, "sampled")
@@ -280,33 +277,6 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, said: Sequenc
                 page += not_worse(mine, judgement.shown[name], name, chance)
     page += said
     return "\n\n".join([*page, *trial.notes])
-
-
-class PolicyAndGuides(TensorDictModuleBase):
-    """A policy on the first rows of an env with advice, and its guides on the others.
-
-    Args:
-        env: the env.
-        policy: writes the action.
-        count: number of rows of the policy.
-        guides: number of guides; each acts on as many of the other rows.
-    """
-
-    def __init__(self, env: EnvBase, policy: TensorDictModuleBase, count: int, guides: int) -> None:
-        self.in_keys, self.out_keys = list(policy.in_keys), ["action"]
-        super().__init__()
-        cases = (env.batch_size[0] - count) // guides
-        # Of the guides' action on the rows of the policy nothing is used.
-        of_row = [0] * count + [guide for guide in range(guides) for _ in range(cases)]
-        self.guides = FollowAdvice(env, of_row)
-        self.policy, self.count = policy, count
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        advised = self.guides(tensordict.copy())["action"]
-        tensordict = self.policy(tensordict)
-        action = torch.cat([tensordict["action"][: self.count], advised[self.count :]])
-        return tensordict.set("action", action)
 
 
 def not_worse(

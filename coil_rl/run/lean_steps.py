@@ -83,7 +83,7 @@ class LeanEnv:
 
 
 class LeanSteps:
-    """Steps with resets of an env, taken by a policy.
+    """Steps with resets of an env in which a policy acts.
 
     Args:
         env: for which `covers` is true.
@@ -92,7 +92,7 @@ class LeanSteps:
     """
 
     def __init__(self, env: EnvBase, policy: Any, keys: Sequence[NestedKey]) -> None:
-        self.policy, self.env = policy, LeanEnv(env)
+        self.env = LeanEnv(env)
         self.before = [key for key in keys if not _is_next(key)]
         self.after = {key: _in_next(key) for key in keys if _is_next(key)}
         self.carried = [*_observed(policy, keys), *self.env.sums]
@@ -119,13 +119,13 @@ class LeanSteps:
         """Return what is read of the state of the env before a step."""
         return Entries({key: carrier[key] for key in self.carried})
 
-    def __call__(self, entries: Entries) -> tuple[dict[NestedKey, Tensor], Entries]:
-        """Act and take a step; return the entries to keep, and what is read in the next step.
+    def step(self, entries: Entries) -> tuple[dict[NestedKey, Tensor], Entries]:
+        """Take a step; return the entries to keep, and what is read in the next step.
 
         Args:
-            entries: what is read in this step; it gets what the policy writes.
+            entries: what is read in this step, and what the policy has written.
         """
-        after = self.env.step(self.policy(entries)["action"], entries)
+        after = self.env.step(entries["action"], entries)
         kept = {key: entries[key] for key in self.before}
         kept |= {key: after[name] for key, name in self.after.items()}
         return kept, self._begun(after)

@@ -5,17 +5,13 @@ Several act in one batch, and their operations are traced once and repeated.
 
 import copy
 from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModuleBase,
-    TensorDictSequential,
-)
-from tensordict.utils import expand_as_right
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch._ops import OpOverload
 from torch.fx import GraphModule, Node
@@ -30,7 +26,10 @@ def policy_batch(
     policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]
 ) -> TensorDictModuleBase:
     """Return a policy for rows [S * C] that acts in state s, one of S, on rows s C to (s + 1) C."""
-    return StackedPolicies(policy, states) if is_tensors(policy) else PoliciesInTurn(policy, states)
+    copies = [copy.deepcopy(policy) for _ in states]
+    for each, state in zip(copies, states, strict=True):
+        each.load_state_dict(state)
+    return StackedPolicies(copies) if is_tensors(policy) else OnRows(list(map(Acting, copies)))
 
 
 def is_tensors(policy: TensorDictModuleBase) -> bool:
@@ -58,31 +57,59 @@ def traced(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     return TracedPolicy(policy) if is_tensors(policy) else policy
 
 
-class PartlySampled(TensorDictModuleBase):
-    """A policy that samples its actions in some rows, and takes the deterministic ones in others.
-
-    Its network is computed once for both.
+@dataclass(frozen=True, eq=False)
+class Acting:
+    """A policy in an env, and the rows on which it acts.
 
     Args:
-        policy: whose last module draws the action.
-        sampled: [B], whether the actions of each row are sampled.
+        policy: writes the action. It is called as it is, see `traced`.
+        sampled: whether it samples its actions.
+        rows: on which it acts; None: on its equal part.
+        whole: whether it is called with all rows of the env, so that its random numbers do not
+            depend on those on which it acts.
     """
 
-    def __init__(self, policy: ProbabilisticTensorDictSequential, sampled: Tensor) -> None:
-        self.in_keys, self.out_keys = list(policy.in_keys), list(policy.out_keys)
+    policy: TensorDictModuleBase
+    sampled: bool = False
+    rows: slice | None = None
+    whole: bool = False
+
+    def act(self, entries: TensorDictBase, rows: slice) -> TensorDictBase:
+        """Return what the policy writes for some rows of the entries of an env."""
+        kind = ExplorationType.RANDOM if self.sampled else ExplorationType.DETERMINISTIC
+        with set_exploration_type(kind):
+            if self.whole:
+                return self.policy(entries.copy())[rows]
+            return self.policy(entries[rows])
+
+
+class OnRows(TensorDictModuleBase):
+    """Policies side by side in one env, each on its own rows.
+
+    Args:
+        parts: in the order of their rows.
+    """
+
+    def __init__(self, parts: Sequence[Acting]) -> None:
+        policies = [part.policy for part in parts]
+        self.in_keys = list(dict.fromkeys(key for each in policies for key in each.in_keys))
+        remembered = dict.fromkeys(key for each in policies for key in memory_keys(each))
+        self.out_keys = ["action", *remembered]
         super().__init__()
-        *modules, self.last = policy.module
-        self.network, self.sampled = TensorDictSequential(*modules), sampled
+        self.parts = list(parts)  # plain objects, so that the policies are no submodules
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        tensordict = self.network(tensordict)
-        with set_exploration_type(ExplorationType.RANDOM):
-            drawn = self.last(tensordict)["action"]
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            chosen = self.last(tensordict)["action"]
-        rows = expand_as_right(self.sampled, drawn)
-        return tensordict.set("action", torch.where(rows, drawn, chosen))
+        """Write the `action` of the policy of each row, and what policies remember."""
+        entries = tensordict.select(*self.in_keys)
+        size = len(entries) // len(self.parts)
+        acted = []
+        for number, part in enumerate(self.parts):
+            acted.append(part.act(entries, part.rows or slice(number * size, (number + 1) * size)))
+        for key in self.out_keys:
+            # What a policy remembers stays as it is on the rows of the others.
+            own = [each[key] if key in each.keys(True) else each[key[1:]] for each in acted]
+            tensordict.set(key, torch.cat(own))
+        return tensordict
 
 
 @torch.no_grad()
@@ -176,9 +203,8 @@ class StackedPolicies(TracedPolicy):
     Each acts on its own part of the rows.
     """
 
-    def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
-        super().__init__(copy.deepcopy(policy))
-        policies = PoliciesInTurn(policy, states).policies
+    def __init__(self, policies: Sequence[TensorDictModuleBase]) -> None:
+        super().__init__(copy.deepcopy(policies[0]))
         self.states = torch.stack([TensorDict.from_module(each) for each in policies]).detach()
 
     def _act(self, rows: TensorDictBase) -> Tensor:
@@ -188,55 +214,3 @@ class StackedPolicies(TracedPolicy):
     def _act_in(self, state: TensorDictBase, rows: TensorDictBase) -> Tensor:
         with state.to_module(self._policy[0]):
             return super()._act(rows)
-
-
-class PoliciesInTurn(TensorDictModuleBase):
-    """Copies of any policy with different states, called in turn.
-
-    Each acts on its own part of the rows.
-    """
-
-    def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
-        super().__init__()
-        self.in_keys, self.out_keys = list(policy.in_keys), ["action", *memory_keys(policy)]
-        self.policies = torch.nn.ModuleList(copy.deepcopy(policy) for _ in states)
-        for each, state in zip(self.policies, states, strict=True):
-            each.load_state_dict(state)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the `action` of the policy of each row, and what that policy remembers."""
-        parts = tensordict.select(*self.in_keys).chunk(len(self.policies))
-        parts = [policy(part) for policy, part in zip(self.policies, parts, strict=True)]
-        for key in self.out_keys:
-            tensordict.set(key, torch.cat([part[key] for part in parts]))
-        return tensordict
-
-
-class PoliciesBeside(TensorDictModuleBase):
-    """Any policies without a memory, side by side.
-
-    Each acts on its own part of the rows.
-
-    Args:
-        policies: each acts on an equal part of the rows, in their order. They are called as they
-            are, see `traced`.
-        sampled: whether each samples its actions.
-    """
-
-    def __init__(self, policies: Sequence[TensorDictModuleBase], sampled: Sequence[bool]) -> None:
-        super().__init__()
-        keys = [key for policy in policies for key in policy.in_keys]
-        self.in_keys, self.out_keys = list(dict.fromkeys(keys)), ["action"]
-        # A list, so that they are no submodules.
-        self.policies = list(policies)
-        kinds = {True: ExplorationType.RANDOM, False: ExplorationType.DETERMINISTIC}
-        self.kinds = [kinds[each] for each in sampled]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the `action` of the policy of each row."""
-        parts = tensordict.select(*self.in_keys).chunk(len(self.policies))
-        actions = []
-        for policy, part, kind in zip(self.policies, parts, self.kinds, strict=True):
-            with set_exploration_type(kind):
-                actions.append(policy(part)["action"])
-        return tensordict.set("action", torch.cat(actions))

@@ -76,7 +76,7 @@ class Rollout:
         columns: dict[NestedKey, list[Tensor]] = {}
         try:
             with set_exploration_type(ExplorationType.RANDOM):
-                carrier = self._drive(columns) if self.lean is None else self._drive_lean(columns)
+                carrier = self._drive(columns)
         except Exception:
             # NaN of an earlier step may be the cause.
             self._check(self._stacked(columns), 0)
@@ -93,33 +93,25 @@ class Rollout:
         check_batch(batch.exclude(*self.unchecked), self.taken + steps)
 
     def _drive(self, columns: dict[NestedKey, list[Tensor]]) -> TensorDictBase:
-        """Take the steps of a batch by TorchRL's step, and return the data of the next one.
+        """Take the steps of a batch, and return the data of the next one.
 
         Args:
             columns: gets the entries of each step.
         """
-        carrier = self.acting
-        for _ in range(self.steps):
-            self.acting = self.policy(self._with_noise(carrier))
-            step, carrier = self.env.step_and_maybe_reset(self.acting)
-            for key in self.keys or step.keys(True, True):
-                columns.setdefault(key, []).append(step[key])
-        return carrier
-
-    def _drive_lean(self, columns: dict[NestedKey, list[Tensor]]) -> TensorDictBase:
-        """Take the steps of a batch as `_drive` does, in less time."""
         lean: Any = self.lean
-        entries = acting = lean.carry(self.acting)
+        take = self.env.step_and_maybe_reset if lean is None else lean.step
+        carrier = acting = self.acting if lean is None else lean.carry(self.acting)
         try:
             for _ in range(self.steps):
-                acting = self._with_noise(entries)
-                step, entries = lean(acting)
-                for key, value in step.items():
-                    columns.setdefault(key, []).append(value)
+                acting = self._with_noise(carrier)
+                acting = self.policy(acting)
+                step, carrier = take(acting)
+                for key in self.keys or step.keys(True, True):
+                    columns.setdefault(key, []).append(step[key])
         except Exception:
-            self.acting = lean.data(acting)
+            self.acting = acting if lean is None else lean.data(acting)
             raise
-        return lean.data(entries)
+        return carrier if lean is None else lean.data(carrier)
 
     def _with_noise(self, carrier: Any) -> Any:
         """Write the exploration noise of the next step, where it is correlated."""

@@ -478,21 +478,14 @@ class Run:
 
     def _settings_of_parts(self) -> dict[str, Any]:
         """Return what reports need of a run that was made from parts."""
-        measured = {}
-        for name, measure in self.trial.evaluation.measures.items():
-            measured[name] = {
-                "entry": measure.entry if isinstance(measure.entry, str) else list(measure.entry),
-                "reduction": measure.reduction,
-                "title": measure.title,
-                "format": measure.format,
-            }
+        measures = self.trial.evaluation.measures.items()
         return {
             "made_from_parts": True,
             "label": self.label,
             "seed": self.seed,
             "method": {"name": self.label, "needs_guide": bool(self.trial.guides)},
             "budget": {"frames": self.budget.frames, "steps": self.budget.steps},
-            "evaluation": {"measures": measured},
+            "evaluation": {"measures": {name: each.node() for name, each in measures}},
         }
 
 

@@ -9,7 +9,7 @@ import copy
 import inspect
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -20,6 +20,7 @@ from coil_rl.config.nodes import build, find_target, is_foreign
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.foreign.controllers import ControllerGuide, PerRow, load
 from coil_rl.guides import classic
+from coil_rl.plain_yaml import leaves
 from coil_rl.ranges import yaml_text
 from coil_rl.tune.search import Number
 
@@ -67,7 +68,7 @@ def numbers_to_tune(config: DictConfig) -> list[Number]:
             f"tune={yaml_text(values)} must be the bounds by name, such as tune='{{kp: [0.1, 10, "
             f"log]}}'; guide.{name} has {has}"
         )
-    wanted = dict(_flat(values or {}))
+    wanted = leaves(values or {})
     if not wanted:
         raise UserError(
             f"method={config.method.name} needs the numbers to tune and their bounds, such as "
@@ -80,16 +81,6 @@ def numbers_to_tune(config: DictConfig) -> list[Number]:
                 f"{did_you_mean(key, known)}"
             )
     return [_number(key, bounds, *known[key]) for key, bounds in wanted.items()]
-
-
-def _flat(node: Mapping[Any, Any], name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield full name and value of everything in nested mappings that is no mapping."""
-    for key, value in node.items():
-        full = f"{name}.{key}" if name else str(key)
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, full)
-        else:
-            yield full, value
 
 
 def _number(name: str, bounds: Any, own: float, whole: bool) -> Number:

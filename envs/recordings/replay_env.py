@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import Degrees
 from coil_rl.envs.recordings.demonstrations import about_demonstrations
-from coil_rl.envs.recordings.folders import RecordingError
+from coil_rl.envs.recordings.folders import RecordingError, files_of
 from coil_rl.envs.recordings.mcap_files import read_messages
 from coil_rl.envs.recordings.reading import read_recording
 from coil_rl.envs.recordings.recording import STANDS, Recording
@@ -264,13 +264,25 @@ class McapReplayEnv(EnvBase):
         return TensorDict(entries, self.batch_size, device=self.device)
 
 
-@lru_cache(maxsize=256)
 def _scans(path: str, topic: str) -> int:
     """Return the number of messages on the topic of the scans, at least 1."""
     try:
-        return max(1, len(read_messages(path, [topic]).messages[topic]))
-    except RecordingError:
+        stats = [file.stat() for file in files_of(Path(path)).files]
+        states = tuple((each.st_size, each.st_mtime_ns) for each in stats)
+        return max(1, _messages(Path(path).resolve(), topic, states))
+    except (OSError, RecordingError):
         return 1
+
+
+@lru_cache(maxsize=256)
+def _messages(path: Path, topic: str, states: tuple[tuple[int, int], ...]) -> int:
+    """Return the number of messages on a topic.
+
+    Args:
+        path: absolute; a relative one is another recording in another working directory.
+        states: sizes and times of change of the files, which only keep the memory true.
+    """
+    return len(read_messages(path, [topic]).messages[topic])
 
 
 def _joined(parts: Sequence[NDArray[Any]]) -> Tensor:

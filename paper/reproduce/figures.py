@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from coil_paper.reproduce.result import NO_RUNS, PAGES, Result, Runs
-from coil_rl import PPO, ConeTrackEnv, SplineGuide, check_range, shipped_tracks
+from coil_rl import PPO, ConeTrackEnv, SplineGuide, shipped_tracks
 from coil_rl.envs import (
     SIDES,
     Frame,
@@ -30,6 +30,7 @@ from coil_rl.envs import (
     simulated_drive,
 )
 from coil_rl.envs.robot import RANGE_MAX, points_of
+from coil_rl.ranges import Interval, checked
 from coil_rl.report import style, write_csv
 
 Array = NDArray[np.float64]
@@ -145,6 +146,7 @@ def _term(ppo: PPO, rows: TensorDictBase, advantage: float) -> tuple[float, floa
     return float(losses["log_ratio"][0].detach().exp()), gain, float(slope[0])
 
 
+@checked
 class OnTheWay(Drawing):
     """A moment of the guide's drive on a shipped track. The car faces up, positions are in m.
 
@@ -153,8 +155,9 @@ class OnTheWay(Drawing):
         seconds: the time since the start of the drive, from 0 to 60.
     """
 
-    def __init__(self, track: str = "train_1", seconds: float = 10.0) -> None:
-        check_range(0, 60, seconds=seconds)
+    def __init__(
+        self, track: str = "train_1", seconds: Annotated[float, Interval(ge=0, le=60)] = 10.0
+    ) -> None:
         self.track, self.seconds = shipped_track(track), seconds
 
     @torch.no_grad()

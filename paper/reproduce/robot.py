@@ -22,15 +22,17 @@ from coil_paper.reproduce.recorded_drives import (
     smoothness,
 )
 from coil_paper.reproduce.result import NO_RUNS, PAGES, Result, Runs, runs_by_label
-from coil_rl import SimulatedRobotEnv, UserError, check_range, guide_titles, open_run
+from coil_rl import SimulatedRobotEnv, UserError, guide_titles, open_run
 from coil_rl.envs import Recording, Track, read_recording, robot_tracks
 from coil_rl.envs.robot import track_notes
+from coil_rl.ranges import Count, checked
 from coil_rl.report import Run, count_of_seeds, estimate, markdown_table, read_runs, write_csv
 
 PAGE = PAGES["table_6"]
 PAPER_ROBOT = PAGE["paper"]
 
 
+@checked
 @dataclass(eq=False)
 class Table6(Result):
     """Smoothness, laps, crashes and lines of several policies, from recordings.
@@ -67,8 +69,8 @@ class Table6(Result):
     runs: Sequence[str] = ()
     worlds: Mapping[str, Sequence[Track]] = field(default_factory=dict)
     labels: Sequence[str] = ("oil", "ppo", "coil")
-    repeats: int = 3
-    laps: int = 3
+    repeats: Count = 3
+    laps: Count = 3
     scan: str = "/scan"
     odometry: str | None = "/odom"
     command: str | None = "/cmd_vel"
@@ -77,7 +79,6 @@ class Table6(Result):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_range(1, repeats=self.repeats, laps=self.laps)
         if not self.labels:
             raise ValueError("labels=[] leaves the guide alone; give at least one")
         files = self._named_files()

@@ -23,7 +23,7 @@ from coil_paper.reproduce import pages
 from coil_paper.reproduce.result import NO_RUNS, PAGES, Result, Runs
 from coil_paper.tabular.coil import noisy_guide, optimal_guide, random_guide, worst_guide
 from coil_paper.tabular.mdp import Array, Integers
-from coil_rl import check_range
+from coil_rl.ranges import Count, Share, checked
 from coil_rl.report import markdown_table, style, write_csv
 
 NEARLY = 0.01  # of a score
@@ -33,6 +33,7 @@ LINE_OFFSET = 1.6  # points between coinciding lines
 PLAIN: Any = {"color": style.INK, "lw": 1.6, "ls": style.SECOND_ROUND}
 
 
+@checked
 @dataclass(eq=False)
 class TabularCoil(Result):
     """Tabular COIL with guides of different quality.
@@ -50,23 +51,21 @@ class TabularCoil(Result):
         steps: increasing numbers of steps, after which the policies are evaluated.
     """
 
-    worlds: int = 20
+    worlds: Count = 20
     states: int = 12
-    actions: int = 3
-    classes: int = 4
-    noise: float = 0.2
+    actions: Count = 3
+    classes: Count = 4
+    noise: Share = 0.2
     epsilon: float = 0.2
     power: float = 0.6
     episode_steps: int = 50
     steps: Sequence[int] = (100, 300, 1_000, 3_000, 10_000, 30_000)
 
     def __post_init__(self) -> None:
-        check_range(1, worlds=self.worlds, actions=self.actions, classes=self.classes)
         if self.states < max(3, self.classes):
             raise ValueError(
                 f"states={self.states} must be at least 3, and at least classes={self.classes}"
             )
-        check_range(0, 1, noise=self.noise)
         self.steps = tuple(self.steps)
         if not self.steps or list(self.steps) != sorted(set(self.steps)) or self.steps[0] < 1:
             raise ValueError(f"steps={list(self.steps)} must be increasing integers from 1")

@@ -12,7 +12,7 @@ from coil_paper.reproduce import pages
 from coil_paper.reproduce.result import NO_RUNS, PAGES, Result, Runs
 from coil_paper.tabular import policy_iteration, toymaker, value_iteration
 from coil_paper.tabular.mdp import Array
-from coil_rl import check_range
+from coil_rl.ranges import Count, Positive, checked
 from coil_rl.report import markdown_table, style, write_csv
 
 PAPER_Q = np.array(PAGES["table_1"]["paper"])
@@ -21,6 +21,7 @@ ROUNDING = 0.005  # largest rounding error of two decimals
 SHARES = (0.1, 0.05, 0.02, 0.01, 0.001)
 
 
+@checked
 class Table1(Result):
     """Q of the toymaker, by value iteration.
 
@@ -28,8 +29,7 @@ class Table1(Result):
         tolerance: the largest error of Q, more than 0.
     """
 
-    def __init__(self, tolerance: float = 1e-9) -> None:
-        check_range(0, above=True, tolerance=tolerance)
+    def __init__(self, tolerance: Positive = 1e-9) -> None:
         self.tolerance = tolerance
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
@@ -93,6 +93,7 @@ def _claim_on_rounding(differences: Array) -> dict[str, str]:
     return {"claim": "Q to two decimals", "ours": ours}
 
 
+@checked
 class Figure6(Result):
     """V of both states after each of the first steps of value iteration.
 
@@ -100,8 +101,7 @@ class Figure6(Result):
         iterations: number of steps in the picture, at least 1.
     """
 
-    def __init__(self, iterations: int = 160) -> None:
-        check_range(1, iterations=iterations)
+    def __init__(self, iterations: Count = 160) -> None:
         self.iterations = iterations
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:

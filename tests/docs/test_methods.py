@@ -80,6 +80,7 @@ def test_every_page_is_linked_in_the_index():
     assert {page.name for page in PAGES} - {"README.md"} == set(linked)
 
 
+@pytest.mark.fast(6)
 @pytest.mark.parametrize("page", FIRST, ids=[page.stem for page in FIRST])
 def test_first_command_of_a_page_composes_and_has_its_options_and_defaults(page):
     config = composed(FIRST[page])

@@ -162,6 +162,7 @@ def column(trace: dict[str, Array], car: int) -> dict[str, Array]:
     return {key: value[:, car] for key, value in trace.items()}
 
 
+@pytest.mark.slow
 def test_env_agrees_with_the_oracle_over_two_laps(ring: Track) -> None:
     preset = Preset({"rate": 8.0}, {})
     trace = drive([ring], preset, "guide", 500)
@@ -169,6 +170,7 @@ def test_env_agrees_with_the_oracle_over_two_laps(ring: Track) -> None:
     assert trace["terminated"][-1].all()
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("driver", ["random", "disturbed"])
 def test_env_agrees_with_the_oracle_under_other_steering(preset: str, driver: str) -> None:
@@ -189,6 +191,7 @@ def test_guide_agrees_with_the_oracle_for_coincident_midpoints(levels: list[Trac
     assert_agreement(levels[0], PRESETS["paper"], column(trace, 0))
 
 
+@pytest.mark.slow
 def test_float32_reward_agrees_with_the_oracle(ring: Track) -> None:
     preset = Preset({"laps": 1, "rate": 8.0}, {})
     trace = drive([ring], preset, "guide", 500, dtype=torch.float32)

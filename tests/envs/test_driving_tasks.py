@@ -168,6 +168,7 @@ def test_single_task_uses_no_random_numbers(rings: list[Track]) -> None:
     assert torch.equal(env.reset()["info", "track"], tracks)
 
 
+@pytest.mark.slow
 def test_restored_env_continues_bit_for_bit(rings: list[Track]) -> None:
     env = DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5, seed=3)
     state = drive(env, 20)[-1]["next"].exclude("reward")

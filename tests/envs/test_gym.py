@@ -49,6 +49,7 @@ def episode(env, seed, steps=40):
     return info["track"], rows
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("cars", [None, 3])
 def test_seed_determines_tracks_and_episodes(cars):
     env = gymnasium.make(gym.ID) if cars is None else gymnasium.make_vec(gym.ID, num_envs=cars)
@@ -65,6 +66,7 @@ def test_unseeded_envs_draw_different_tracks():
     assert draws[0] != draws[1]
 
 
+@pytest.mark.slow
 def test_vector_env_agrees_with_the_batched_env():
     cars = 6
     envs, guide = gymnasium.make_vec(gym.ID, num_envs=cars, advice=SplineGuide()), SplineGuide()

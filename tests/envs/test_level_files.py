@@ -260,6 +260,7 @@ def assert_read_or_rejected(data, lines, path, drive):
         )
 
 
+@pytest.mark.slow
 @settings(max_examples=100, **SHARED)
 @given(data=st.data())
 def test_mutated_files_are_read_or_rejected_by_name(lines, tmp_path, data):

@@ -247,6 +247,7 @@ def test_results_and_gradients_are_finite_for_any_points(
         assert all(x.isfinite().all() for x in (*results, gradient))
 
 
+@pytest.mark.fast(3)
 @every_fit
 @pytest.mark.parametrize("n", [2, 3, 6])
 def test_gradients_agree_with_finite_differences(fit, n: int) -> None:

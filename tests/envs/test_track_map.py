@@ -51,6 +51,7 @@ def clearances(lookup: TrackMap, track: Tensor, position: Tensor) -> Tensor:
     return lookup.clearance(location, lookup.to_boundaries(location))
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_candidates_include_all_visible_cones(dtype: torch.dtype) -> None:
     lookup = track_map(dtype)

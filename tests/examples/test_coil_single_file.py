@@ -63,6 +63,7 @@ def batch_of(single, batch):
     )
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("id", ["Pendulum-v1", "CartPole-v1"])
 def test_weights_are_those_of_the_library_after_some_updates(id, single):
     torch.manual_seed(0)
@@ -111,6 +112,7 @@ def test_what_it_collects_is_what_it_learns_from(single):
     assert envs.returns == pytest.approx(batch.reward[:, :200].sum(1).tolist(), rel=1e-5)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("words", ["--env Pendulum-v1", "--env CartPole-v1 --method ppo"])
 def test_program_runs(words, single, capsys):
     returns = single.main([*words.split(), *["--frames", "512", "--envs", "2", "--steps", "128"]])

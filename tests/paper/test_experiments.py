@@ -20,11 +20,9 @@ def first(experiment, run_dir):
     return compose_train([*words, *choice, *TINY_SWEEP, f"run_dir={run_dir}"])
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_experiment_passes_the_check_and_can_be_resumed(experiment, tmp_path):
-    config = first(experiment, tmp_path / "run")
-    check(config)
-    assert config.existing == "resume"
+@pytest.mark.parametrize("experiment", EXPERIMENTS[::5])
+def test_experiment_passes_the_check(experiment, tmp_path):
+    check(first(experiment, tmp_path / "run"))
 
 
 @pytest.mark.slow
@@ -33,6 +31,7 @@ def test_every_experiment_trains_and_evaluates(experiment, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "run"
     config = first(experiment, run)
+    assert config.existing == "resume"
     run.mkdir()
     check(config)
     train(config)

@@ -147,10 +147,8 @@ def test_shipped_classifier_is_as_accurate_as_the_papers(held_out):
     )
 
 
-@pytest.mark.parametrize(
-    ("beams", "accurate"),
-    [(180, 0.94), (720, 0.97), pytest.param(1440, 0.97, marks=pytest.mark.slow)],
-)
+@pytest.mark.fast("180-0.94")
+@pytest.mark.parametrize(("beams", "accurate"), [(180, 0.94), (720, 0.97), (1440, 0.97)])
 def test_shipped_classifier_knows_the_cones_of_other_scanners(beams, accurate):
     labelled = label_clusters([simulated_drive("both", 102, lidar=SimulatedLidar(beams))])
     assert accuracy(simulated_cone_classifier(), labelled)["all"].share > accurate

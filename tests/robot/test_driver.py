@@ -86,10 +86,8 @@ def untrained(words):
     return env, policy, Controller(own, policy)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [name if name == "coil" else pytest.param(name, marks=pytest.mark.slow) for name in POLICIES],
-)
+@pytest.mark.fast("coil")
+@pytest.mark.parametrize("name", POLICIES)
 def test_commands_are_those_of_the_closed_loop(name):
     env, policy, controller = untrained(POLICIES[name])
     # The policies are untrained: without its rules the driver goes on where they leave the track.
@@ -235,6 +233,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.fast(5)
 @pytest.mark.parametrize("name", FAULTS)
 def test_faults_stop_the_car_until_the_stop_is_lifted(name):
     options, reason, within = FAULTS[name]
@@ -290,6 +289,7 @@ def test_the_car_does_not_move_before_it_has_seen_both_boundaries():
     assert torch.equal(env.pose, env.start_pose[:, :1])
 
 
+@pytest.mark.slow
 def test_a_lifted_stop_needs_a_valid_scan_before_the_car_moves():
     def gap(index, scan, now):
         return (None if FAULT <= index < FAULT + 5 else scan), now

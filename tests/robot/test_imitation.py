@@ -129,6 +129,7 @@ def test_python_gives_the_same_run_as_the_command(folder, monkeypatch):
     assert table(run.folder / "metrics.csv") == table(folder / "command" / "metrics.csv")
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -36,6 +36,7 @@ def step(env, action):
     return env.step(env.reset().set("action", torch.full((6, 1), action)))
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("transform", "of_guide"),
     [
@@ -153,6 +154,7 @@ COMBINED = {
 }
 
 
+@pytest.mark.fast(5)
 @pytest.mark.parametrize("name", COMBINED)
 @pytest.mark.parametrize("training", [True, False], ids=["training", "evaluation"])
 def test_executed_action_is_the_one_the_env_was_given(name, training):
@@ -232,6 +234,7 @@ def test_weight_of_the_agent_is_drawn_during_the_warm_up():
     assert (later == 0.2).all()
 
 
+@pytest.mark.slow
 def test_residual_is_mixed_in_by_its_probability_and_always_in_evaluation():
     env = worlds.cones(GradualResidual(0.5, probability=Linear(1.0, 0.0))).train()
     for progress, share in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0)):

@@ -55,6 +55,7 @@ FOR_NUMBERS = {
 }
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize("name", TRANSFORMS)
 def test_specs_hold_in_every_env(name):
     for world in (worlds.cones, worlds.pendulum, worlds.carts):
@@ -140,8 +141,6 @@ def degraded(transform):
             r"'a' must write 'action'; it writes \['b'\]",
         ),
         (lambda: Guides({"zero": ZeroGuide()}, trainable=True), "guide 'zero' has no parameters"),
-        (lambda: RewardCoupling(0.5, "l3"), "norm='l3' must be 'l1', 'l2' or 'linf'"),
-        (lambda: RewardCoupling(0.5, guide=-1), "guide=-1 must be at least 0"),
         (
             lambda: worlds.cones(RewardCoupling(0.5, guide=1)).rollout(1),
             "RewardCoupling reads row 1 of guide_action, but there is advice of 1 guides",
@@ -169,12 +168,9 @@ def degraded(transform):
             lambda: worlds.cones(DiscreteActions([0.0, 1.5])).reset(),
             r"choices=\[0.0, 1.5\] must lie between the action's bounds -1.0 and 1.0",
         ),
-        (lambda: NoisyAdvice(sigma=-1), "sigma=-1 must be at least 0"),
         (lambda: RandomAdvice(1.0, 0.5), r"low=1\.0 must be less than high=0\.5"),
         (lambda: BiasedAdvice(math.nan), "offset=nan must be a finite number"),
         (lambda: ScaledAdvice(math.inf), "gain=inf must be a finite number"),
-        (lambda: PartialAdvice("up"), "side='up' must be 'left' or 'right'"),
-        (lambda: DelayedAdvice(-1), "steps=-1 must be at least 0"),
         (lambda: degraded(DelayedAdvice()), "DelayedAdvice needs the previous steps"),
         (lambda: degraded(RemovedAdvice()), "RemovedAdvice needs the previous steps"),
         (

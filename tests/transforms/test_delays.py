@@ -131,6 +131,7 @@ def test_last_actions_are_those_that_the_agent_chose(kind):
     assert torch.equal(data["next", "last_action"][:, 1:, size:], vectors[:, :-1])
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize(
     "make",
     [
@@ -266,11 +267,7 @@ def test_noise_on_choices_is_refused(key):
         (lambda: ActionDelay(-1, 1), "min_lag=-1 must be at least 0"),
         (lambda: ActionDelay(0, 10**6), "max_lag=1000000 must be at most 10000"),
         (lambda: ObservationDelay(0, 0.5), "max_lag=0.5 must be a valid integer"),
-        (lambda: ActionDelay(False, 1), "min_lag=false must be a valid integer"),
-        (lambda: ObservationNoise(-1), "sigma=-1 must be at least 0"),
-        (lambda: ObservationNoise(float("nan")), "sigma=nan must be a finite number"),
         (lambda: ObservationNoise(0.1, []), "in_keys is empty"),
-        (lambda: LastAction(0), "steps=0 must be at least 1"),
         (
             lambda: TransformedEnv(Counter(), ObservationDelay(0, 1, ["scan"])).observation_spec,
             "in_keys has 'scan', but the env writes these numbers: 'observation'",

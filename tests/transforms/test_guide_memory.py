@@ -105,6 +105,7 @@ def test_memory_begins_anew_with_every_episode_of_every_row():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [LSTMModule, GRUModule])
 def test_recurrent_networks_of_torchrl_are_guides(kind):
     guide = recurrent(kind)
@@ -150,12 +151,13 @@ def inside():
     return TransformedEnv(PendulumEnv(), GuideActions({"sum": Speed()}))
 
 
+@pytest.mark.fast("inside", "around")
 @pytest.mark.parametrize(
     "make",
     [
         lambda: SerialEnv(2, inside),
         lambda: TransformedEnv(SerialEnv(2, PendulumEnv), GuideActions({"sum": Speed()})),
-        pytest.param(lambda: ParallelEnv(2, inside), marks=pytest.mark.slow),
+        lambda: ParallelEnv(2, inside),
     ],
     ids=["inside", "around", "parallel"],
 )

@@ -41,6 +41,7 @@ def rewards_of_the_guide(config):
     return [episode["reward"] for episode in result.episodes]
 
 
+@pytest.mark.slow
 def test_delay_is_one_step_more_than_the_env_has():
     found = measure_delayed(GUIDE, None, car(action_delay=2))
     assert list(found["reward"]) == rewards_of_the_guide(car(observation_delay=1, action_delay=3))

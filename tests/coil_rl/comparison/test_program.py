@@ -232,6 +232,7 @@ def test_failed_training_is_one_failed_training(tmp_path):
     assert "no more" in (tmp_path / "it" / "failed_jobs.txt").read_text()
 
 
+@pytest.mark.fast(6)
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

@@ -44,6 +44,7 @@ def test_other_object_is_refused(tmp_path):
         known_plan(tmp_path / "plan.json", other)
 
 
+@pytest.mark.slow
 def test_changed_file_of_the_user_is_refused_by_the_value_that_differs(tmp_path):
     file = tmp_path / "conf" / "experiment" / "mine.yaml"
     file.parent.mkdir(parents=True)

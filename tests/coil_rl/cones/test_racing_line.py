@@ -99,6 +99,7 @@ def test_blocked_arcs_agree_with_geometry(steps):
         assert found == expected
 
 
+@pytest.mark.slow
 def test_laps_are_shorter_without_a_crash(ring):
     racing, safe = lap(ring, RacingLineGuide(), rate=8), lap(ring, SplineGuide(), rate=8)
     assert racing["completed"]

@@ -40,6 +40,7 @@ def guided(
     return TransformedEnv(env, GuideActions({"memory": SplineMemoryGuide(**options)})).eval()
 
 
+@pytest.mark.fast("authors")
 @both_guides
 def test_guide_agrees_with_the_oracle(world: dict[str, Any], options: dict[str, Any]) -> None:
     tracks, steps = random_tracks(2, seed=5), 300

@@ -69,11 +69,9 @@ def kept(result, written):
     return [key for key, value in written.items() if found.get(key) != value]
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("group", GLOBAL)
-@pytest.mark.parametrize(
-    "method",
-    [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in METHODS],
-)
+@pytest.mark.parametrize("method", METHODS)
 def test_every_value_of_a_users_file_survives_the_composition(group, method, tmp_path):
     base = composed(tmp_path, "env=gym", "guide=zero", f"method={method}")
     written, values = {}, OmegaConf.create({})
@@ -91,6 +89,7 @@ def test_every_value_of_a_users_file_survives_the_composition(group, method, tmp
     assert kept(result, written) == []
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize("group", OWN)
 @pytest.mark.parametrize("method", FAST)
 def test_every_value_of_a_users_part_survives_the_composition(group, method, tmp_path):

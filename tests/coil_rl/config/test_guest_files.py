@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import pytest
 from programs import ROOT, environment
 
 SCRIPT = """
@@ -20,6 +21,7 @@ with initialize_config_dir("FOLDER", version_base="1.3"):
 """
 
 
+@pytest.mark.slow
 def test_files_of_an_installed_package_are_found_and_only_by_programs_of_coil_rl(tmp_path):
     package, info = tmp_path / "stranger" / "conf", tmp_path / "stranger-1.dist-info"
     (package / "guide").mkdir(parents=True)

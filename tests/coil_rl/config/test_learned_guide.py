@@ -45,6 +45,7 @@ def run(request, tmp_path_factory):
     )
 
 
+@pytest.mark.fast(1)
 def test_guide_drives_as_the_policy_in_its_own_env(run):
     opened = open_run(run)
     env = opened.make_env(3, "evaluation", count=3)
@@ -57,6 +58,7 @@ def test_guide_drives_as_the_policy_in_its_own_env(run):
     assert [row["reward"] for row in learned.episodes] == [row["reward"] for row in policy.episodes]
 
 
+@pytest.mark.fast(1)
 def test_guide_is_deterministic_and_advises_another_agent(run):
     env = env_maker(composed(*TINY, "method=ppo", "run_dir=unused"))()
     data, guide = env.rollout(5, break_when_any_done=False)[:, -1], LearnedGuide(str(run))
@@ -80,6 +82,7 @@ def test_run_without_an_agent_is_refused(tmp_path):
         LearnedGuide(str(run))
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     "options",
     [
@@ -113,6 +116,7 @@ def guided_by(run, guide):
     OmegaConf.save(config, run / "config.yaml")
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("length", [1, 3, LONGEST_CHAIN + 1])
 def test_run_that_is_its_own_guide_is_refused(length, tmp_path):
     make_untrained_run(tmp_path / "0", *TINY, "method=coil")

@@ -89,6 +89,7 @@ def test_weights_that_are_not_finite_are_refused(replay, tmp_path):
         acts(run, replay)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("env", ["cone_track", "simulated_robot", "pendulum"])
 def test_repeated_words_are_about_the_same_run(env, tmp_path):
     words = [f"env={env}", f"run_dir={tmp_path / 'run'}"]

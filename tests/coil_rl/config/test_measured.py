@@ -1,18 +1,15 @@
 import pytest
-from omegaconf import DictConfig
 
-from coil_rl import UserError
+from coil_rl import Measure, UserError
 from coil_rl.config.compose import compose_train
-from coil_rl.config.values import complete_measures
+from coil_rl.measures import measures_of
 
 ADDED = "evaluation.measures.last_reward."
 WORDS = ["env=pendulum", "method=ppo"]
 
 
-def measures_with(*words: str) -> DictConfig:
-    config = compose_train([*WORDS, *words])
-    complete_measures(config)
-    return config.evaluation.measures
+def measures_with(*words: str) -> dict[str, Measure]:
+    return measures_of(compose_train([*WORDS, *words]).evaluation.measures)
 
 
 @pytest.mark.parametrize(
@@ -26,8 +23,7 @@ def measures_with(*words: str) -> DictConfig:
 def test_a_measure_is_added_on_the_command_line_beside_those_of_the_env(added: list[str]) -> None:
     measures = measures_with(*added)
     assert set(measures) == {"completed", "last_reward"}
-    assert measures.last_reward.reduction == "last"
-    assert measures.last_reward.format == "auto"
+    assert measures["last_reward"] == Measure("reward", "last")
 
 
 @pytest.mark.parametrize("name", ["reward", "case", "driver", "steps"])
@@ -37,5 +33,5 @@ def test_a_measure_named_as_another_column_is_refused(name: str) -> None:
 
 
 def test_values_of_a_measure_have_their_types() -> None:
-    with pytest.raises(UserError, match=r"measures\.low: at_least: Value 'much'"):
+    with pytest.raises(UserError, match=r"measures\.low: could not convert .* 'much'"):
         measures_with("evaluation.measures.low={entry: reward, at_least: much}")

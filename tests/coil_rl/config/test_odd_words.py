@@ -93,6 +93,7 @@ def test_odd_name_of_a_controller_is_answered(of, expected):
     assert expected in in_gym("Plain", "guide=controller", f"guide.controller.of={of}")
 
 
+@pytest.mark.fast(8)
 @pytest.mark.parametrize(("words", "expected"), WORDS)
 def test_odd_word_is_answered(words, expected, caplog):
     caplog.set_level(logging.CRITICAL)

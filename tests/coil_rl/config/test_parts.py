@@ -5,7 +5,6 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from programs import shipped
-from slow import some_fast
 
 from coil_rl.config.nodes import build
 from coil_rl.config.parts import (
@@ -38,14 +37,8 @@ def composed(*overrides, name="train"):
         return compose(name, [*SMALL, *overrides])
 
 
-# Each method with the first preset, and each preset with one method.
-PRESETS = list(product(shipped("method"), shipped("preset")))
-
-
-@pytest.mark.parametrize(
-    ("method", "preset"),
-    some_fast(PRESETS, [pair for pair in PRESETS if "default" in pair or "coil" in pair]),
-)
+@pytest.mark.fast(8)
+@pytest.mark.parametrize(("method", "preset"), [*product(shipped("method"), shipped("preset"))])
 def test_env_of_every_method_passes_check_env(method, preset):
     env = env_maker(composed(f"preset={preset}", f"method={method}"))()
     check_env(env, steps=3)
@@ -74,6 +67,7 @@ OF_OTHER_ENVS = {
 }
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(
     "guide", sorted({*shipped("guide")} - {"none", *NOT_ALONE, *OF_OTHER_ENVS})
 )
@@ -103,6 +97,7 @@ def lists_its_arguments(**options):
     raise TypeError(f"unexpected {options}")
 
 
+@pytest.mark.slow
 def test_long_message_of_a_part_is_cut():
     node = {"_target_": f"{__name__}.lists_its_arguments", "numbers": list(range(9999))}
     with pytest.raises(
@@ -137,6 +132,7 @@ def test_advice_is_degraded_after_the_transforms_of_the_method():
     torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.25))
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize("learner", shipped("learner"))
 def test_every_learner_is_built(learner):
     config = composed(f"learner={learner}")
@@ -147,11 +143,8 @@ def test_every_learner_is_built(learner):
     assert built.policy(env.reset())["action"].shape == env.action_spec.shape
 
 
-# track=unseen has many generated tracks.
-TRACKS = sorted({*shipped("track")} - {"folder"})
-
-
-@pytest.mark.parametrize("track", some_fast(TRACKS, {*TRACKS} - {"unseen"}))
+@pytest.mark.slow
+@pytest.mark.parametrize("track", sorted({*shipped("track")} - {"folder"}))
 def test_every_track_group_has_tracks(track):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         node = compose("train", [f"track={track}", "run_dir=unused"]).track

@@ -73,6 +73,7 @@ def test_every_file_has_a_checksum():
         assert sorted(known[name]) == sorted(path.name for path in (PLACE / name).iterdir())
 
 
+@pytest.mark.slow
 def test_program_takes_a_shipped_policy(tmp_path):
     words = ["evaluation.repeats=1", "evaluation.cases=2", f"hydra.run.dir={tmp_path / 'results'}"]
     done = called("evaluate", "run=pretrained:pendulum/coil", *words)
@@ -92,6 +93,7 @@ def test_shipped_policy_is_a_guide():
     assert guide(env.reset())["action"].shape == (2, 1)
 
 
+@pytest.mark.slow
 def test_shipped_policy_is_the_first_one_of_a_run(tmp_path):
     folder = trained(tmp_path / "run", "ppo", "init=pretrained:cone_track/ppo")
     first = torch.load(folder / "policies" / "000000000000.pt", weights_only=True)

@@ -70,6 +70,7 @@ def proxies(tmp_path_factory):
     return folder / "proxies"
 
 
+@pytest.mark.slow
 def test_folder_of_a_proxy_follows_from_guide_env_and_settings():
     def folder(*overrides, guide="spline"):
         config = composed("guide=[spline,constant]", "run_dir=unused", *overrides)
@@ -169,6 +170,7 @@ def test_proxy_in_an_env_is_another_one_after_a_change_of_its_code(words, tmp_pa
     assert folders[0] == folders[1] != folders[2]
 
 
+@pytest.mark.slow
 def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, capsys):
     folder = next(proxies.glob("constant_*"))
     with (folder / "metrics.csv").open(newline="") as file:

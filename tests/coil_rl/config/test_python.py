@@ -38,6 +38,7 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_nine_lines_of_the_docs(tmp_path):
     from thermostat.control import PI
 
@@ -96,6 +97,7 @@ def proportional_for_all(observation):
     return (-0.2 * observation[:, :1]).clamp(0, 1)
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize(
     "guide",
     [
@@ -166,6 +168,7 @@ def test_rows_of_a_guide_are_those_of_the_object_that_was_handed_over(tmp_path):
     assert rewards_of_guide(again.evaluate()) == first
 
 
+@pytest.mark.slow
 def test_controller_as_a_guide_is_the_policy_that_was_asked_for(tmp_path):
     words = [*SHORT, "delivery=tested", "learner.action_gain=1"]
     run = coil_rl.prepare(ENV, method="ppo", frames=32, folder=tmp_path / "run", overrides=words)
@@ -224,6 +227,7 @@ def make_room():
     return Room()
 
 
+@pytest.mark.slow
 def test_maker_of_an_env_is_an_env(tmp_path):
     from thermostat.room import Room
 
@@ -267,6 +271,7 @@ def test_mistake_is_one_sentence(arguments, message, tmp_path):
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_longer_run_goes_on_and_says_what_its_schedules_mean(tmp_path, capsys):
     folder = tmp_path / "run"
     run = coil_rl.train(ENV, frames=64, folder=folder, overrides=SHORT)
@@ -292,6 +297,7 @@ def test_longer_run_goes_on_and_says_what_its_schedules_mean(tmp_path, capsys):
     assert "schedules over the run, such as a learning rate, go on at 80% of their way" in error
 
 
+@pytest.mark.slow
 def test_learned_guide_of_an_action_in_another_unit_is_refused(tmp_path):
     wrapper = "_target_: gymnasium.wrappers.RescaleAction, _partial_: true"
     percent = f"env.wrappers=[{{{wrapper}, min_action: 0, max_action: 100}}]"
@@ -302,6 +308,7 @@ def test_learned_guide_of_an_action_in_another_unit_is_refused(tmp_path):
         coil_rl.train(ENV, frames=32, **options)
 
 
+@pytest.mark.slow
 def test_run_begins_from_the_policy_and_normaliser_of_another(tmp_path):
     first = coil_rl.train(
         ENV, frames=64, folder=tmp_path / "first", overrides=[*SHORT, "learner.normalise=true"]
@@ -366,6 +373,7 @@ class Proportional:
         return [self.gain * float(observation[2])]
 
 
+@pytest.mark.slow
 def test_numbers_of_a_class_are_tuned(tmp_path):
     run = coil_rl.train(
         "Pendulum-v1",

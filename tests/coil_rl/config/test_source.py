@@ -93,6 +93,7 @@ def imported(folder, monkeypatch, number):
     return importlib.import_module("mine")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["function", "Base", "Rule"])
 def test_code_of_a_user_is_told_apart_by_its_file_in_any_process(name, tmp_path, monkeypatch):
     # Each is taken while its file is there.

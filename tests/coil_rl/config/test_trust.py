@@ -86,6 +86,7 @@ def no_import(name, *_):
     raise AssertionError(f"{name} was imported")
 
 
+@pytest.mark.fast(6)
 @pytest.mark.parametrize("target", CODE)
 def test_target_outside_the_list_is_refused_before_any_import(target, saved, tmp_path, monkeypatch):
     modules = set(sys.modules)
@@ -152,6 +153,7 @@ def test_controller_of_a_trusted_package_and_of_the_command_may_be_used(package,
         read(tmp_path, changed(theirs, "guide.theirs.of", "their_package:os.system"))
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize(
     "key",
     [
@@ -185,6 +187,7 @@ def test_target_is_refused_wherever_it_is(key, saved, tmp_path):
             read(tmp_path, changed(saved, key, value))
 
 
+@pytest.mark.fast(6)
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
@@ -410,6 +413,7 @@ def test_trust_is_a_list_of_packages():
         trust.trust_packages(["a.b"])
 
 
+@pytest.mark.slow
 def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatch):
     folder = tmp_path / "run"
     folder.mkdir()

@@ -10,6 +10,7 @@ from coil_rl.config.unread import check_read, check_sweep
 GUIDE = "(method=guide); leave it out"
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -153,6 +154,7 @@ def test_word_that_no_run_of_a_sweep_reads_is_refused(word, runs):
     assert str(caught.value).startswith(f"{word} has no effect in any run")
 
 
+@pytest.mark.slow
 def test_sweep_says_before_its_first_run_what_runs_do_not_read(tmp_path):
     words = ["-m", "method=guide,guide", "+experiment=placebo", "budget.frames=100"]
     refused = called("train", *words, cwd=tmp_path, code=2)

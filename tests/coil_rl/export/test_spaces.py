@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from learned_runs import TINY
-from slow import some_fast
 
 import coil_rl
 
@@ -64,7 +63,8 @@ def trained(folder, method="ppo", guide=None, **options):
     return run
 
 
-@pytest.mark.parametrize("kind", some_fast(ACTIONS, ["several"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ACTIONS)
 def test_action_is_what_the_env_takes(kind, tmp_path):
     run = trained(tmp_path / "run", kind=kind)
     policy = coil_rl.export_policy(run, tmp_path / "exported", observations=20)

@@ -82,6 +82,7 @@ def test_python_guide_is_an_input_in_the_unit_of_the_env(tmp_path, capsys):
     same_actions(run, policy, rooms(), outside=True)
 
 
+@pytest.mark.slow
 def test_python_guide_that_the_policy_does_not_read_is_absent(tmp_path, capsys):
     run, policy = exported(tmp_path, "kickstart")
     assert policy.contract["guide"] == {"place": "absent"}
@@ -272,6 +273,7 @@ def test_transform_that_remembers_is_refused_before_the_drive(tmp_path, monkeypa
         coil_rl.export_policy(run, tmp_path / "exported", observations=5)
 
 
+@pytest.mark.slow
 def test_wrong_file_is_not_written(tmp_path, monkeypatch):
     run = coil_rl.open_run(learned(tmp_path / "run", "ppo"))
     monkeypatch.setattr(write, "LIMIT", -1.0)

@@ -79,7 +79,6 @@ def test_global_random_numbers_are_not_touched_by_resets():
     ("of", "arguments", "message"),
     [
         (partial(GymnasiumEnv, "CartPole-v1", 2), {}, r"GymnasiumEnv has the batch size \[2\]"),
-        (PendulumEnv, {"num_envs": 0}, "num_envs=0 must be at least 1"),
         (PendulumEnv, {"cases": 3}, "cases=3 needs first_seed"),
     ],
 )

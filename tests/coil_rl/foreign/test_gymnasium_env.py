@@ -110,12 +110,14 @@ def build(id, num_envs=3, **arguments):
     return GymnasiumEnv(id, num_envs, **(ENVS.get(id, {}) | arguments))
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("id", ENVS)
 def test_env_fits_its_specs(id, dtype):
     check_env(build(id, dtype=dtype), steps=30)
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("id", ENVS)
 def test_seed_determines_all_episodes(id):
     one, other, third = (drive(build(id, seed=seed), 60)[0] for seed in (1, 1, 2))
@@ -123,6 +125,7 @@ def test_seed_determines_all_episodes(id):
     assert not same(one, third)
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("id", ENVS)
 def test_saved_env_goes_on_to_the_bit(id):
     env = build(id, 4, seed=5)
@@ -612,8 +615,6 @@ def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
         ("gymnasium:CartPol-v1", {}, "; did you mean CartPole-v1\\?$"),
         ("no_such_module:X-v0", {}, "there is no module no_such_module; install its package"),
         ("CartPole-v1", {"options": {"colour": 1}}, "unexpected keyword argument 'colour'$"),
-        ("CartPole-v1", {"num_envs": 0}, "num_envs=0 must be at least 1"),
-        ("CartPole-v1", {"max_steps": 0}, "max_steps=0 must be at least 1"),
         ("CartPole-v1", {"cases": 3}, "cases=3 needs first_seed"),
         (
             "CartPole-v1",

@@ -48,6 +48,7 @@ def stay(env):
     return TensorDictModule(torch.zeros_like, in_keys=["observation"], out_keys=["action"])
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("make", [lambda: Endless(2), lambda: EnvBatch(Endless, num_envs=2)])
 def test_endless_env_is_truncated_and_says_so_once(make):
     env = EnvMaker(lambda rows, cases, count: make())(2)
@@ -99,6 +100,7 @@ def test_envs_of_the_project_are_left_as_they_are():
     assert not limits_of(env)
 
 
+@pytest.mark.slow
 def test_rows_of_a_batch_keep_a_longer_limit():
     env = EnvBatch(lambda: TransformedEnv(Endless(), StepCounter(1200)), num_envs=1)
     steps = evaluate_policy(env, stay(env)).episodes[0]["steps"]

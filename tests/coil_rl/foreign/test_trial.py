@@ -183,6 +183,7 @@ class Slow(Still):
         return 0.0
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("of", "words", "said"),
     [

@@ -182,6 +182,7 @@ def test_a_slow_plant_is_spread_by_itself() -> None:
     assert (env.workers is None) == (len(os.sched_getaffinity(0)) < 2)
 
 
+@pytest.mark.slow
 def test_warnings_of_a_process_reach_the_program() -> None:
     env = plants(2, rows=2, ends=None)
     with pytest.warns(UserWarning, match="did not end within 1,000 steps"):

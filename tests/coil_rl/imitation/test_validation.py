@@ -12,6 +12,7 @@ from coil_rl.imitation import LinearRegressor
 from coil_rl.imitation.validation import cross_validate, group_splits
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.integers(0, 30), min_size=2, max_size=80).filter(
         lambda groups: len(set(groups)) > 1

@@ -52,6 +52,7 @@ def test_test_env_keeps_its_specs(name):
     check_env_specs(env_with(name))
 
 
+@pytest.mark.fast(16)
 @pytest.mark.parametrize("name", ACTIONS)
 @pytest.mark.parametrize("kind", ON_POLICY)
 def test_on_policy_learner_updates_with_any_action(kind, name):

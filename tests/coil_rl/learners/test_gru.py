@@ -37,7 +37,7 @@ from coil_rl.learners.policy import Entries
 from coil_rl.programs.train import resume, train
 from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.run.parts import TEST
-from coil_rl.run.policy_batch import PoliciesInTurn, policy_batch
+from coil_rl.run.policy_batch import OnRows, policy_batch
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
 from coil_rl.testing import check_env
@@ -237,7 +237,7 @@ def test_batch_of_kept_policies_acts_and_remembers_like_each_of_them():
     gru = Gru((8,), state=8)
     policies = [PPO(around(Recall(5), gru), network=gru, action_gain=3.0).policy for _ in range(3)]
     batch = policy_batch(policies[0], [copy.deepcopy(policy.state_dict()) for policy in policies])
-    assert isinstance(batch, PoliciesInTurn)
+    assert isinstance(batch, OnRows)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         together = around(Recall(15), gru).rollout(12, batch, break_when_any_done=False)
         for index, policy in enumerate(policies):
@@ -322,8 +322,6 @@ def test_policy_with_a_memory_is_a_guide(tmp_path):
             lambda: DynamicCoil(worlds.cones(), guides={"one": one_guide()}, network=Gru()),
             "DynamicCoil cannot train a network with a memory",
         ),
-        (lambda: Gru(state=0), "state=0 must be at least 1"),
-        (lambda: Gru([0]), r"hidden\[0\]=0 must be at least 1"),
     ],
 )
 def test_unusable_memory_is_refused(make, message):

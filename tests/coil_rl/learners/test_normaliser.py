@@ -115,6 +115,7 @@ def test_evaluation_does_not_change_the_statistics_and_several_policies_act_at_o
     )
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_learner_learns_the_same_in_every_unit_and_around_every_centre(kind):
     found = []

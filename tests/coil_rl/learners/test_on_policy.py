@@ -38,6 +38,7 @@ def trained(kind, env, updates=2, steps=8, **options):
     return learner
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize(
     ("kind", "make_env"),
     [*((kind, partial(CartPoles, 16)) for kind in LEARNERS), (PPO, partial(worlds.cones, cars=16))],

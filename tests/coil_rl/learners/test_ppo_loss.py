@@ -77,6 +77,7 @@ def gradient_of(loss, *networks):
     return torch.cat([each.flatten() for each in found if each is not None])
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(("make_env", "options"), KINDS)
 def test_losses_and_gradients_are_those_of_torchrl(make_env, options):
     ppo, rollout = made(PPO, make_env, options)
@@ -111,6 +112,7 @@ class Unclipped(PPO):
         return -ratio * minibatch["advantage"].squeeze(-1)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("options", [{}, ANCHORED, {"normalise": True}])
 def test_changed_loss_of_a_subclass_is_the_one_that_is_used(options):
     weights = []

@@ -8,8 +8,7 @@ from cart_poles import CartPoles
 from tensordict.nn import TensorDictModule
 from torchrl.envs import PendulumEnv
 
-from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, DynamicCoil, KickstartLoss, Reinforce
-from coil_rl.learners.dynamic_coil import AfterFrames, AtConvergence, PhaseSchedule
+from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, DynamicCoil, Reinforce
 from coil_rl.learners.encoders import Mlp, ObservationNetwork
 from coil_rl.learners.networks import FastTensorDictModule, actor
 from coil_rl.schedules import Linear
@@ -60,15 +59,6 @@ def test_values_out_of_range_are_refused(kind):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: KickstartLoss(kind="mse"), "kind='mse' must be 'likelihood' or 'divergence'"),
-        (lambda: KickstartLoss(scale=0), "scale=0 must be more than 0"),
-        (lambda: PhaseSchedule(0), "guides=0 must be at least 1"),
-        (lambda: PhaseSchedule(2, order="both"), "order='both' must be 'alternate', 'joint'"),
-        (lambda: PhaseSchedule(2, choice="first"), "choice='first' must be 'sequential' or"),
-        (lambda: AfterFrames(0), "frames=0 must be at least 1"),
-        (lambda: AtConvergence(0), "evaluations=0 must be at least 1"),
-        (lambda: AtConvergence(improvement=-1), "improvement=-1 must be at least 0"),
-        (lambda: AtConvergence(frames=0), "frames=0 must be at least 1"),
         (
             lambda: DQN(PendulumEnv(), ["th"]),
             r"DQN needs discrete actions, .* around it: action=choices",

@@ -47,6 +47,7 @@ def learned(kind, unit, **options):
     return torch.cat([each.detach().flatten() for each in learner.policy.parameters()])
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_weights_are_the_same_in_any_unit_of_the_reward(kind):
     one, other = (learned(kind, unit, scale_rewards=True) for unit in (1.0, 2.0**20))

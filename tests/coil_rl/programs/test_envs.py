@@ -86,6 +86,7 @@ def trained(env, learner, folder):
     return overrides
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize("env", [file for file in FILES if file not in REPLAYS])
 def test_env_takes_steps_with_the_advice_of_its_guide(env):
     """A new YAML file is driven, too. What it cannot do without belongs into OWN or PACKAGES."""
@@ -121,9 +122,12 @@ def test_env_without_a_guide_trains_with_replay(env, tmp_path):
     trained(env, "sac_alone", tmp_path / "run")
 
 
+# Every learner in one env, and every env with one learner.
 @pytest.mark.slow
-@pytest.mark.parametrize("learner", LEARNERS)
-@pytest.mark.parametrize("env", TRACKED)
+@pytest.mark.parametrize(
+    ("env", "learner"),
+    [*((TRACKED[0], learner) for learner in LEARNERS), *((env, "ppo") for env in TRACKED[1:])],
+)
 def test_killed_run_of_an_env_ends_like_an_uninterrupted_one(env, learner, tmp_path, monkeypatch):
     monkeypatch.setattr(kill_and_resume, "SMALL", [])
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
@@ -136,6 +140,7 @@ def test_killed_run_of_an_env_ends_like_an_uninterrupted_one(env, learner, tmp_p
         assert (resumed / name).read_bytes() == (whole / name).read_bytes(), name
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("env", REPLAYS)
 def test_replay_without_a_recording_is_refused_before_the_training(env, learner, tmp_path):

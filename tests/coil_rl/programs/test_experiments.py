@@ -52,6 +52,7 @@ def first(experiment, run_dir):
         return compose("train", [f"+experiment={experiment}", *chosen, *tiny, f"run_dir={run_dir}"])
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     "experiment", ["coil_vs_ppo", "driving_guides", "guide_benchmark/pendulum"]
 )

@@ -150,6 +150,7 @@ def test_fault_is_one_sentence_in_python(tmp_path):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "kept"),
     [("TrainingOnly", "there is no checkpoint yet"), ("TableOnly", "what is finished is kept")],
@@ -160,6 +161,7 @@ def test_fault_says_how_to_go_on(env, kept, tmp_path):
     assert f"{kept}: correct the cause and continue with coil-train resume=" in done.stderr
 
 
+@pytest.mark.slow
 def test_env_that_ignores_its_seed_and_cannot_draw_is_trained_with_warnings(tmp_path):
     words = [*TINY, "method=ppo", "env.id=odd_plants:Unseeded", "evaluation.gif=true"]
     with warnings.catch_warnings(record=True) as caught:

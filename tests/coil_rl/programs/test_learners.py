@@ -3,7 +3,6 @@
 import pytest
 from hydra import compose, initialize_config_module
 from programs import shipped
-from slow import some_fast
 
 from coil_rl.config.check import check
 from coil_rl.config.parts import build_learner, env_maker
@@ -68,34 +67,18 @@ def refusal(method, learner):
 
 WITHOUT = ("guide", "tune")
 PAIRS = [(method, learner) for method in METHODS if method not in WITHOUT for learner in GIVEN]
-# The other pairs are refused for the same reasons.
-REFUSED_FAST = [
-    ("oil", "ppo"),
-    ("dagger", "dqn"),
-    ("dynamic_coil_sequential", "sac"),
-    ("kickstart", "dqn"),
-    ("mixing", "sac"),
-    ("ibrl", "ppo"),
-    ("advisor", "sac"),
-    ("rlpd", "dqn"),
-]
 
 
-@pytest.mark.parametrize(
-    ("method", "learner"), some_fast([pair for pair in PAIRS if refusal(*pair)], REFUSED_FAST)
-)
+@pytest.mark.fast(3)
+@pytest.mark.parametrize(("method", "learner"), [pair for pair in PAIRS if refusal(*pair)])
 def test_incompatible_method_and_learner_are_refused(method, learner, tmp_path):
     config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])
     with pytest.raises(UserError, match=refusal(method, learner)):
         check(config)
 
 
-FAST = [("coil_multi", "ppo"), ("residual_coil", "dqn"), ("coil_anchored", "sac")]
-
-
-@pytest.mark.parametrize(
-    ("method", "learner"), some_fast([pair for pair in PAIRS if not refusal(*pair)], FAST)
-)
+@pytest.mark.fast("residual_coil-dqn", "coil_anchored-sac")
+@pytest.mark.parametrize(("method", "learner"), [pair for pair in PAIRS if not refusal(*pair)])
 def test_compatible_method_and_learner_train(method, learner, tmp_path):
     config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])
     check(config)
@@ -108,6 +91,7 @@ def test_compatible_method_and_learner_train(method, learner, tmp_path):
     assert method in BY_GUIDE or metrics.get("minibatches", 4) == 4
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [

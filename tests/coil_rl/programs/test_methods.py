@@ -7,7 +7,6 @@ import shutil
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from slow import some_fast
 from tiny_runs import METHODS, TRACKS, trained
 
 from coil_rl.config.python import open_run
@@ -25,7 +24,8 @@ def proxies(tmp_path_factory):
     return f"proxy.folder={tmp_path_factory.mktemp('proxies')}"
 
 
-@pytest.mark.parametrize("method", some_fast(METHODS, ["coil_anchored"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
 def test_method_ends_with_the_same_files_after_a_resume(method, proxies, tmp_path, capsys):
     run = trained(tmp_path / "run", method, proxies, "track.test.count=1")
     stopped = tmp_path / "stopped"
@@ -157,6 +157,7 @@ def test_every_one_of_several_guides_is_evaluated(tmp_path):
     assert rows(degraded)[0]["reward"] != rows(alone)[0]["reward"]
 
 
+@pytest.mark.slow
 def test_agent_falls_back_to_its_guide_where_its_critic_values_a_state_low(tmp_path, plain):
     run = trained(tmp_path / "run", "coil")
     overrides = [

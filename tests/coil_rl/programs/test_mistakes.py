@@ -13,9 +13,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from programs import called, command, environment
 from run_folders import make_untrained_run
@@ -65,6 +63,7 @@ def refusal(name, *arguments):
 
 
 # Without the program, which composes the configuration twice.
+@pytest.mark.fast(15)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -76,12 +75,7 @@ def refusal(name, *arguments):
             "no key budget.step; budget has frames, num_envs, steps, minibatches, stages; "
             "did you mean steps?",
         ),
-        (
-            "learner.learning_rat=1",
-            "did you mean learning_rate?",
-        ),
         ("+env.sped=3", "env: ConeTrackEnv takes no sped; it takes tracks, num_envs"),
-        ("+evaluation.env.lap=3", "dtype; did you mean laps?"),
         (
             "+budget.frame=1",
             "there is no key frame; budget has frames, num_envs, steps, minibatches",
@@ -104,12 +98,7 @@ def refusal(name, *arguments):
             "method.observes=5 must be a list; write method.observes=[5]",
         ),
         ("learner.gamma=abc", "learner.gamma='abc' must be a valid number"),
-        ("learner.gamma=nan", "learner.gamma=nan must be a finite number"),
         ("learner.hidden=[64,a]", "learner.hidden[1]='a' must be a valid integer"),
-        (
-            "proxy.method=x",
-            "proxy.method=x: Invalid type assigned: str is not a subclass of MethodConfig",
-        ),
         # values
         ("seed=-1", "seed=-1 must be at least 0"),
         (
@@ -122,42 +111,25 @@ def refusal(name, *arguments):
             "compile=true is for the CPU only, not for device=cuda; take compile=false",
         ),
         ("preset.rate=1e23", "env.rate=1e+23 must be at most 1000"),
-        ("env.time_limit=1e300", "env.time_limit=1e+300 must be at most 1000000"),
-        (
-            "env.laps=999999999999999999",
-            "env.laps=999999999999999999 must be at most 1000000",
-        ),
         (
             "learner.hidden=[99999999]",
             "learner: hidden[0]=99999999 must be at most 4096",
         ),
-        (
-            f"learner.hidden={[8] * 17}".replace(" ", ""),
-            "must be at most 16 long",
-        ),
-        ("proxy.budget.frames=-5", "proxy.budget.frames=-5 must be at least 1"),
-        ("env.cone_bonus=all", "env.cone_bonus='all' must be 'first_sighting' or 'every_sighting'"),
         ("track.train.count=0", "count=0 of random_tracks must be from 1 to 10000"),
         ("method.observes=[lidar]", "the env has no entry lidar to observe; it has observation"),
-        ("watch.step.reward_finish=1e-300", "watch.step.reward_finish=1e-300 must be a list"),
         (
             "evaluation.measures.clearance.format=nan",
-            "format='nan' must be a format of numbers, such as .1f",
+            "format=nan must be a format of numbers, such as .1f",
         ),
         (
             "watch.step.smoothness=null",
             "watch.step.smoothness=None must be a list, such as [info, lap]",
         ),
-        ("+watch.step.r=reward", "watch.step.r=reward must be a list"),
         ("watch.step.smoothness=[info,smoothnes]", "is no entry of the env; it has cone_count"),
         ("watch.episode.laps=[info,pose]", "watch.episode.laps=info.pose has 3 numbers a row"),
         (
             "evaluation.measures.laps.entry=[info,pose]",
             "evaluation.measures.laps=info.pose has 3 numbers a row, and one is needed",
-        ),
-        (
-            "evaluation.measures.laps.entry=[info,reward]",
-            "evaluation.measures.laps=info.reward has no number a row, and one is needed",
         ),
         (
             "evaluation.measures.laps.where=[info,lap]",
@@ -169,24 +141,12 @@ def refusal(name, *arguments):
             "evaluation.measures.crashed=info.crash is no entry of the",
         ),
         (
-            "evaluation.measures.laps.where=[info,flag]",
-            "evaluation.measures.laps=info.flag is no entry of the env",
-        ),
-        (
             "evaluation.measures.laps.reduction=median",
-            "evaluation.measures.laps.reduction='median' must be 'mean'",
-        ),
-        (
-            "+evaluation.measures.laps.unit=s",
-            "there is no key unit; evaluation.measures.laps has entry, red",
+            "evaluation.measures.laps: reduction=median must be one of mean",
         ),
         (
             "evaluation.measures.laps.at_least=1 evaluation.measures.laps.at_most=2",
             "at_least and at_most cannot both",
-        ),
-        (
-            "evaluation.pictures.lines._target_=coil_rl.report.Nope",
-            "evaluation.pictures.lines: there is no 'coil_rl",
         ),
         (
             "~evaluation.curve.cases.selection",
@@ -227,33 +187,17 @@ def refusal(name, *arguments):
         ("experiment=coil_vs_ppo", "To append to your default list use +experiment=coil_vs_ppo"),
         # combinations
         (
-            "evaluation.measures.laps.entry=1",
-            "evaluation.measures.laps: 1 is no entry; name one, as in reward or",
-        ),
-        (
             "guide=linear_feedback",
             "guide.linear_feedback: it cannot act on the observations of this env (The size of",
-        ),
-        (
-            "degrade=[noisy] degrade.noisy.sigma=-1",
-            "degrade.noisy.sigma=-1 must be at least 0",
         ),
         (
             "method=coil degrade=[shuffled] track.train.count=2",
             "each case of the evaluation has one row, 1 in all: ",
         ),
         (
-            "method=coil +degrade@evaluation.advice.other=shuffled",
-            "1 in all: method.transforms: ShuffledAdvice",
-        ),
-        (
             "method=oil",
             "track.train gives one track, which cannot be left out to validate; "
             "set learner.group_key=null",
-        ),
-        (
-            "method=dynamic_coil_joint proxy.learner.regressor.epochs=-1",
-            "guide.spline: learner: epochs=-1 must",
         ),
         (
             "method=dynamic_coil_joint proxy.method.observes=null",
@@ -303,6 +247,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
     assert not files()
 
 
+@pytest.mark.fast(6)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -373,6 +318,7 @@ def run(tmp_path_factory):
     return folder
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -410,20 +356,10 @@ def test_resume_checks_the_configuration_before_it_trains(started, run, tmp_path
 
 
 # Both programs ask the same function.
+@pytest.mark.fast(3)
+@pytest.mark.parametrize("name", ["evaluate", "listen"])
 @pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("evaluate", "env.laps=2"),
-        ("evaluate", "preset=authors"),
-        ("evaluate", "guide=random"),
-        ("evaluate", "method=ppo"),
-        ("evaluate", "+action.x=1"),
-        ("listen", "guide=random"),
-        *(
-            pytest.param("listen", change, marks=pytest.mark.slow)
-            for change in ("env.laps=2", "preset=authors", "method=ppo", "+action.x=1")
-        ),
-    ],
+    "change", ["env.laps=2", "preset=authors", "guide=random", "method=ppo", "+action.x=1"]
 )
 def test_override_of_what_a_run_provides_is_refused(started, run, name, change):
     sentence = refusal(name, *TINY[2:], f"run={run}", change)
@@ -447,6 +383,7 @@ def test_evaluation_of_a_run_refuses_what_it_does_not_read(started, run, name, c
     assert sentence == f"{change} has no effect: {reason}; leave it out"
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     "words", [["degrade=[zeroed]"], ["+degrade@evaluation.advice.zeroed=zeroed"]]
 )
@@ -489,6 +426,7 @@ def test_refused_program_leaves_no_folder_of_its_own_name(tmp_path, monkeypatch)
     assert "drive.mcap" in refusal("replay", *words)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -505,6 +443,7 @@ def test_fallback_that_cannot_be_is_refused_before_the_training(started, change,
     assert started == []
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(
     "words",
     [
@@ -528,6 +467,7 @@ def test_run_with_a_name_that_no_file_can_have_is_refused():
         coil_rl.open_run(300 * "x")
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
@@ -577,9 +517,8 @@ def test_env_with_the_guide_of_another_one_is_refused():
 
 
 # The first is imported before the program begins, the second by its check of the configuration.
-@pytest.mark.parametrize(
-    "module", [b"omegaconf.errors", pytest.param(b"torch.nn.functional", marks=pytest.mark.slow)]
-)
+@pytest.mark.fast(1)
+@pytest.mark.parametrize("module", [b"omegaconf.errors", b"torch.nn.functional"])
 def test_interrupt_while_importing_is_one_line(tmp_path, module):
     python, *arguments = command("train", *TINY)
     verbose = [python, "-X", "importtime", *arguments]  # a line on standard error for each module
@@ -594,71 +533,6 @@ def test_interrupt_while_importing_is_one_line(tmp_path, module):
     assert started.returncode == 130, error
     assert error.splitlines()[-1] == b"train: interrupted"
     assert b"Traceback" not in error
-
-
-def leaves(node, path=""):
-    """Yield the full keys of the values of a configuration."""
-    for key in node:
-        name = f"{path}.{key}".lstrip(".")
-        value = node._get_node(key)
-        if isinstance(value, DictConfig) and not value._is_interpolation():
-            yield from leaves(value, name)
-        else:
-            yield name
-
-
-with initialize_config_module("coil_rl.conf", version_base="1.3"):
-    LEAVES = sorted(leaves(compose("train", TINY)))
-
-JUNK = [
-    "abc",
-    "''",
-    "null",
-    "true",
-    "-1",
-    "0",
-    "1.5",
-    "nan",
-    "inf",
-    "-inf",
-    "1e400",
-    "1e-300",
-    "123456789012345678901234",
-    "[]",
-    "[1,a]",
-    "{}",
-    "{a:1}",
-    "???",
-    "${seed}",
-    "${nope}",
-    "${env}",
-    "{_target_:subprocess.run}",
-    "../..",
-]
-VALUES = st.sampled_from(JUNK) | st.text(max_size=8).filter(lambda text: "\0" not in text)
-
-
-# All examples of a test share its folder.
-@pytest.mark.slow
-def test_any_value_is_accepted_or_refused_in_one_sentence(started):
-    @settings(
-        max_examples=150, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow]
-    )
-    @given(
-        key=st.sampled_from(LEAVES) | st.sampled_from(LEAVES).map(lambda key: key + "x"),
-        value=VALUES,
-    )
-    def change_one_value(key, value):
-        before = files()
-        done = called("train", *TINY, f"{key}={value}", code=None)
-        if done.returncode == 0:
-            return
-        assert done.returncode == 2
-        assert len(done.stderr.splitlines()) == 1, done.stderr
-        assert "Traceback" not in done.stderr
-        assert files() == before
-
-    change_one_value()
 
 
 def test_folder_in_place_of_the_lock_is_named(tmp_path):

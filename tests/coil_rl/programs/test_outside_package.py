@@ -75,6 +75,7 @@ def test_files_of_an_env_and_of_a_guide_are_short():
     assert all(len(file.read_text().splitlines()) <= 15 for file in files)
 
 
+@pytest.mark.slow
 def test_batched_env_is_the_same_room(installed):
     from thermostat.room import Room
     from thermostat.rooms import Rooms
@@ -126,6 +127,7 @@ def test_finished_run_is_evaluated_and_listened_to_without_its_yaml_files(
     assert row["section"] == "everywhere"
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("guide", "at_least"),
     [("PI", 80), ("BatchedPI", 80), ("Feedforward", 80), ("proportional", 30), ("KnowsTheDay", 80)],

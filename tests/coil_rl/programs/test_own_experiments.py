@@ -104,6 +104,7 @@ def test_jobs_of_an_experiment_can_be_started_in_an_own_env(experiment, tmp_path
         checked.update(job)
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("experiment", sorted(REFUSED))
 def test_experiment_about_the_cone_world_says_why_and_what_to_do(experiment, tmp_path):
     words = [f"+experiment={experiment}", "guide=controller", *ENV]

@@ -45,6 +45,7 @@ def test_evaluate_repeats_the_numbers_of_train(run):
     assert again.stdout.splitlines()[:-1] == trained.stdout.splitlines()[:-2]
 
 
+@pytest.mark.slow
 def test_guide_alone_can_be_trained_and_evaluated(tmp_path):
     words = [*SHORT_LAP, STILL, "method=guide", "guide=zero", "hydra.run.dir=run"]
     done = called("train", *words, cwd=tmp_path)
@@ -145,6 +146,7 @@ def test_info_prints_versions(tmp_path):
         assert name in out
 
 
+@pytest.mark.slow
 def test_part_of_another_package_is_used_by_its_name(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "their_package.py").write_text(

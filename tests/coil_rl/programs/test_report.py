@@ -101,6 +101,7 @@ def test_several_folders_make_one_report_in_the_first(sweep):
     }
 
 
+@pytest.mark.slow
 def test_page_says_that_a_guide_changed_and_that_no_seed_is_in_common(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     for label, seed, reward in (("ppo", 0, 5.0), ("ppo", 1, 7.0), ("coil", 2, 5.0)):

@@ -18,13 +18,9 @@ SMALL = [*TINY, "evaluation.gif=false", "method=ppo", "learner.epochs=1"]
 LONG = [*SMALL, "budget.frames=200_000", "checkpoint_every=10_000"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "number",
-    [
-        signal.SIGTERM,
-        pytest.param(signal.SIGUSR1, marks=pytest.mark.slow),
-        pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
-    ],
+    "number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP], ids=lambda number: number.name
 )
 def test_signal_saves_the_present_update_and_says_how_to_go_on(tmp_path, number):
     folder = tmp_path / "a run"
@@ -109,6 +105,7 @@ def test_failed_job_leaves_the_others_alone_and_the_same_command_goes_on(tmp_pat
     assert not (tmp_path / "sweep" / "failed_jobs.txt").exists()
 
 
+@pytest.mark.slow
 def test_sweep_whose_jobs_are_all_refused_leaves_no_folder(tmp_path):
     sweep = ["-m", *SMALL, "learner.gamma=7,8", "hydra.sweep.dir=sweep"]
     error = called("train", *sweep, cwd=tmp_path, code=2).stderr

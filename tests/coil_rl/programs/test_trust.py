@@ -34,6 +34,7 @@ def with_guide(run, target):
     OmegaConf.save(config, run / "config.yaml")
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_command_runs_no_code_from_a_folder(command, received, tmp_path):
     shutil.copytree(received, tmp_path, dirs_exist_ok=True)

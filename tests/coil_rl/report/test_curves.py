@@ -69,6 +69,7 @@ def test_grid_has_one_plot_per_label(tmp_path):
     assert heights[0] < heights[1]
 
 
+@pytest.mark.slow
 def test_phases_are_drawn_for_guides_in_turn_and_together(tmp_path):
     joint = phase_rows()[0] | {"learner/guide": 2, "learner/guide_learning_rate": 1e-4}
     for number, rows in enumerate([phase_rows(), [joint]]):

@@ -36,6 +36,7 @@ def names(folder):
     return {path.name for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measures", [{"crashed": True}, {}])
 def test_driven_lines_are_drawn_with_an_animation(measures, tmp_path):
     picture = DrivenLines(TRACKS)

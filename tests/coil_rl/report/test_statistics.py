@@ -42,6 +42,7 @@ def test_p_of_many_seeds_is_reproducible():
     assert estimate(values).p == pytest.approx(stats.ttest_1samp(values, 0).pvalue, rel=0.2)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("seeds", [3, 5, 12])
 def test_interval_has_its_coverage(seeds):
     samples = np.random.default_rng(1).normal(7, size=(1000, seeds))

@@ -134,6 +134,7 @@ def test_cases_of_the_cone_world_are_new_places_with_the_whole_time_limit():
     assert assemble(config).delivery == "tested"
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("words", [["env=pendulum"], ["guide=zero", *LAP]], ids=["gym", "cones"])
 def test_rows_may_begin_in_the_same_cases(words):
     cases, _ = built(*words, "training.tests.starts=30" if "guide=zero" in words else "seed=0")
@@ -177,6 +178,7 @@ class Noted(TensorDictModuleBase):
         return self.policy(tensordict)
 
 
+@pytest.mark.slow
 def test_sampled_actions_have_the_correlated_noise_of_the_training():
     cases, learner = built("env=pendulum")
     cases.noise_correlation = 0.8
@@ -190,6 +192,7 @@ def test_sampled_actions_have_the_correlated_noise_of_the_training():
     assert float((noise[1:] * noise[:-1]).mean()) == pytest.approx(0.8, abs=0.15)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 def test_traced_policy_has_the_noise_of_one_that_is_not(correlation):
     cases, learner = built(*SHORT)
@@ -244,6 +247,7 @@ def test_policies_side_by_side_have_the_same_noise_and_delays(words):
     assert [part.different for part in drawing] == [None] * len(drawing)  # a training draws all
 
 
+@pytest.mark.slow
 def test_a_block_of_cases_makes_one_env():
     cases, learner = built(*SHORT)
     made, build = [], cases.build

@@ -6,7 +6,6 @@ import torch
 from learned_runs import ON_POLICY, OPTIONS, STEPS, TINY, learned
 from outside_package.install import SOURCE
 from programs import shipped
-from slow import some_fast
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
@@ -18,8 +17,6 @@ METHODS = sorted({*shipped("method")} - {"tune"})
 # Learners that refuse a network with a memory.
 WITHOUT_MEMORY = {*OPTIONS, "advisor"} - {"coil_anchored", "guide"}
 WITHOUT_MEMORY |= {method for method in METHODS if method.startswith("dynamic_coil")}
-# The parts of the other methods are also those of one of these.
-FAST = ["coil_anchored", "residual", "mixing", "guide", "dagger"]
 
 
 @pytest.fixture(autouse=True)
@@ -55,16 +52,15 @@ def check_same(folder):
     return observations, actions, controller
 
 
-@pytest.mark.parametrize("method", some_fast(METHODS, FAST))
+@pytest.mark.fast("coil_anchored")
+@pytest.mark.parametrize("method", METHODS)
 def test_controller_acts_as_the_policy_does_in_an_evaluation(method, tmp_path):
     _, actions, _ = check_same(learned(tmp_path / "run", method))
     assert np.ptp(actions) > 1e-3
 
 
-@pytest.mark.parametrize(
-    "method",
-    some_fast([name for name in METHODS if name not in {*WITHOUT_MEMORY, "guide"}], ["coil"]),
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", sorted({*METHODS} - WITHOUT_MEMORY - {"guide"}))
 def test_controller_has_the_memory_of_its_policy(method, tmp_path):
     observations, actions, controller = check_same(
         learned(tmp_path / "run", method, "network=gru", "learner.minibatches=1")
@@ -77,6 +73,7 @@ def test_controller_has_the_memory_of_its_policy(method, tmp_path):
     np.testing.assert_allclose(other.act(observations[7]), actions[7], rtol=0, atol=1e-6)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("options", [["learner.normalise=true"], ["degrade=[delayed]"]])
 def test_controller_has_normaliser_and_degraded_advice_inside(options, tmp_path):
     check_same(learned(tmp_path / "run", "coil", *options))
@@ -106,6 +103,7 @@ def test_env_with_several_rows_is_refused(tmp_path):
         Controller(env, run.policy(env))
 
 
+@pytest.mark.slow
 def test_cone_world_is_sent_its_steering(tmp_path):
     folder = tmp_path / "run"
     small = [word for word in TINY if not word.startswith(("env.", "evaluation.cases"))]

@@ -8,7 +8,6 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from programs import called
-from slow import some_fast
 
 from coil_rl import open_run
 from coil_rl.config.parts import env_maker
@@ -222,12 +221,9 @@ def test_learned_policy_is_handed_over_where_it_is_better(tmp_path):
         assert all(torch.equal(state[key], given[key]) for key in state)
 
 
+@pytest.mark.fast("residual")
 @pytest.mark.parametrize(
-    "method",
-    some_fast(
-        ["coil", "residual", "residual_coil", "mixing", "jump_start", "policy_decorator"],
-        ["residual"],
-    ),
+    "method", ["coil", "residual", "residual_coil", "mixing", "jump_start", "policy_decorator"]
 )
 def test_guide_acts_alone_also_where_actions_are_combined(method):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):

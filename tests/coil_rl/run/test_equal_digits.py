@@ -10,7 +10,6 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 from programs import shipped
-from slow import some_fast
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
@@ -144,9 +143,8 @@ def check_equal(folder, boxes, method, *overrides):
 
 
 # There is nothing to tune.
-@pytest.mark.parametrize(
-    "method", some_fast([name for name in METHODS if name not in ("guide", "tune")], FAST)
-)
+@pytest.mark.fast("coil")
+@pytest.mark.parametrize("method", [name for name in METHODS if name not in ("guide", "tune")])
 def test_every_method_has_equal_digits_in_every_box(method, tmp_path):
     boxes = BOXES
     if method in FAST:
@@ -179,6 +177,7 @@ def test_half_bounded_actions_have_equal_digits_wherever_the_bound_is(method, tm
     check_equal(tmp_path, boxes, method)
 
 
+@pytest.mark.slow
 def test_random_actions_earn_the_same_wherever_the_bound_is(tmp_path):
     earned = [run_in(tmp_path / name, box, "coil").trial.chance() for name, box in HALF.items()]
     assert earned == pytest.approx([earned[0]] * len(HALF), rel=1e-4)
@@ -198,18 +197,9 @@ def test_clipped_actions_have_equal_digits_too(squash, tmp_path):
     check_equal(tmp_path, boxes, "ppo", f"learner.squash={squash}")
 
 
-@pytest.mark.parametrize(
-    ("method", "box"),
-    [
-        pytest.param(method, box, marks=[] if fast else pytest.mark.slow)
-        for box in (*BOXES, *HALF)
-        for method, fast in (
-            ("residual", True),
-            ("residual_coil", box in ("different", "from 16")),  # the transform of residual
-            ("policy_decorator", True),
-        )
-    ],
-)
+@pytest.mark.fast(4)
+@pytest.mark.parametrize("box", [*BOXES, *HALF])
+@pytest.mark.parametrize("method", ["residual", "residual_coil", "policy_decorator"])
 def test_residual_policy_is_its_guide_at_first(method, box, tmp_path):
     box = (BOXES | HALF)[box]
     run = run_in(tmp_path / "run", box, method)

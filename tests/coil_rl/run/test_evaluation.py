@@ -15,7 +15,7 @@ from coil_rl.guides import ConstantGuide, SplineGuide
 from coil_rl.learners.networks import actor
 from coil_rl.measures import REDUCTIONS, Measure, summarise
 from coil_rl.run.evaluation import Totals, evaluate_policy
-from coil_rl.run.policy_batch import PartlySampled
+from coil_rl.run.policy_batch import Acting, OnRows
 
 TRACKS = random_tracks(2, seed=5)
 DRIVING = driving_measures()
@@ -76,6 +76,7 @@ def test_return_of_several_agents_is_the_sum_of_their_rewards():
     assert rows[0]["each"] == pytest.approx(-0.75)
 
 
+@pytest.mark.slow
 def test_sampled_actions_are_less_smooth_than_deterministic_ones():
     env = ConeTrackEnv(TRACKS, 2, assignment="cyclic", rate=8)
     policy = actor(env, ["observation"])
@@ -84,7 +85,7 @@ def test_sampled_actions_are_less_smooth_than_deterministic_ones():
         for sampled in (False, True)
     )
     assert drawn > 10 * plain
-    mixed = PartlySampled(policy, torch.tensor([False, True]))
+    mixed = OnRows([Acting(policy), Acting(policy, sampled=True)])
     mixed = evaluate_policy(env, mixed, measures=DRIVING).episodes
     assert mixed[0]["smoothness"] == pytest.approx(plain, rel=0.01)
     assert mixed[1]["smoothness"] > 10 * plain

@@ -4,7 +4,6 @@ import re
 
 import pytest
 import torch
-from slow import some_fast
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.envs import Compose, RewardSum, Transform, TransformedEnv
 from torchrl.record.loggers import CSVLogger, TensorboardLogger
@@ -95,12 +94,10 @@ class Killed(BaseException):
     pass
 
 
+@pytest.mark.fast("SplineMemoryGuide-4")
 @pytest.mark.parametrize(
     ("guide", "last"),
-    some_fast(
-        [(RandomGuide, 1), (RandomGuide, 5), (SplineMemoryGuide, 4), (SplineGuide, 4)],
-        [(SplineMemoryGuide, 4)],
-    ),
+    [(RandomGuide, 1), (RandomGuide, 5), (SplineMemoryGuide, 4), (SplineGuide, 4)],
 )
 def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last, capsys):
     frames = 16 * 8 * 5
@@ -163,6 +160,7 @@ def test_checkpoint_of_another_run_is_refused(tmp_path):
         resumed(threads=1)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     "damage",
     [
@@ -233,9 +231,9 @@ class WriteNaN(Transform):
 
 
 # At step 20 the env itself raises an error, because of the NaN; step 24 is the last of a batch.
+@pytest.mark.fast("reward-24")
 @pytest.mark.parametrize(
-    ("key", "step"),
-    some_fast([("observation", 20), ("observation", 24), ("reward", 24)], [("reward", 24)]),
+    ("key", "step"), [("observation", 20), ("observation", 24), ("reward", 24)]
 )
 def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, step):
     good = experiment(tmp_path / "good", frames=16 * 8 * 2)
@@ -254,6 +252,7 @@ def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, 
     corrected.run()
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("place", "message"),
     [
@@ -281,6 +280,7 @@ def test_nan_in_a_loss_or_a_weight_stops_the_run_and_keeps_the_checkpoint(tmp_pa
     assert not (tmp_path / "run" / "policy_last.pt").exists()
 
 
+@pytest.mark.slow
 def test_update_without_a_minibatch_may_have_no_loss(tmp_path):
     run = experiment(tmp_path / "run")
     update = run.learner.update

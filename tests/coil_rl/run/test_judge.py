@@ -9,16 +9,14 @@ from omegaconf import OmegaConf
 from coil_rl.config.assemble import trial
 from coil_rl.config.parts import (
     build_evaluation,
-    build_guides,
     build_learner,
     build_pictures,
     env_maker,
-    guide_results,
     recorded,
 )
 from coil_rl.errors import UserError
 from coil_rl.report.pictures import Picture
-from coil_rl.run.judge import evaluate_guides, judge, report_outcome
+from coil_rl.run.judge import judge, report_outcome
 from coil_rl.run.reasons import about_returns
 
 TINY = ["env.time_limit=1", "guide=[spline,random]", "run_dir=unused"]
@@ -31,27 +29,7 @@ def composed():
 
 
 def evaluated(config):
-    return guide_results(config, build_evaluation(config))
-
-
-def test_guides_of_a_sweep_are_driven_once(composed):
-    first, again = (evaluated(composed(f"method={method}")) for method in ("coil", "ppo"))
-    assert list(first) == ["guide spline", "guide random"]
-    assert all(again[driver] is result for driver, result in first.items())
-
-
-@pytest.mark.parametrize("change", ["seed=1", "degrade=delayed", "env.smoothing=0.2"])
-def test_guides_are_driven_again_after_a_change_of_guide_or_env(composed, change):
-    first, others = evaluated(composed()), evaluated(composed(change))
-    assert all(others[driver] is not result for driver, result in first.items())
-
-
-def test_given_guides_are_not_cached(composed):
-    config = composed()
-    cached = evaluated(config)
-    given = evaluate_guides(env_maker(config), build_evaluation(config), build_guides(config))
-    assert given["guide spline"] is not cached["guide spline"]
-    assert given["guide spline"].mean_reward == cached["guide spline"].mean_reward
+    return trial(config, env_maker(config)).guide_results(build_evaluation(config))
 
 
 @pytest.mark.slow
@@ -82,7 +60,8 @@ def test_evaluation_has_the_cases_and_measures_of_the_env_and_the_entries_of_its
     assert evaluation.cases == ["test_1", "test_2", "test_3"]
     assert list(evaluation.measures) == list(config.evaluation.measures)
     assert evaluation.record == {"pose": ("info", "pose")}
-    (result,) = guide_results(composed("guide=spline"), evaluation).values()
+    config = composed("guide=spline")
+    (result,) = trial(config, env_maker(config)).guide_results(evaluation).values()
     assert [episode["case"] for episode in result.episodes] == evaluation.cases
     assert len(result.histories["pose"]) == 3
 

@@ -11,8 +11,8 @@ from coil_rl.compiled import record
 from coil_rl.imitation import ForestRegressor, Imitation, LinearRegressor
 from coil_rl.learners import DQN, PPO, SAC, Anchor
 from coil_rl.run.policy_batch import (
-    PartlySampled,
-    PoliciesInTurn,
+    Acting,
+    OnRows,
     StackedPolicies,
     TracedPolicy,
     compute_constants,
@@ -47,7 +47,7 @@ def test_batch_of_policies_acts_like_each_of_them(learner):
         states = [perturbed(policy, seed) for seed in range(3)]
     rows = observations(env)
     batch = policy_batch(policy, states)
-    assert isinstance(batch, PoliciesInTurn if learner == "forest" else StackedPolicies)
+    assert isinstance(batch, OnRows if learner == "forest" else StackedPolicies)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         together = batch(rows.clone())["action"]
         for index, state in enumerate(states):
@@ -125,9 +125,11 @@ def test_rows_of_a_partly_sampled_policy_are_those_of_the_policy_to_the_bit(opti
     env = cones()
     policy = PPO(env, KEYS, **options).policy
     policy.load_state_dict(perturbed(policy, 0))
-    sampled, rows = torch.arange(15) % 3 > 0, observations(env)
+    sampled, rows = torch.arange(15) >= 5, observations(env)
+    chosen = Acting(policy, rows=slice(5), whole=True)
+    partly = OnRows([chosen, Acting(policy, sampled=True, rows=slice(5, 15), whole=True)])
     actions = []
-    for each in (policy, PartlySampled(policy, sampled)):
+    for each in (policy, partly):
         for kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
             torch.manual_seed(0)
             with torch.no_grad(), set_exploration_type(kind):

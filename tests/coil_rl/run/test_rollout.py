@@ -62,6 +62,7 @@ def learning(env, correlation, squash=True, observed="observation"):
     return ppo, Rollout(env, ppo.policy, 50, keys, noise_correlation=correlation)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 @pytest.mark.parametrize("squash", [True, False])
 def test_noise_is_correlated_over_steps_and_batches_and_each_action_has_the_policys_distribution(
@@ -87,6 +88,7 @@ def test_noise_is_correlated_over_steps_and_batches_and_each_action_has_the_poli
     torch.testing.assert_close(batch["action_log_prob"], density)
 
 
+@pytest.mark.slow
 def test_correlated_noise_goes_on_after_a_restored_state():
     env, other = worlds.cones(), worlds.cones()
     (ppo, first), (_, second) = learning(env, 0.9), learning(other, 0.9)

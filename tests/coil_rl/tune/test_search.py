@@ -70,6 +70,7 @@ def test_every_step_is_a_frame_and_frames_are_bounded(run):
     assert int(rows[-1]["guide/calls"]) >= frames[-1]
 
 
+@pytest.mark.slow
 def test_budget_that_is_too_small_for_a_generation_and_its_test_is_said(tmp_path):
     folder = tmp_path / "run"
     tuned(folder, *SLOW_SWING, "budget.frames=300")
@@ -88,6 +89,7 @@ def test_run_is_read_by_reports_with_its_curve(run):
     assert returns[-1] > returns[0]
 
 
+@pytest.mark.slow
 def test_noise_of_a_case_is_the_same_for_all_numbers(tmp_path):
     words = [*SLOW_SWING, "disturb=[observation_noise]", "disturb.observation_noise.sigma=0.3"]
     tuned(tmp_path / "run", *words, "budget.frames=3000")
@@ -96,6 +98,7 @@ def test_noise_of_a_case_is_the_same_for_all_numbers(tmp_path):
     assert own == pytest.approx(found.guide_returns["guide"])  # which acts alone in its rows
 
 
+@pytest.mark.slow
 def test_tuned_guide_is_a_guide_that_acts_as_the_policy_of_its_run(run):
     opened = open_run(run)
     evaluation = opened.trial.evaluation
@@ -122,6 +125,7 @@ def test_policy_may_be_anchored_at_a_tuned_guide(run, tmp_path):
     assert float(start["start/guide"]) > -600
 
 
+@pytest.mark.slow
 def test_interrupted_search_ends_with_the_same_files(run, tmp_path, monkeypatch):
     generation = Tuner.generation
 
@@ -138,6 +142,7 @@ def test_interrupted_search_ends_with_the_same_files(run, tmp_path, monkeypatch)
         assert (tmp_path / "run" / file).read_text() == (run / file).read_text(), file
 
 
+@pytest.mark.slow
 def test_run_that_is_made_longer_searches_on(run, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     before = rows_of(tmp_path / "run" / "metrics.csv")
@@ -169,6 +174,7 @@ def test_number_beyond_its_bounds_is_kept_where_nothing_is_better(tmp_path):
     assert json.loads((run / "delivery.json").read_text())["policy"] == "guide"
 
 
+@pytest.mark.slow
 def test_weights_of_a_rule_with_choices_are_tuned(tmp_path):
     run = tmp_path / "run"
     tuned(

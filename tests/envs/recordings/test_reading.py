@@ -262,6 +262,7 @@ def test_recording_that_is_cut_off_is_read_as_far_as_it_goes(tmp_path, whole):
     assert "cut off before its first scan" in refusal(copy(whole, tmp_path, 0.01))
 
 
+@pytest.mark.fast(1)
 @EITHER_COMPRESSION
 def test_recording_may_be_cut_off_anywhere(tmp_path, whole, compression):
     path = compression(copy(whole, tmp_path))
@@ -271,6 +272,7 @@ def test_recording_may_be_cut_off_anywhere(tmp_path, whole, compression):
         assert "cut off" in refusal(path, strict=True)
 
 
+@pytest.mark.fast(6)
 @EITHER_COMPRESSION
 @pytest.mark.parametrize("place", ["content", "length", "end"])
 @pytest.mark.parametrize("damaged", [[0], [1], [-1], [0, 1, 2]], ids=str)
@@ -359,6 +361,7 @@ def scanless(path):
     return path
 
 
+@pytest.mark.fast(1)
 @EITHER_COMPRESSION
 def test_damage_anywhere_is_found_or_harmless(tmp_path, compression):
     path = compression(drive(tmp_path / "a.mcap", scans=9, commands=True))

@@ -39,6 +39,7 @@ def test_figure_10_is_the_clipped_term_and_red_where_it_is_flat(tmp_path):
     assert "at ratios up to 0.795 for a negative advantage A, and from 1.205 on" in page
 
 
+@pytest.mark.slow
 def test_figure_19_has_the_cones_in_sight_and_nothing_else_detected(tmp_path):
     page, series = series_of(Figure19("test_3", 5.33), tmp_path)
     ends = series["", "detected"].reshape(-1, 2, 2)

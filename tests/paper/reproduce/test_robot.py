@@ -84,6 +84,7 @@ def test_another_robots_recording_is_measured_by_odometry_or_commands(tmp_path):
     assert float(integrated["lap_time"]) == pytest.approx(2 * np.pi / 0.15, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_the_last_pose_is_in_the_recording(recordings):
     state = SimulatedRobotEnv(seed=4).rollout(200, ConstantGuide(1.0))
     poses, _, _ = read_recording(recordings / "crash.mcap").odometry
@@ -181,6 +182,7 @@ def test_recorded_command_is_the_transformed_action(tmp_path):
     assert 0 < (turn_rate - advised).abs().mean() < 0.2
 
 
+@pytest.mark.slow
 def test_run_without_an_agent_is_refused(tmp_path):
     run = make_untrained_run(
         tmp_path / "guide", "method=guide", "track=generated", "track.train.count=1"

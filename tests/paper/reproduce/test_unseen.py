@@ -28,6 +28,7 @@ def drivers(page, heading, world=0):
     return {row[0]: dict(zip(columns, row, strict=True)) for row in rows}
 
 
+@pytest.mark.slow
 def test_drivers_are_the_guide_and_then_the_agents_by_reward(made):
     deterministic = drivers(made[0], "Deterministic actions")
     assert list(deterministic) == ["guide", "ppo", "coil", "coil_shuffled", "oil"]

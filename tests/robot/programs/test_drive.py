@@ -59,6 +59,7 @@ def test_topic_and_scanner_of_a_recording_are_chosen(tmp_path):
     assert "33 scans (driving 33)" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_policy_drives_with_what_it_was_trained_with(tmp_path):
     words = ["env=simulated_robot", "preset=authors", "+env.max_steering=60", "env.smoothing=0.2"]
     make_untrained_run(tmp_path / "run", "method=coil", *words)

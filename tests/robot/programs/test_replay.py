@@ -133,6 +133,7 @@ def test_topics_of_the_foxglove_layout_are_in_the_recording(done, messages):
         assert isinstance(functools.reduce(getattr, fields, messages[topic][0]), (float, bool))
 
 
+@pytest.mark.slow
 def test_same_replay_makes_the_same_bytes(done, folder):
     torch.rand(3)  # earlier draws have no effect
     replayed(folder, "runs=[coil_0,coil_1]", out="again")
@@ -142,6 +143,7 @@ def test_same_replay_makes_the_same_bytes(done, folder):
         )
 
 
+@pytest.mark.slow
 def test_each_of_several_recordings_has_a_folder(tmp_path):
     for name, scans in (("a", 3), ("b", 5)):
         drive(tmp_path / name / "drive.mcap", scans)
@@ -188,6 +190,7 @@ def test_recording_without_boundaries_is_replayed_with_a_warning(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_recording_that_is_cut_off_is_replayed_as_far_as_it_goes(tmp_path):
     whole = uncompressed(drive(tmp_path / "whole.mcap", 200)).read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 6 // 10])
@@ -253,6 +256,7 @@ def test_equal_labels_are_distinguished_by_seed_and_then_by_number():
     assert _first_repeated(["a", "b"]) is None
 
 
+@pytest.mark.fast(6)
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

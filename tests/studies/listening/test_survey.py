@@ -77,6 +77,7 @@ def test_every_state_of_every_episode_is_measured(found):
         assert (found.section[on_track] == TRACK_SECTIONS.sections[index][points]).all()
 
 
+@pytest.mark.slow
 def test_removing_an_unused_guide_costs_nothing_and_the_followed_one_the_lap(rows):
     for row in rows:
         if row["guide"] == "random":
@@ -90,6 +91,7 @@ def test_removing_an_unused_guide_costs_nothing_and_the_followed_one_the_lap(row
     assert rows[0]["lost"] > 100
 
 
+@pytest.mark.slow
 def test_advice_is_replaced_in_its_section_only():
     history = []
 
@@ -156,6 +158,7 @@ def robots(count):
     return SimulatedRobotEnv(num_envs=count, assignment="cyclic", laps=1, time_limit=20)
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(("bare", "slot"), [(cars, 1), (robots, 0)], ids=["cars", "robots"])
 def test_removal_of_a_guide_that_is_not_followed_loses_nothing(bare, slot):
     """All draws, of a random guide and of a LiDAR, are the same with and without the removal."""
