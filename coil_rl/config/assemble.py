@@ -26,7 +26,7 @@ from coil_rl.config.parts import (
     what_guides_see,
 )
 from coil_rl.config.proxies import PROXIES, distil
-from coil_rl.config.trust import make_logger
+from coil_rl.config.trust import make_logger, to_trust
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
@@ -84,6 +84,7 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         threads=config.threads,
         settings=settings(config),
         identity=identity(config),
+        trust=to_trust(config),
     )
 
 
