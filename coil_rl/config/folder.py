@@ -26,7 +26,7 @@ from coil_rl.errors import UserError, did_you_mean
 from coil_rl.files import LARGEST_NUMBERS, read_file, read_text
 from coil_rl.measures import measures_of
 from coil_rl.plain_yaml import is_part, leaves, read_yaml
-from coil_rl.run.folder import CONFIG, check_same, is_begun
+from coil_rl.run.folder import CODE, CODE_BEFORE, CONFIG, check_same, is_begun
 
 PREFIX = "pretrained:"
 CHECKSUMS, CARD = "checksums.json", "card.md"
@@ -77,6 +77,7 @@ def read_config(
                 f"{key}={folder} was made in Python from parts, which no file names; "
                 "make the same coil_rl.Run there, and call its methods"
             )
+        values = {key: value for key, value in values.items() if key not in (CODE, CODE_BEFORE)}
         logger = shipped_logger(values.get("logger"))
         if logger is not None or not goes_on:
             values["logger"] = None
