@@ -58,8 +58,9 @@ class Layer(nn.Module):
     def __init__(self, each: Sequence[nn.Linear], *, biased: bool = True) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.stack([layer.weight.detach().T for layer in each]))
-        bias = torch.stack([layer.bias.detach()[None] for layer in each])
-        self.register_parameter("bias", nn.Parameter(bias) if biased else None)
+        self.bias: nn.Parameter | None = None
+        if biased:
+            self.bias = nn.Parameter(torch.stack([layer.bias.detach()[None] for layer in each]))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [critics, N, inputs] to [critics, N, outputs]."""
