@@ -74,7 +74,7 @@ def train(
     if isinstance(env, Run):
         _refuse_others(guide, method, seed, folder, tune, overrides)
         return env.train(frames)
-    folder = Path(folder).expanduser() if folder is not None else _new_folder()
+    folder = _new_folder() if folder is None else Path(folder).expanduser()
     run = prepare(
         env,
         guide=guide,
@@ -129,6 +129,7 @@ def prepare(
     Raises:
         UserError: for a mistake in an argument.
     """
+    folder = Path(folder).absolute()
     given = named(env, guide, str(folder))
     words = list(given.words)
     words.append(f"method={method or method_for(guide)}")
