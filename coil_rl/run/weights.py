@@ -1,9 +1,11 @@
 """Putting the weights of a file into a policy."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from coil_rl.errors import UserError
 from coil_rl.run import checkpoint
@@ -25,6 +27,15 @@ def put_weights(policy: TensorDictModuleBase, state: Any, path: Path) -> None:
     Raises:
         UserError: if they do not fit the policy, or are not finite.
     """
+    own = policy.state_dict()
+    for name, value in state.items() if isinstance(state, Mapping) else ():
+        known = own.get(name)
+        both = isinstance(value, Tensor) and isinstance(known, Tensor)
+        if both and value.dtype != known.dtype:  # torch would make another policy of them
+            raise UserError(
+                f"{path} holds {name} as {value.dtype}, not {known.dtype}, so that it is no policy "
+                "of this run; train again or use another"
+            )
     try:
         policy.load_state_dict(state)
     except UserError as error:
