@@ -87,10 +87,10 @@ def check(config: DictConfig) -> None:
         _check_own_run(config)
         _check_delivery(config, has_agent=has_agent)
     make_env = parts.env_maker(config)
-    cases = _count_cases(config)
+    cases = len(parts.build_evaluation(config).cases)
     if trains:
         check_passive(config, make_env)
-    if not _is_of_run(config):
+    if trains or OmegaConf.select(config, "run") is None:  # an evaluated run has its own env
         recorded = parts.recorded(parts.build_pictures(config))
         _check_env(config, make_env, cases, recorded.values())
     build_all(config.evaluation.advice, "evaluation.advice")
@@ -105,21 +105,6 @@ def check(config: DictConfig) -> None:
         if config.method.transforms:
             for advice in config.evaluation.advice:
                 _check_cases(cases, partial(make_env, cases, TEST, advice))
-
-
-def _is_of_run(config: DictConfig) -> bool:
-    """Return whether a configuration is of the evaluation of a run, which has its own env."""
-    return (
-        OmegaConf.get_type(config) is not TrainConfig
-        and OmegaConf.select(config, "run") is not None
-    )
-
-
-def _count_cases(config: DictConfig) -> int:
-    """Return the number of cases of an evaluation; 0 if they are the tracks of a run."""
-    if _is_of_run(config) and OmegaConf.is_dict(config.evaluation.cases):
-        return 0
-    return len(parts.build_evaluation(config).cases)
 
 
 def _check_kind(config: DictConfig) -> None:
@@ -215,7 +200,7 @@ def _check_guides(
             )
         return {}
     guides = parts.build_guides(config)
-    demonstrations = parts.demonstrations(config)
+    demonstrations = parts.of_guides(config, "demonstrates")
     for name, guide in guides.items():
         its_env = make_env.bare(1, TRAIN, None) if name in demonstrations else env
         check_guide_in_env(guide, its_env, f"guide.{name}")

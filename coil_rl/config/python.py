@@ -74,7 +74,7 @@ def train(
     if isinstance(env, Run):
         _refuse_others(guide, method, seed, folder, tune, overrides)
         return env.train(frames)
-    folder = _new_folder() if folder is None else Path(folder).expanduser()
+    folder = Path(folder).expanduser() if folder is not None else new_folder("train")
     run = prepare(
         env,
         guide=guide,
@@ -202,9 +202,10 @@ def composed(given: Named, folder: str | Path) -> DictConfig:
     return config
 
 
-def _new_folder() -> Path:
+def new_folder(program: str) -> Path:
+    """Return a new folder in the outputs of a program."""
     now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f")
-    return Path("outputs", "train", f"{now}_{os.getpid()}")
+    return Path("outputs", program, f"{now}_{os.getpid()}")
 
 
 def _shipped(group: str) -> set[str]:

@@ -5,10 +5,13 @@ import io
 import pickle
 import zipfile
 from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from coil_rl.errors import UserError
 from coil_rl.files import folder_to_disk, read_file, whole_file
@@ -62,6 +65,36 @@ def load(path: Path, device: str = "cpu") -> Any:
         raise UserError(
             f"{path} is damaged ({type(error).__name__}); train again or use another"
         ) from error
+
+
+def put_weights(policy: TensorDictModuleBase, state: Any, path: Path) -> None:
+    """Put the weights that were read from a file into a policy.
+
+    Raises:
+        UserError: if they do not fit the policy, or are not finite.
+    """
+    own = policy.state_dict()
+    for name, value in state.items() if isinstance(state, Mapping) else ():
+        known = own.get(name)
+        both = isinstance(value, Tensor) and isinstance(known, Tensor)
+        if both and value.dtype != known.dtype:  # torch would make another policy of them
+            raise UserError(
+                f"{path} holds {name} as {value.dtype}, not {known.dtype}, so that it is no policy "
+                "of this run; train again or use another"
+            )
+    try:
+        policy.load_state_dict(state)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} does not fit the networks in {path.parent / 'config.yaml'}; one of them was "
+            "changed after the run"
+        ) from error
+    if not all(parameter.isfinite().all() for parameter in policy.parameters()):
+        raise UserError(
+            f"{path} holds weights that are NaN or infinite; train again or use another"
+        )
 
 
 def save_newest(state: Any, folder: Path) -> None:

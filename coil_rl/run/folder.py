@@ -59,20 +59,26 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
         ) from None
 
 
-def begin(folder: Path, saved: Mapping[str, Any], command: Sequence[str] = ()) -> None:
+def begin(
+    folder: Path,
+    saved: Mapping[str, Any],
+    command: Sequence[str] = (),
+    trust: Sequence[str] = (),
+) -> None:
     """Write the versions, the configuration and the command of a new run.
 
     Args:
         saved: the configuration, plain values only; written as `config.yaml`.
         command: what was typed; written as `command.txt`, if there is any.
+        trust: packages that a command which goes on with the run must trust.
 
     Raises:
         UserError: if there is a run already.
     """
     if (folder / CONFIG).exists():
         raise UserError(
-            f"{folder} already holds a run; resume it with {resume_command(folder)}, or choose "
-            "another folder with hydra.run.dir=FOLDER"
+            f"{folder} already holds a run; resume it with {resume_command(folder, trust)}, or "
+            "choose another folder with hydra.run.dir=FOLDER"
         )
     record.VERSIONS.write(folder, versions())
     if command:

@@ -48,12 +48,10 @@ from coil_rl.run.folder import (
 )
 from coil_rl.run.guide_returns import guide_returns
 from coil_rl.run.judge import Trial, judge, report_outcome
-from coil_rl.run.next_step import next_step
 from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, try_out
-from coil_rl.run.reasons import SENTENCES, handed_over, start_test
+from coil_rl.run.reasons import SENTENCES, handed_over, next_step, start_test
 from coil_rl.run.stopping import resume_command
 from coil_rl.run.training import training_of
-from coil_rl.run.weights import put_weights
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -119,6 +117,7 @@ class Run:
             `method.needs_guide` and `evaluation.measures` for reports.
         identity: values on which the numbers depend, by name; a resumed run must have the same.
         command: what was typed to make the run.
+        trust: packages that a command which goes on with it must trust.
         code: returns the SHA-256 of each file of the user that it depends on, by module.
 
     Example:
@@ -151,6 +150,7 @@ class Run:
     settings: Mapping[str, Any] = field(default_factory=dict)
     identity: Mapping[str, Any] = field(default_factory=dict)
     command: Sequence[str] = ()
+    trust: Sequence[str] = ()
     code: Callable[[], Mapping[str, str]] = dict
 
     def __post_init__(self) -> None:
@@ -169,6 +169,11 @@ class Run:
     def has_agent(self) -> bool:
         """Whether the run has a policy, and not only a guide that acts alone."""
         return self.make_learner is not None
+
+    @property
+    def resume_command(self) -> str:
+        """The command that continues the run, as a shell reads it."""
+        return resume_command(self.folder, self.trust)
 
     def weights(self, which: str) -> Path:
         """Return the file of a policy, "handed_over" or "last".
@@ -287,7 +292,8 @@ class Run:
     def begin(self) -> None:
         """Write the configuration of a new run; a `UserError` if the folder holds one already."""
         code = dict(self.code())
-        begin(self.folder, {**self.settings, **({CODE: code} if code else {})}, self.command)
+        settings = {**self.settings, **({CODE: code} if code else {})}
+        begin(self.folder, settings, self.command, self.trust)
 
     def lengthen(self, frames: int) -> None:
         """Set a new length, before the run goes on.
@@ -383,20 +389,20 @@ class Run:
             judge(self._trial_with_reasons(), policy, self.folder, self.seed, drivers)
             reward = report_outcome(self.folder)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"continue with: {resume_command(self.folder)}") from None
+            raise KeyboardInterrupt(f"continue with: {self.resume_command}") from None
         except ValueError as error:  # of env or controller, before or after the training
             if isinstance(error, UserError) or not is_outside(error):
                 raise
             raise UserError(
                 f"{error}; what is finished is kept: correct the cause and continue with "
-                f"{resume_command(self.folder)}"
+                f"{self.resume_command}"
             ) from error
         except OSError as error:
             if error.errno not in NO_SPACE:
                 raise
             raise UserError(
                 f"{error.filename or self.folder} cannot be written ({error.strerror}); make room, "
-                f"and continue with {resume_command(self.folder)}"
+                f"and continue with {self.resume_command}"
             ) from error
         self._say_next()
         return reward
@@ -405,7 +411,7 @@ class Run:
         """Print the command that usually follows a training."""
         if self.has_agent:
             rows = record.METRICS.need(self.folder)
-            say(next_step(self.folder, self.budget.frames, rows))
+            say(next_step(self.folder, self.budget.frames, rows, self.trust))
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
         """Train, draw the learning curve and return the policy to evaluate."""
@@ -496,7 +502,7 @@ class Run:
         guide = guide_of(state, env)
         if guide is not None:
             return guide
-        put_weights(policy, state, path)
+        checkpoint.put_weights(policy, state, path)
         return policy
 
     def _trial_with_reasons(self) -> Trial:

@@ -21,7 +21,12 @@ TINY = ["budget.num_envs=4", "budget.steps=16", "evaluation.cases=2", "logger=no
 TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
 TINY += ["checkpoint_every=1"]
 ON_POLICY = ["learner.minibatches=2"]
-REPLAY = ["learner=sac", "learner.starts=16", "learner.ratio=0.25", "learner.batch_size=16"]
+REPLAY = [
+    "learner=sac",
+    "learner.starts=16",
+    "learner.updates_per_step=0.015625",
+    "learner.batch_size=16",
+]
 
 
 class Reactor(gymnasium.Env):

@@ -16,7 +16,6 @@ from tensordict.nn import TensorDictModule
 from coil_rl.errors import UserError
 from coil_rl.files import remove_unfinished
 from coil_rl.run import checkpoint
-from coil_rl.run.weights import put_weights
 
 
 def test_saved_state_is_loaded_unchanged(tmp_path):
@@ -226,7 +225,7 @@ def test_kill_at_any_step_of_a_save_leaves_a_checkpoint(tmp_path, monkeypatch):
 @pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.float64])
 def test_weights_of_another_type_are_refused(dtype, tmp_path):
     policy = TensorDictModule(torch.nn.Linear(2, 1), in_keys=["x"], out_keys=["y"])
-    put_weights(policy, policy.state_dict(), tmp_path)
+    checkpoint.put_weights(policy, policy.state_dict(), tmp_path)
     state = {name: value.to(dtype) for name, value in policy.state_dict().items()}
     with pytest.raises(UserError, match=rf"weight as {dtype}, not torch.float32"):
-        put_weights(policy, state, tmp_path)
+        checkpoint.put_weights(policy, state, tmp_path)
