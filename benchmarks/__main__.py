@@ -40,7 +40,7 @@ from benchmarks.training import (
     measure_shares,
     measure_training,
 )
-from coil_rl.config.check import check_parts
+from coil_rl.config.check import check
 from coil_rl.config.messages import sentence
 from coil_rl.errors import UserError
 from coil_rl.programs.app import program
@@ -182,7 +182,7 @@ def check_configuration(args: Namespace) -> None:
                 f"{override} has no effect: the methods ppo and coil are compared; leave it out"
             )
     try:
-        check_parts(train_config(args, "coil"))
+        check(train_config(args, "coil"))
     except HydraException as error:
         raise UserError(sentence(error)) from error
 

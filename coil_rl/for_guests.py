@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from coil_rl.lazy import lazy_names as lazy_names
 
 if TYPE_CHECKING:
-    from coil_rl.config.check import make_folder as make_folder
     from coil_rl.config.fits import check_guide_in_env as check_guide_in_env
     from coil_rl.config.nodes import check_arguments as check_arguments
     from coil_rl.config.parts import build_guides as build_guides

@@ -4,17 +4,15 @@ They hold for the parts of this project, and can be used for those of any other 
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Iterable
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
-from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs, step_mdp
+from torch import nn
+from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs
 
-from coil_rl.foreign.batch import optional_entries
-from coil_rl.foreign.gymnasium_env import GymnasiumEnv
-from coil_rl.foreign.trial import AskedGuide, difference, episodes
+from coil_rl.foreign.trial import Finding, Recorded, Trial
 from coil_rl.transforms import GuideActions, set_progress
 from coil_rl.transforms.action_space import ActionSpace, nested_key, space_of
 from coil_rl.transforms.guide_actions import unfit_action
@@ -36,84 +34,19 @@ def check_env(env: EnvBase, steps: int = 10) -> None:
         AssertionError: if data does not fit the specs, by `check_env_specs`.
         ValueError: for the first other property that does not hold; it names the entry.
     """
-    base = env.base_env if isinstance(env, TransformedEnv) else env
     set_progress(env.train(), 0.0)
     check_env_specs(env)
-    _check_rollouts(env, steps)
-    if isinstance(base, GymnasiumEnv):
-        _look_at_bounds(base, steps)
-    data = env.rand_action(env.reset())
-    copy = data.clone()
-    env.step(data)
-    changed = difference(copy, data)
-    if changed is not None:
-        raise ValueError(f"a step changed {changed} of the data before it; write new tensors")
-    if env.batch_size and env.batch_size[0] > 1:
-        _check_partial_reset(base)
+    trial = Trial(env, steps)
+    trial.ask_env()
+    _raise_or_warn(trial.findings)
 
 
-def _check_rollouts(env: EnvBase, steps: int) -> None:
-    """Compare two rollouts with the same seed."""
-    rollout, again = episodes(env, steps)
-    optional = {part for key in optional_entries(env) for part in (key, ("next", *key))}
-    for key, value in rollout.items(True, True):
-        numbers = value.nan_to_num() if key in optional else value
-        if value.is_floating_point() and not numbers.isfinite().all():
-            raise ValueError(f"{key} holds a number that is not finite")
-    changed = difference(rollout, again)
-    if changed is not None:
-        raise ValueError(
-            f"the same seed gives other values of {changed}; "
-            "draw random numbers from a seeded generator"
-        )
-
-
-def _look_at_bounds(env: GymnasiumEnv, steps: int) -> None:
-    """Warn of each entry of the observation with a number outside of its space."""
-    rollout = env.rollout(steps, break_when_any_done=False)
-    for entry in env.codec.entries:
-        parts = [rollout[entry.key], rollout["next", *entry.key]]
-        values = torch.cat([part.reshape(-1, *entry.given) for part in parts])
-        found = entry.outside(values.cpu().numpy())
-        if found is not None:
-            index, value, low, high = found
-            warnings.warn(
-                f"number {index} of {entry.title} is {value:g}, but the observation_space of "
-                f"{entry.id} has it from {low:g} to {high:g}; correct its bounds, or the number",
-                stacklevel=3,
-            )
-
-
-def _check_partial_reset(env: EnvBase) -> None:
-    """Compare a step after the reset of row 0 with the same step without it.
-
-    An env that draws random numbers in its steps may differ anyway: so the step is compared only if
-    another seed makes no difference.
-    """
-
-    def leave_alone(present: TensorDictBase) -> TensorDictBase:
-        return present
-
-    def seed(present: TensorDictBase) -> TensorDictBase:
-        env.set_seed(1)
-        return present
-
-    def reset(present: TensorDictBase) -> TensorDictBase:
-        mask = torch.zeros_like(present["done"])
-        mask[0] = True
-        return env.reset(present.set("_reset", mask))
-
-    def second_step(change: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:
-        env.set_seed(0)
-        torch.manual_seed(0)
-        present = change(step_mdp(env.step(env.rand_action(env.reset()))))
-        torch.manual_seed(0)  # of the action
-        return env.step(env.rand_action(present))["next"]
-
-    plain, seeded, after_reset = second_step(leave_alone), second_step(seed), second_step(reset)
-    changed = difference(plain[1:], after_reset[1:])
-    if difference(plain, seeded) is None and changed is not None:
-        raise ValueError(f"resetting row 0 changed {changed} of other rows in the next step")
+def _raise_or_warn(findings: Iterable[Finding]) -> None:
+    """Raise a `ValueError` for the first finding; bounds that are left are a warning."""
+    for finding in findings:
+        if finding.kind != "bounds":
+            raise ValueError(finding.text)
+        warnings.warn(finding.text, stacklevel=3)
 
 
 def check_guide(
@@ -166,57 +99,15 @@ def _check_history(
     guide: TensorDictModuleBase, env: EnvBase, action_key: NestedKey, tolerance: float, steps: int
 ) -> None:
     """Check what the advice of a guide depends on over the steps of an episode."""
-    recorded = _recorded_rollout(env, steps)
-    asked = AskedGuide(guide, env, recorded, action_key)
-    space = space_of(asked.env.base_env, action_key)
-    middle = recorded.shape[1] // 2
+    trial = Trial(env, steps)
+    recorded = trial.recorded()
+    space = space_of(Recorded(env, recorded), action_key)
     hook = guide.register_forward_hook(_CheckedAction(space, action_key))
     try:
-        first, again, fresh = asked.advice(), asked.advice(), asked.advice(begin=middle)
-        try:
-            interrupted = asked.advice(reset_at=middle)
-        except (IndexError, RuntimeError) as error:
-            raise ValueError(
-                "the guide fails after a single row was reset, "
-                f"so it may remember in itself, not in entries: {error}"
-            ) from error
+        trial.ask_guide(guide, recorded, action_key, tolerance)
     finally:
         hook.remove()
-
-    def equal(one: Tensor, other: Tensor) -> bool:
-        return torch.allclose(one, other, rtol=0, atol=tolerance)
-
-    if not torch.equal(first, again):
-        raise ValueError(
-            "the guide's action is another one for the same history; "
-            "it draws, or remembers earlier episodes"
-        )
-    if not equal(interrupted[1:], first[1:]):
-        raise ValueError("the guide's action for a row depends on the reset of another row")
-    if not equal(interrupted[0, middle:], fresh[0]):
-        raise ValueError(
-            "the guide's action after the reset of a row depends on what was before it"
-        )
-
-
-def _recorded_rollout(env: EnvBase, steps: int) -> TensorDictBase:
-    """Return data [B, T] of random actions, with at least two rows.
-
-    For an env without batch dimension these are two episodes.
-    """
-    with torch.no_grad():
-        if env.batch_size:
-            recorded: TensorDictBase = env.rollout(steps, break_when_any_done=False)
-        else:
-            episodes = [env.rollout(steps, break_when_any_done=False) for _ in range(2)]
-            shortest = min(map(len, episodes))
-            recorded = TensorDict.stack([episode[:shortest] for episode in episodes])
-    if len(recorded.batch_size) != 2 or len(recorded) < 2:
-        raise ValueError(
-            "check_guide needs an env with one batch dimension of at least 2 rows, not "
-            f"{list(env.batch_size)}; make it with more, such as GymnasiumEnv(ID, num_envs=2)"
-        )
-    return recorded
+    _raise_or_warn(trial.findings)
 
 
 class _CheckedAction:

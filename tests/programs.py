@@ -15,7 +15,6 @@ from hydra._internal.hydra import Hydra
 import coil_rl.conf
 import coil_robot.conf
 import coil_studies.conf
-from coil_rl.run.stopping import remember_trust
 
 ROOT = Path(__file__).parents[1]
 CONF = Path(coil_rl.conf.__path__[0])  # of the library that is tested, which may be a wheel
@@ -142,6 +141,5 @@ def called(name, *arguments, cwd=".", code=0):
     finally:
         sys.argv = given
         logging.getLogger().handlers.clear()
-        remember_trust([])  # as in the next process
     assert code is None or ended == code, error.getvalue()
     return subprocess.CompletedProcess(sys.argv, ended, out.getvalue(), error.getvalue())

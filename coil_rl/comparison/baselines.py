@@ -26,7 +26,6 @@ from coil_rl.run import checkpoint
 from coil_rl.run.curve import POLICIES
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.parts import TEST, EnvMaker
-from coil_rl.run.weights import put_weights
 from coil_rl.transforms.action_space import ActionSpace
 
 FILE = "baselines.csv"
@@ -137,7 +136,7 @@ def measure_network(folder: Path, run: Path) -> None:
     opened = assemble(read_config(run, "run"), run)
     env = opened.make_env(len(opened.trial.evaluation.cases), TEST)
     policy = opened.make_learner(env).policy  # type: ignore[misc]
-    put_weights(policy, checkpoint.load(first), first)
+    checkpoint.put_weights(policy, checkpoint.load(first), first)
     write_csv(_rows(NETWORK, opened.trial.evaluation.run(env, policy)), file)
 
 

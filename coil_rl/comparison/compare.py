@@ -2,13 +2,11 @@
 
 import json
 import math
-import os
 import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +38,9 @@ from coil_rl.comparison.page import command_of, delayed_sentence, draw, page_of
 from coil_rl.comparison.same import identity_of, keep_plan, known_plan
 from coil_rl.comparison.timing import Plan
 from coil_rl.comparison.verdict import NOTHING, Verdict, verdict
-from coil_rl.config.check import check_parts
+from coil_rl.config.check import check
 from coil_rl.config.parts import env_maker
-from coil_rl.config.python import Named, composed, named
+from coil_rl.config.python import Named, composed, named, new_folder
 from coil_rl.config.trust import trust_own
 from coil_rl.config.unread import check_read
 from coil_rl.errors import UserError
@@ -109,7 +107,7 @@ def compare(
         >>> found = coil_rl.compare("Pendulum-v1", guide="swing_up")  # doctest: +SKIP
         >>> print(found.page)  # doctest: +SKIP
     """
-    place = new_folder() if folder is None else Path(folder).expanduser()
+    place = new_folder("compare") if folder is None else Path(folder).expanduser()
     given = named(env, guide, str(place))
     words = [*given.words, *overrides]
     if frames is not None:
@@ -117,12 +115,6 @@ def compare(
     if tune is not None:
         given.nodes["tune"] = dict(tune)
     return Comparison(Named(words, given.nodes), place, minutes=minutes, seed=seed).run()
-
-
-def new_folder() -> Path:
-    """Return the folder of a new comparison."""
-    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f")
-    return Path("outputs", "compare", f"{now}_{os.getpid()}")
 
 
 class Comparison:
@@ -213,11 +205,11 @@ class Comparison:
                 "or guide=controller guide.controller.of=MODULE:NAME"
             )
         trust_own(anchored)
-        check_parts(anchored)
+        check(anchored)
         # What this arm does not read, none of them reads: it has a learner, advice and tests.
         check_read(anchored, self.given.words)
         if self.tunes:
-            check_parts(self._config(TUNE))
+            check(self._config(TUNE))
         return self._config(PPO)
 
     def _config(

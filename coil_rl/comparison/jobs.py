@@ -1,11 +1,10 @@
 """The trainings of a comparison, one after the other; one that fails leaves the others alone."""
 
-import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from coil_rl.config.messages import is_no_bug, sentence
+from coil_rl.config.messages import reason_of
 from coil_rl.config.python import Named, prepared
 from coil_rl.files import FAILED_JOBS
 from coil_rl.learners.learner import Callback, Learner
@@ -48,10 +47,7 @@ def _run_job(job: Named, folder: Path, bar: Any) -> str | None:
             _show(run, bar)
             run.train()
     except Exception as error:
-        reason = sentence(error)
-        if not is_no_bug(error):
-            traceback.print_exception(error)
-            reason = f"{type(error).__name__}: {reason}"
+        reason = reason_of(error)
         say(f"coil-compare: {folder.name} failed: {reason}; the others go on", error=True)
         return reason
     return None

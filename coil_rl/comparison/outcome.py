@@ -14,8 +14,7 @@ from coil_rl.comparison.baselines import NAME, action_words, read_baselines
 from coil_rl.comparison.entry import ZERO_ACTIONS, Entry
 from coil_rl.report.curves import points
 from coil_rl.report.runs import RETURN, Run, read_runs
-from coil_rl.run.next_step import still_rising
-from coil_rl.run.reasons import POLICIES
+from coil_rl.run.reasons import POLICIES, still_rising
 from coil_rl.tune.run import TUNED
 
 

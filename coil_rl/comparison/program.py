@@ -47,8 +47,8 @@ def compare(arguments: Sequence[str]) -> None:
         raise UserError(f"seed={own['seed']} must be a whole number")
     compose_train([*words, "method=coil_anchored", "run_dir=unused"])  # mistakes, in a moment
     # They import PyTorch, which takes seconds.
-    from coil_rl.comparison.compare import Comparison, new_folder
-    from coil_rl.config.python import Named
+    from coil_rl.comparison.compare import Comparison
+    from coil_rl.config.python import Named, new_folder
 
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     nodes: dict[str, Any] = {}
@@ -56,7 +56,7 @@ def compare(arguments: Sequence[str]) -> None:
         nodes["tune"] = _value("tune", own["tune"])
     trust = _value("trust", next((w[6:] for w in words if w.startswith("trust=")), "[]"))
     trust_packages(trust)
-    place = new_folder() if folder is None else folder
+    place = new_folder("compare") if folder is None else folder
     others = [argument for argument in arguments if not argument.startswith("folder=")]
     command = shlex.join(["coil-compare", *others, f"folder={place}"])
     given = Named(words, nodes)

@@ -18,15 +18,15 @@ from coil_rl.config.parts import (
     build_guides,
     build_learner,
     build_pictures,
-    demonstrations,
     driving_guides,
     env_maker,
+    of_guides,
     recorded,
     trains_guides,
-    what_guides_see,
 )
 from coil_rl.config.proxies import PROXIES, distil
-from coil_rl.config.trust import make_logger
+from coil_rl.config.source import code_of_run
+from coil_rl.config.trust import make_logger, to_trust
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
@@ -84,6 +84,8 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         threads=config.threads,
         settings=settings(config),
         identity=identity(config),
+        trust=to_trust(config),
+        code=partial(code_of_run, config),
     )
 
 
@@ -110,7 +112,7 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
     has_agent = config.method.observes is not None
     notes = [
         f"guide.{name} sees: {what}; it may know more than the agent."
-        for name, what in what_guides_see(config).items()
+        for name, what in of_guides(config, "sees").items()
     ]
     if has_agent:
         tested = OmegaConf.select(config, "delivery") == "tested"
@@ -124,7 +126,7 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         together=has_agent
         and not config.method.run
         and advises_only(config)
-        and not demonstrations(config),
+        and not of_guides(config, "demonstrates"),
         advice=list(config.evaluation.advice) if advises(config) else [],
         repeats=config.evaluation.repeats,
         compiled=config.compile,

@@ -1,19 +1,17 @@
 """Check of a configuration before a run starts: ranges, and one small build of every part.
 
-A mistake is found in seconds. Nothing is written except the folder of the run, as the last step.
+A mistake is found in seconds.
 """
 
-import errno
 import math
-import os
-import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from coil_rl.config import parts
@@ -22,10 +20,8 @@ from coil_rl.config.fits import (
     check_guide_in_env,
     check_measures,
     check_number,
-    dotted,
 )
 from coil_rl.config.folder import run_folder
-from coil_rl.config.messages import sentence
 from coil_rl.config.nodes import build, build_all, check_node
 from coil_rl.config.own_run import own_run
 from coil_rl.config.passive import check_passive, passive
@@ -39,15 +35,13 @@ from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import check_logger
 from coil_rl.config.values import check_values
 from coil_rl.errors import UserError, did_you_mean
-from coil_rl.foreign.batch import SeededRows
-from coil_rl.foreign.trial import Tried, tried, unrepeated
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.output import say
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
 from coil_rl.run.folder import HANDED_OVER, weights_file
-from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
+from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, transformed, try_out
 from coil_rl.run.training import INIT
 from coil_rl.transforms.action_space import ChoicesError, nested_key
 
@@ -79,16 +73,11 @@ STEPS_SAID, POINTS_SAID = 100, 8
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in a configuration.
+    """Check the configuration of a program that acts or trains; nothing is written.
 
-    It is of a program that acts or trains.
+    Raises:
+        UserError: for the first mistake.
     """
-    check_parts(config)
-    make_folder(Path(config.run_dir))
-
-
-def check_parts(config: DictConfig) -> None:
-    """Do the checks of `check` without making the folder of the run."""
     check_values(config)
     trains = OmegaConf.get_type(config) is TrainConfig
     has_agent = trains and config.method.observes is not None
@@ -98,10 +87,10 @@ def check_parts(config: DictConfig) -> None:
         _check_own_run(config)
         _check_delivery(config, has_agent=has_agent)
     make_env = parts.env_maker(config)
-    cases = _count_cases(config)
+    cases = len(parts.build_evaluation(config).cases)
     if trains:
         check_passive(config, make_env)
-    if not _is_of_run(config):
+    if trains or OmegaConf.select(config, "run") is None:  # an evaluated run has its own env
         recorded = parts.recorded(parts.build_pictures(config))
         _check_env(config, make_env, cases, recorded.values())
     build_all(config.evaluation.advice, "evaluation.advice")
@@ -116,21 +105,6 @@ def check_parts(config: DictConfig) -> None:
         if config.method.transforms:
             for advice in config.evaluation.advice:
                 _check_cases(cases, partial(make_env, cases, TEST, advice))
-
-
-def _is_of_run(config: DictConfig) -> bool:
-    """Return whether a configuration is of the evaluation of a run, which has its own env."""
-    return (
-        OmegaConf.get_type(config) is not TrainConfig
-        and OmegaConf.select(config, "run") is not None
-    )
-
-
-def _count_cases(config: DictConfig) -> int:
-    """Return the number of cases of an evaluation; 0 if they are the tracks of a run."""
-    if _is_of_run(config) and OmegaConf.is_dict(config.evaluation.cases):
-        return 0
-    return len(parts.build_evaluation(config).cases)
 
 
 def _check_kind(config: DictConfig) -> None:
@@ -203,11 +177,20 @@ def _check_env(
             "it; choose another env"
         )
     check_node(config.env, "env")
-    env = make_env.bare(1, TEST, None)
+    env = make_env.bare(SOME_ROWS, TEST, None)
     check_measures(config.evaluation.measures, env)
     for key in recorded:
         check_entry(env, key, "evaluation.pictures")
-    _check_repeats(env)
+    guides = _check_guides(config, make_env, cases, env)
+    trial = try_out(env, guides)
+    if OmegaConf.get_type(config) is TrainConfig:
+        _say_cost_of_curve(config, trial.seconds)
+
+
+def _check_guides(
+    config: DictConfig, make_env: EnvMaker, cases: int, env: EnvBase
+) -> dict[str, TensorDictModuleBase]:
+    """Check that the guides can act in the env, and return them."""
     advises = config.method.needs_guide or "advice" in config.method.transforms
     if not config.guide and not advises:
         if config.degrade:
@@ -215,71 +198,43 @@ def _check_env(
                 f"degrade=[{','.join(map(str, config.degrade))}] has no effect, because there is "
                 "no guide whose advice could be degraded; leave it out, or give guide=NAME"
             )
-        return
+        return {}
     guides = parts.build_guides(config)
-    demonstrations = parts.demonstrations(config)
+    demonstrations = parts.of_guides(config, "demonstrates")
     for name, guide in guides.items():
         its_env = make_env.bare(1, TRAIN, None) if name in demonstrations else env
         check_guide_in_env(guide, its_env, f"guide.{name}")
-        found = tried(guide, its_env)
-        _check_draws(found)
-        if OmegaConf.get_type(config) is TrainConfig:
-            _say_cost_of_curve(config, found)
     build_all(config.degrade, "degrade")
     if parts.build_disturbances(config, TEST):
         transformed(env, make_env.disturb(TEST), "disturb")
     if config.degrade:
         _check_cases(cases, partial(make_env.guided, cases, TEST, guides))
+    return guides
 
 
-def _check_repeats(env: EnvBase) -> None:
-    """Warn if an env does not obey its seed.
-
-    The run is right all the same, but its cases differ from one evaluation to the next.
-    """
-    if not isinstance(env, SeededRows):
-        return
-    key = unrepeated(env)
-    if key is not None:
-        warnings.warn(
-            f"the env does not obey its seed: {dotted(key)} differs when an episode is repeated, "
-            "so the cases of an evaluation are not the same for each policy; draw random numbers "
-            "from self.np_random, or give env.fresh=true if a reset leaves something of the past",
-            stacklevel=2,
-        )
-
-
-def _check_draws(found: Tried) -> None:
-    """Warn if a controller acts by random numbers that no seed of the run reaches."""
-    if found.unseeded:
-        warnings.warn(
-            f"the controller {found.title} gives other actions for the same observations from the "
-            "same start: it draws random numbers that no seed of the run reaches, from np.random, "
-            "random or a generator without a seed, so the run cannot be repeated or resumed to the "
-            "bit; give it a generator of its own with a seed, such as np.random.default_rng(0)",
-            stacklevel=2,
-        )
-
-
-def _say_cost_of_curve(config: DictConfig, found: Tried) -> None:
+def _say_cost_of_curve(config: DictConfig, seconds: Mapping[str, float]) -> None:
     """Say how much time a slow controller takes in the evaluation curve, and how to shorten it.
 
     The number of policies in it is left to the user: if it followed a measured time, the same
     command would make another run on a busier machine.
+
+    Args:
+        seconds: of an action, by controller.
     """
     curve = config.evaluation.curve
     asks = config.method.observes is not None and "advice" in config.method.transforms
     sets = 1 if config.delivery == "tested" else len(curve.cases)
     episodes = (curve.points + 1) * curve.num_envs * sets
-    minutes = STEPS_SAID * episodes * found.seconds / 60
-    if asks and curve.points >= POINTS_SAID and 1 <= minutes < math.inf:
-        say(
-            f"an action of the controller {found.title} takes {1000 * found.seconds:.1f} ms, so "
-            f"the evaluation curve takes {minutes:.0f} min for each {STEPS_SAID} steps of its "
-            f"{episodes} episodes ({curve.points + 1} policies); "
-            f"evaluation.curve.points={curve.points // 4} keeps fewer policies",
-            error=True,
-        )
+    for title, each in seconds.items():
+        minutes = STEPS_SAID * episodes * each / 60
+        if asks and curve.points >= POINTS_SAID and 1 <= minutes < math.inf:
+            say(
+                f"an action of the controller {title} takes {1000 * each:.1f} ms, so the "
+                f"evaluation curve takes {minutes:.0f} min for each {STEPS_SAID} steps of its "
+                f"{episodes} episodes ({curve.points + 1} policies); "
+                f"evaluation.curve.points={curve.points // 4} keeps fewer policies",
+                error=True,
+            )
 
 
 def _check_cases(cases: int, make: Callable[[], Any]) -> None:
@@ -406,7 +361,7 @@ def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
     """Raise a `UserError` for the first mistake in the training of the proxies of guides."""
     for name in guides:
         try:
-            check_parts(proxy_config(config, name))
+            check(proxy_config(config, name))
         except UserError as error:
             raise UserError(f"proxy of guide.{name}: {error}") from error
 
@@ -420,16 +375,6 @@ def _check_frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> None:
             f"guides take {taken} frames; give at least "
             f"{taken + budget.num_envs * budget.steps}, or a smaller proxy.budget.frames"
         )
-
-
-def make_folder(folder: Path) -> None:
-    """Make the folder of a run, or raise a `UserError` if nothing can be written there."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK):
-            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
-    except OSError as error:
-        raise UserError(sentence(error)) from error
 
 
 def needs_numbers(error: BaseException | None) -> bool:

@@ -5,8 +5,10 @@ opened by its name. Wherever a program takes the folder of a run to read, `pretr
 one. Its files are checked by their SHA-256 before any of them is read.
 """
 
+import errno
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -24,7 +26,7 @@ from coil_rl.errors import UserError, did_you_mean
 from coil_rl.files import LARGEST_NUMBERS, read_file, read_text
 from coil_rl.measures import measures_of
 from coil_rl.plain_yaml import is_part, leaves, read_yaml
-from coil_rl.run.folder import CONFIG, check_same, is_begun
+from coil_rl.run.folder import CODE, CODE_BEFORE, CONFIG, check_same, is_begun
 
 PREFIX = "pretrained:"
 CHECKSUMS, CARD = "checksums.json", "card.md"
@@ -75,6 +77,7 @@ def read_config(
                 f"{key}={folder} was made in Python from parts, which no file names; "
                 "make the same coil_rl.Run there, and call its methods"
             )
+        values = {key: value for key, value in values.items() if key not in (CODE, CODE_BEFORE)}
         logger = shipped_logger(values.get("logger"))
         if logger is not None or not goes_on:
             values["logger"] = None
@@ -120,6 +123,16 @@ def _values(config: DictConfig) -> dict[str, Any]:
     measures = measures_of(values["evaluation"]["measures"])
     values["evaluation"]["measures"] = {name: each.node() for name, each in measures.items()}
     return dict(values)
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder of a run, or raise a `UserError` if nothing can be written there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+    except OSError as error:
+        raise UserError(sentence(error)) from error
 
 
 def pretrained_names() -> list[str]:

@@ -3,6 +3,7 @@
 import errno
 import re
 import sys
+import traceback
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -75,6 +76,14 @@ def refuse(name: str, error: BaseException) -> NoReturn:
     """End a program with one sentence and exit code 2."""
     print(f"{name}: {sentence(error)}", file=sys.stderr)
     sys.exit(2)
+
+
+def reason_of(error: Exception) -> str:
+    """Return why one of several jobs failed; the traceback of a bug is printed."""
+    if is_no_bug(error):
+        return sentence(error)
+    traceback.print_exception(error)
+    return f"{type(error).__name__}: {sentence(error)}"
 
 
 def sentence(error: BaseException) -> str:

@@ -268,14 +268,19 @@ def trains_guides(config: DictConfig) -> bool:
     return config.method.observes is not None and learner_kind(config) == "guides"
 
 
-def what_guides_see(config: DictConfig) -> dict[str, str]:
-    """Return by name the attribute `sees` of the guides that may know more than an agent."""
-    seen = {}
+def of_guides(config: DictConfig, attribute: str) -> dict[str, Any]:
+    """Return an attribute of the classes of guides by name, of those that set it.
+
+    Args:
+        attribute: `sees`, what a guide may know more than an agent; or `demonstrates`, for one
+            whose actions were recorded, which has no advice in the env in which a policy is tested.
+    """
+    found = {}
     for name, node in config.guide.items():
-        sees = getattr(find_target(node.get("_target_"), name), "sees", "")
-        if sees:
-            seen[str(name)] = sees
-    return seen
+        value = getattr(find_target(node.get("_target_"), f"guide.{name}"), attribute, None)
+        if value:
+            found[str(name)] = value
+    return found
 
 
 def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:
@@ -304,24 +309,12 @@ def build_nodes_of_guides(nodes: Mapping[str, Any]) -> dict[str, TensorDictModul
     return guides
 
 
-def demonstrations(config: DictConfig) -> list[str]:
-    """Return the names of the guides that demonstrate: what they do was recorded.
-
-    They have the attribute `demonstrates`, and no advice in the env in which a policy is tested.
-    """
-    names = []
-    for name, node in config.guide.items():
-        if getattr(find_target(node.get("_target_"), f"guide.{name}"), "demonstrates", False):
-            names.append(str(name))
-    return names
-
-
 def driving_guides(config: DictConfig) -> dict[str, Any]:
     """Return the nodes of the guides that can drive, by name."""
     if "_target_" in config.guide:  # `build_guides` says what is wrong
         return {}
     nodes: Any = OmegaConf.to_container(config.guide, resolve=True)
-    left_out = demonstrations(config)
+    left_out = of_guides(config, "demonstrates")
     return {name: node for name, node in nodes.items() if name not in left_out}
 
 

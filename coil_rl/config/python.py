@@ -17,9 +17,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from torchrl.envs import EnvBase
 
 from coil_rl.config.assemble import assemble
-from coil_rl.config.check import check_parts, make_folder
+from coil_rl.config.check import check
 from coil_rl.config.compose import compose_train, packages, quoted
-from coil_rl.config.folder import PREFIX, read_config, run_folder
+from coil_rl.config.folder import PREFIX, make_folder, read_config, run_folder
 from coil_rl.config.given import give, import_path, keep
 from coil_rl.config.schema import method_for
 from coil_rl.config.trust import trust_own, trust_packages
@@ -74,7 +74,7 @@ def train(
     if isinstance(env, Run):
         _refuse_others(guide, method, seed, folder, tune, overrides)
         return env.train(frames)
-    folder = Path(folder).expanduser() if folder is not None else _new_folder()
+    folder = Path(folder).expanduser() if folder is not None else new_folder("train")
     run = prepare(
         env,
         guide=guide,
@@ -179,7 +179,7 @@ def prepared(given: Named, folder: str | Path) -> Run:
     """
     config = composed(given, folder)
     trust_own(config)
-    check_parts(config)
+    check(config)
     if not given.shared:
         check_read(config, given.words)
     make_folder(Path(config.run_dir))
@@ -201,9 +201,10 @@ def composed(given: Named, folder: str | Path) -> DictConfig:
     return config
 
 
-def _new_folder() -> Path:
+def new_folder(program: str) -> Path:
+    """Return a new folder in the outputs of a program."""
     now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f")
-    return Path("outputs", "train", f"{now}_{os.getpid()}")
+    return Path("outputs", program, f"{now}_{os.getpid()}")
 
 
 def _shipped(group: str) -> set[str]:

@@ -11,16 +11,21 @@ import sys
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from types import FunctionType
+from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 import hydra.utils
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
+from coil_rl.config.compose import packages
+from coil_rl.config.given import PLACES, kept_objects
 from coil_rl.config.trust import import_paths
+from coil_rl.errors import UserError
+from coil_rl.foreign.host import is_of_user
 
-INSTALLED = {"site-packages", "dist-packages"}  # folders of libraries
+# Parts of a configuration on which the numbers of a run depend, besides its evaluation.
+PARTS = ["env", "training", "guide", "method", "learner", "degrade", "disturb", "action"]
 
 
 def identity_of(thing: Any) -> str:
@@ -65,19 +70,6 @@ class _State(pickle.Pickler):
         return NotImplemented
 
 
-def is_of_user(thing: Any) -> bool:
-    """Return whether a function or class is neither of Python, of a library nor of this package.
-
-    Args:
-        thing: the function or class.
-    """
-    name = str(getattr(thing, "__module__", ""))
-    if name.partition(".")[0] in (*sys.stdlib_module_names, "coil_rl"):
-        return False
-    file = getattr(sys.modules.get(name), "__file__", None)
-    return file is None or not INSTALLED & set(Path(file).parts)
-
-
 def code_of_user(config: DictConfig, keys: Iterable[str]) -> list[str]:
     """Return the identity of each class and function of the user that a configuration names.
 
@@ -87,6 +79,45 @@ def code_of_user(config: DictConfig, keys: Iterable[str]) -> list[str]:
     parts = OmegaConf.masked_copy(config, list(keys))
     named = [*map(_named, sorted(import_paths(parts))), _registered(config.env.get("id"))]
     return [identity_of(each) for each in named if each is not None and is_of_user(each)]
+
+
+def code_of_run(config: DictConfig) -> dict[str, str]:
+    """Return the SHA-256 of each file of the user that a run depends on, by its module.
+
+    They are those that define its parts, and what these use of other files of the user.
+
+    Args:
+        config: of the run.
+    """
+    parts = OmegaConf.masked_copy(config, PARTS)
+    parts.evaluation = {key: config.evaluation.get(key) for key in ("env", "advice", "cases")}
+    things = [*map(_named, import_paths(parts)), _registered(config.env.get("id"))]
+    for place in PLACES:
+        with suppress(UserError):  # an object that was not handed over
+            things += kept_objects(config, place)
+    waiting = [name for thing in things for name in _modules_of(thing)]
+    found: dict[str, str] = {}
+    ours = {package.partition(".")[0] for package in packages()}
+    for name in waiting:  # it grows
+        module = sys.modules.get(name)
+        file = getattr(module, "__file__", None)
+        if name in found or file is None or name.partition(".")[0] in ours:
+            continue
+        if not is_of_user(SimpleNamespace(__module__=name)):
+            continue
+        with suppress(OSError):  # it is gone
+            found[name] = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+            waiting += [each for value in vars(module).values() for each in _modules_of(value)]
+    return dict(sorted(found.items()))
+
+
+def _modules_of(thing: Any) -> list[str]:
+    """Return the names of the modules that define a thing: a module, class, function or object."""
+    if isinstance(thing, ModuleType):
+        return [thing.__name__]
+    thing = getattr(thing, "func", thing)  # of a partial
+    defined = thing if isinstance(thing, (type, FunctionType)) else type(thing)
+    return [str(each.__module__) for each in getattr(defined, "__mro__", [defined])]
 
 
 def _named(path: str) -> Any:

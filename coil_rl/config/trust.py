@@ -33,7 +33,6 @@ from coil_rl.config.compose import packages
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.extras import require
 from coil_rl.plain_yaml import entries
-from coil_rl.run.stopping import remember_trust
 
 ENTRY_POINTS = (
     "coil_rl.trusted"  # a package with an entry point of its name in this group is trusted
@@ -110,7 +109,6 @@ def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -
             )
     _packages = frozenset(names)
     _own = frozenset() if command is None else import_paths(command)
-    remember_trust(sorted({*names, *_foreign(command)}))
 
 
 def trust_own(config: DictConfig) -> None:
@@ -132,16 +130,21 @@ def import_paths(config: DictConfig) -> frozenset[str]:
     return frozenset(path for path in paths if isinstance(path, str))
 
 
-def _foreign(command: DictConfig | None) -> frozenset[str]:
-    """Return the packages that the folder of a run of this command may name only if trusted."""
-    if command is None:
-        return frozenset()
+def to_trust(config: DictConfig) -> list[str]:
+    """Return the packages that a later command which takes the folder of a run must trust.
+
+    They are those of the option `trust`, and those of parts that are trusted only here, because
+    the command itself names them.
+
+    Args:
+        config: of the run.
+    """
     named = import_paths(
-        OmegaConf.masked_copy(command, [str(key) for key in command if key != "logger"])
+        OmegaConf.masked_copy(config, [str(key) for key in config if key != "logger"])
     )
     packages = {target.partition(".")[0] for target in named - NAMED - _shipped_targets()}
     known = metadata.entry_points(group=ENTRY_POINTS).names
-    return frozenset(packages - NEVER_TRUSTED - known)
+    return sorted(_packages | (packages - NEVER_TRUSTED - known))
 
 
 def check_config(config: DictConfig, path: Path) -> None:

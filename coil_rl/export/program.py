@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -47,11 +46,7 @@ def next_step(run: str, folder: str, guide: str) -> str:
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in the configuration.
-
-    Otherwise make the folder of the results.
-    """
-    from coil_rl.config.check import make_folder
+    """Raise a `UserError` for the first mistake in the configuration."""
     from coil_rl.config.values import check_values
     from coil_rl.envs.meanings import meaning
     from coil_rl.errors import UserError
@@ -65,7 +60,6 @@ def check(config: DictConfig) -> None:
             meaning(str(name), value)
     except ValueError as error:
         raise UserError(str(error)) from error
-    make_folder(Path(config.run_dir))
 
 
 main = partial(app.run_program, export, "export", check)

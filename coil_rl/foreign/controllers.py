@@ -22,11 +22,14 @@ from torch import nn
 
 from coil_rl.errors import did_you_mean
 from coil_rl.foreign.faults import ForeignError, foreign, shown
+from coil_rl.foreign.guard import Guard
 from coil_rl.foreign.host import Host, Predictor, called, check_call, role_of
 from coil_rl.foreign.remembered import copied, maker_of_rows, restore, state_of
 from coil_rl.foreign.shared import FunctionGuide, NetworkGuide
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key, written_key
 from coil_rl.transforms.hosted import HostedGuide, ToldGuide
+
+NUMBERS = "global random numbers"  # key of a saved state
 
 
 class PerRow(HostedGuide):
@@ -73,6 +76,7 @@ class PerRow(HostedGuide):
         self.in_keys, self.out_keys = [*self.read, "row", "is_init"], [nested_key(out_key)]
         super().__init__()
         self.make, self.hosts = make, dict[int, Host]()
+        self.guard = Guard()
         self.title = title or getattr(getattr(make, "func", make), "__name__", repr(make))
         self.choices: OwnChoices = {}
         self.asked: list[int] = []  # rows of the last call
@@ -97,14 +101,18 @@ class PerRow(HostedGuide):
             columns.append(entry.cpu().numpy().copy())
         observations = zip(*columns, strict=True)
         actions: list[NDArray[Any]] = []
-        for row, start, observed in zip(rows, starts, observations, strict=True):
-            host = self._host(row, start)
-            actions.append(host.act(*observed))
-            if actions[-1].shape != actions[0].shape:
-                raise ForeignError(
-                    f"{host.place}: the action has the shape {list(actions[-1].shape)}, but that "
-                    f"of row {rows[0]} has {list(actions[0].shape)}"
-                )
+        with self.guard.whole() if any(starts) else self.guard:
+            for row, start, observed in zip(rows, starts, observations, strict=True):
+                host = self._host(row, start)
+                actions.append(host.act(*observed))
+                if actions[-1].shape != actions[0].shape:
+                    raise ForeignError(
+                        f"{host.place}: the action has the shape {list(actions[-1].shape)}, but "
+                        f"that of row {rows[0]} has {list(actions[0].shape)}"
+                    )
+        if self.guard.touched:
+            for row, host in self.hosts.items():
+                host.numbers.use(torch.initial_seed() + row)
         action = torch.as_tensor(np.stack(actions), device=tensordict.device)
         shape = (*tensordict.batch_size, *action.shape[1:])
         return tensordict.set(self.out_keys[0], action.reshape(shape))
@@ -128,12 +136,12 @@ class PerRow(HostedGuide):
         place = self.hosts[self.asked[number]].place
         return ForeignError(f"{place}: act returned {shown(returned)}, which {problem}")
 
-    def get_extra_state(self) -> dict[int, Any] | None:
+    def get_extra_state(self) -> dict[Any, Any] | None:
         """Return the states by row; None if an object has none, or one that cannot be saved.
 
         A state that cannot be saved is a `ValueError`.
         """
-        states: dict[int, Any] = {}
+        states: dict[Any, Any] = {}
         for row, host in self.hosts.items():
             if not all(hasattr(host.thing, name) for name in ("state_dict", "load_state_dict")):
                 return None
@@ -141,6 +149,9 @@ class PerRow(HostedGuide):
                 states[row] = state_of(host.thing, self.make)
         if None in states.values():
             return None
+        numbers = {row: host.numbers.state_dict() for row, host in self.hosts.items()}
+        if any(numbers.values()):
+            states[NUMBERS] = numbers
         try:
             return dict(copied(states))
         except pickle.UnpicklingError as error:
@@ -149,7 +160,7 @@ class PerRow(HostedGuide):
                 "dictionaries and tensors only; convert NumPy arrays by tolist()"
             ) from error
 
-    def set_extra_state(self, state: Mapping[int, Any] | None) -> None:
+    def set_extra_state(self, state: Mapping[Any, Any] | None) -> None:
         """Make objects with these states."""
         self.continues = state is not None
         if state is None:
@@ -159,9 +170,13 @@ class PerRow(HostedGuide):
                 stacklevel=2,
             )
             state = {}
+        state = dict(state)
+        numbers = state.pop(NUMBERS, {})
         self.hosts = {row: Host(self.make, self.title, row) for row in state}
         for row, host in self.hosts.items():
-            host.thing = self.make()
+            with self.guard.whole():
+                host.open()
+            host.numbers.load_state_dict(numbers.get(row, {}))
             with foreign(host.place, "load_state_dict"):
                 restore(host.thing, state[row])
 
@@ -196,7 +211,8 @@ class ControllerGuide(HostedGuide):
         in_keys: Sequence[NestedKey] | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        thing = load(of) if isinstance(of, str) else of
+        with Guard().whole():
+            thing = load(of) if isinstance(of, str) else of
         if isinstance(thing, partial):  # Hydra has its own kind, which it checks at every call
             thing = partial(thing.func, *thing.args, **thing.keywords)
         title = getattr(called(of), "__name__", type(of).__name__)

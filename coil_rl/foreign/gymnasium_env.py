@@ -23,6 +23,7 @@ from coil_rl.foreign.codec import (
     Codec,
 )
 from coil_rl.foreign.faults import ForeignError, shortened
+from coil_rl.foreign.guard import Guard
 from coil_rl.foreign.makers import (
     Env,
     make_env,
@@ -133,10 +134,12 @@ class GymnasiumEnv(SeededRows):
         settings = dict(options or {})
         if max_steps is not None:
             settings["max_episode_steps"] = max_steps
-        maker = maker_of(id)
-        make = partial(make_env, maker, wrappers, settings)
+        guard = Guard()
+        with guard.whole():
+            maker = maker_of(id)
+            make = partial(make_env, maker, wrappers, settings)
+            self.shown = render and "rgb_array" in metadata_of(make(), "render_modes", ())
         drawn, every = make, cases or num_envs
-        self.shown = render and "rgb_array" in metadata_of(make(), "render_modes", ())
         if self.shown:
             drawn = partial(make_env, maker, wrappers, settings | {"render_mode": "rgb_array"})
         name = name_of(maker)
@@ -149,10 +152,11 @@ class GymnasiumEnv(SeededRows):
         self.kind = f"{settings} {wrappers} {makers}"
         self.workers: Workers | None = None
         self.info, self.optional = tuple(info), [("info", name) for name in info]
-        first = make_plant(0)
+        with guard.whole():
+            first = make_plant(0)
         self.codec = Codec(name, first.env, dtype)
         # With processes, row 0 of this one only says what the spaces are.
-        self.held = GymnasiumRows(self.codec, self.info).extend([first])
+        self.held = GymnasiumRows(self.codec, self.info, guard).extend([first])
         if not workers:
             self.held.extend(map(make_plant, range(1, num_envs)))
         super().__init__(self.held, num_envs, seed, first_seed, cases, device)
@@ -234,6 +238,10 @@ class GymnasiumEnv(SeededRows):
             self._place_rows()
         super().begin(seeds, actions)
 
+    def stay_in_process(self) -> None:
+        """Use no processes, if no episode has begun."""
+        self.asked = 0
+
     def _place_rows(self) -> None:
         """Decide in which processes the rows are, and make them there."""
         count = self.batch_size[0]
@@ -242,7 +250,7 @@ class GymnasiumEnv(SeededRows):
         codec, make_plant = self.codec, self.make_plant
 
         def make(rows: range) -> GymnasiumRows:
-            return GymnasiumRows(codec, self.info).extend(map(make_plant, rows))
+            return GymnasiumRows(codec, self.info, self.held.guard).extend(map(make_plant, rows))
 
         seconds = partial(timed, make, codec.actions.space.sample)
         number = choose(self.asked, count, seconds, codec.name, self.kind)
@@ -261,7 +269,8 @@ class GymnasiumEnv(SeededRows):
             first: whether it is the first one of an episode.
         """
         (plant,) = self.held.plants
-        plant.observe(observation, first=first)
+        with self.held.guard.whole():
+            plant.observe(observation, first=first)
         self.parts[:] = [self.held.entries()]
         return self._output(stepped=not first)
 

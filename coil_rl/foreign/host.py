@@ -6,9 +6,12 @@ What it is is decided here only, see `role_of`.
 import copy
 import inspect
 import math
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -22,13 +25,28 @@ from torch import nn
 
 from coil_rl.errors import did_you_mean
 from coil_rl.foreign.faults import ForeignError, action_array, foreign
+from coil_rl.foreign.guard import Numbers
 
+INSTALLED = {"site-packages", "dist-packages"}  # folders of libraries
 Role = Literal["guide", "act", "predict", "network", "function", ""]
 
 
 def called(thing: Any) -> Any:
     """Return the class or function that a `functools.partial` calls; anything else itself."""
     return thing.func if isinstance(thing, partial) else thing
+
+
+def is_of_user(thing: Any) -> bool:
+    """Return whether a function or class is neither of Python, of a library nor of this package.
+
+    Args:
+        thing: the function or class.
+    """
+    name = str(getattr(thing, "__module__", ""))
+    if name.partition(".")[0] in (*sys.stdlib_module_names, "coil_rl"):
+        return False
+    file = getattr(sys.modules.get(name), "__file__", None)
+    return file is None or not INSTALLED & set(Path(file).parts)
 
 
 def role_of(thing: Any) -> Role:
@@ -197,7 +215,8 @@ class Host:
         self.make, self.title, self.row, self.beside = make, title, row, beside
         self.thing: Any = None
         self.steps: int | None = None  # of the episode; unknown after a resume
-        self.seconds = math.inf  # the shortest time that an action took
+        self.numbers = Numbers(torch.initial_seed() + row)  # those of its env, where it is beside
+        self.seconds = math.inf  # of the processor, the shortest that an action took
 
     @property
     def place(self) -> str:
@@ -207,17 +226,22 @@ class Host:
         step = "" if self.steps is None else f", step {self.steps}"
         return f"the controller {self.title} (row {self.row}{step})"
 
+    def of_call(self) -> AbstractContextManager[None]:
+        """Return what is around a call."""
+        return self.numbers.of_call() if self.beside is None else nullcontext()
+
     def begin(self) -> None:
         """Begin an episode."""
         self.steps = 0
         if not hasattr(self.thing, "reset"):
-            self._open()
+            self.open()
         if hasattr(self.thing, "reset"):
-            with foreign(self.place, "reset"):
+            with self.of_call(), foreign(self.place, "reset"):
                 self.thing.reset()
 
-    def _open(self) -> None:
-        with foreign(self.place, "the constructor"):
+    def open(self) -> None:
+        """Make the object."""
+        with self.of_call(), foreign(self.place, "the constructor"):
             self.thing = self.make()
 
     def act(self, *observed: Any) -> NDArray[Any]:
@@ -230,11 +254,11 @@ class Host:
             ForeignError: for what the controller raises, or returns that is no array of numbers.
         """
         if self.thing is None:
-            self._open()
-        start = time.perf_counter()
-        with foreign(self.place, "act"):
+            self.open()
+        start = time.process_time()
+        with self.of_call(), foreign(self.place, "act"):
             answer = self.thing.act(*observed)
-        self.seconds = min(self.seconds, time.perf_counter() - start)
+        self.seconds = min(self.seconds, time.process_time() - start)
         try:
             return action_array(answer)
         except ForeignError as error:

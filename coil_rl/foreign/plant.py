@@ -29,6 +29,7 @@ from coil_rl.foreign.faults import (
     shortened,
     shown,
 )
+from coil_rl.foreign.guard import Numbers
 from coil_rl.foreign.host import Host, maker_beside
 from coil_rl.foreign.limit import limit_of, warn_of_limit
 from coil_rl.foreign.makers import Env
@@ -47,6 +48,7 @@ class Plant(ABC):
         limit: steps after which an episode is truncated, with a warning; None for no limit.
         seed: of the running episode.
         steps: since its reset.
+        numbers: global random numbers as the env and the controllers beside it see them.
     """
 
     ended_by: ClassVar[str]  # what could end an episode, for the warning
@@ -54,14 +56,33 @@ class Plant(ABC):
 
     def __init__(self, name: str, row: int) -> None:
         self.name, self.row, self.seed, self.steps = name, row, 0, 0
+        self.numbers = Numbers()
 
-    @abstractmethod
     def begin(self, seed: int) -> None:
-        """Begin an episode."""
+        """Begin an episode; a `ForeignError` for what the env raises, or returns that is none."""
+        self.seed, self.steps = seed, 0
+        self.numbers.seed(seed)
+        with self.numbers.of_call():
+            self._begin()
+
+    def step(self, action: Any) -> None:
+        """Take a step; one whose episode is over stays as it is, with reward 0.
+
+        Errors are those of `begin`.
+        """
+        if not self.numbers.active:  # which takes less time
+            self._step(action)
+            return
+        with self.numbers:
+            self._step(action)
 
     @abstractmethod
-    def step(self, action: Any) -> None:
-        """Take a step; one whose episode is over stays as it is, with reward 0."""
+    def _begin(self) -> None:
+        """Begin an episode with the seed."""
+
+    @abstractmethod
+    def _step(self, action: Any) -> None:
+        """Take a step."""
 
     @property
     def place(self) -> str:
@@ -122,7 +143,8 @@ class GymnasiumPlant(Plant):
         self.size: tuple[int, ...] | None = None  # of the pictures
         self.values: list[NDArray[Any]] = []
         self.advice: dict[str, NDArray[Any]] = {}
-        self._open()
+        with Numbers(row):
+            self._open()
 
     def _open(self) -> None:
         self.env = env = self.make()
@@ -139,21 +161,15 @@ class GymnasiumPlant(Plant):
             for name, thing in self.makers.items()
         }
 
-    def begin(self, seed: int) -> None:
-        """Begin an episode.
-
-        Raises:
-            ForeignError: for an exception of the env, for what is not two values, and for an
-                observation that does not fit its space.
-        """
+    def _begin(self) -> None:
+        """Begin an episode; the answer must be two values, and the observation fit its space."""
         if self.fresh:
             self.close()
             self.alive.pop(id(self.env.unwrapped), None)
             self._open()
-        self.seed, self.steps = seed, 0
         given: dict[str, Any] = {"options": dict(self.options)} if self.options else {}
         with foreign(self.place, "reset"):
-            answer: Any = self.env.reset(seed=seed, **given)
+            answer: Any = self.env.reset(seed=self.seed, **given)
         with self.placed():
             if not isinstance(answer, (tuple, list)) or len(answer) != 2:
                 raise ForeignError(
@@ -169,13 +185,8 @@ class GymnasiumPlant(Plant):
         self._begin_controllers()
         self._advise()
 
-    def step(self, action: Any) -> None:
-        """Take a step; one whose episode is over stays as it is, with reward 0.
-
-        Raises:
-            ForeignError: for an exception of the env, for what is not five values, and for an
-                observation, reward, flag or info that is none.
-        """
+    def _step(self, action: Any) -> None:
+        """Take a step; the answer must be five values: observation, reward, two flags and info."""
         if self.terminated or self.truncated:
             self.reward = 0.0
             return
@@ -228,9 +239,10 @@ class GymnasiumPlant(Plant):
             self.values = self.codec.read(observation)
         except ForeignError as error:
             raise ValueError(f"it does not fit the env {self.name}: {error}") from error
-        if first:
-            self._begin_controllers()
-        self._advise()
+        with self.numbers.of_call():
+            if first:
+                self._begin_controllers()
+            self._advise()
 
     def _look_for_masks(self) -> None:
         """Warn if info has a mask of the possible actions, which policies do not read."""
@@ -318,19 +330,12 @@ class TorchRLPlant(Plant):
         super().__init__(type(own).__name__, row)
         self.env, self.limit = env, limit_of(env)
 
-    def begin(self, seed: int) -> None:
-        """Begin an episode."""
-        self.seed, self.steps = seed, 0
-        # TorchRL's envs may seed the global generators, from which policies sample.
-        with (
-            torch.random.fork_rng(range(torch.cuda.device_count())),
-            foreign(self.place, "reset"),
-        ):
-            self.env.set_seed(seed)
+    def _begin(self) -> None:
+        with foreign(self.place, "reset"):
+            self.env.set_seed(self.seed)
             self.after = self.state = self.env.reset()
 
-    def step(self, action: Tensor) -> None:
-        """Take a step; one whose episode is over stays as it is, with reward 0."""
+    def _step(self, action: Tensor) -> None:
         reward = self.env.reward_key
         if self.after["done"].any():
             self.after = self.after.copy().set(reward, self.env.full_reward_spec[reward].zero())

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.foreign.codec import Codec
+from coil_rl.foreign.guard import Guard
 from coil_rl.foreign.plant import GymnasiumPlant, Plant
 
 Entries = dict[str | tuple[str, ...], NDArray[Any]]
@@ -40,25 +41,35 @@ class Rows(Generic[AnyPlant]):
 
     Args:
         plants: one a row.
+        guard: around each batch of their calls.
     """
 
-    def __init__(self, plants: Iterable[AnyPlant] = ()) -> None:
-        self.plants = list(plants)
+    def __init__(self, plants: Iterable[AnyPlant] = (), guard: Guard | None = None) -> None:
+        self.plants, self.guard = list(plants), guard or Guard()
 
     def begin(
         self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]
     ) -> list[Entries]:
         """Begin episodes, see `Shard`."""
-        for row, seed in seeds.items():
-            self.plants[row].begin(seed)
-            for action in actions.get(row, ()):
-                self.plants[row].step(action)
-        return [self.entries()]
+        with self.guard.whole():
+            for row, seed in seeds.items():
+                self.plants[row].begin(seed)
+                for action in actions.get(row, ()):
+                    self.plants[row].step(action)
+        return self._done()
 
     def step(self, actions: Any) -> list[Entries]:
         """Take a step in all rows, see `Shard`."""
-        for plant, action in zip(self.plants, actions, strict=True):
-            plant.step(action)
+        with self.guard:
+            for plant, action in zip(self.plants, actions, strict=True):
+                plant.step(action)
+        return self._done()
+
+    def _done(self) -> list[Entries]:
+        """Return the entries; from here on rows that use the global numbers have their own."""
+        if self.guard.touched:
+            for plant in self.plants:
+                plant.numbers.use(plant.seed)
         return [self.entries()]
 
     def entries(self) -> Entries:
@@ -74,13 +85,15 @@ class GymnasiumRows(Rows[GymnasiumPlant]):
         info: names of numbers in Gymnasium's info.
     """
 
-    def __init__(self, codec: Codec, info: Sequence[str]) -> None:
-        super().__init__()
+    def __init__(self, codec: Codec, info: Sequence[str], guard: Guard | None = None) -> None:
+        super().__init__(guard=guard)
         self.codec, self.info, self.unseen = codec, tuple(info), set(info)
 
     def extend(self, plants: Iterable[GymnasiumPlant]) -> "GymnasiumRows":
         """Take further plants, and return all; a `ValueError` for one with other spaces."""
-        for plant in plants:
+        with self.guard.whole():
+            made = list(plants)
+        for plant in made:
             self.codec.check_same(plant.env, plant.row)
             plant.codec = self.codec
             self.plants.append(plant)
@@ -126,9 +139,11 @@ class GymnasiumRows(Rows[GymnasiumPlant]):
 
     def picture(self, row: int) -> NDArray[np.uint8]:
         """Return a picture of a row."""
-        return self.plants[row].render()
+        with self.guard:
+            return self.plants[row].render()
 
     def close(self) -> None:
         """Close all envs."""
-        for plant in self.plants:
-            plant.close()
+        with self.guard.whole():
+            for plant in self.plants:
+                plant.close()

@@ -17,96 +17,61 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from coil_rl.foreign.faults import ForeignError, action_array, foreign, shown
+from coil_rl.foreign.guard import Guard
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key
 from coil_rl.transforms.hosted import HostedGuide
 
-# Of the largest number of the actions: for the same question, and in a batch of another size, in
-# which a network adds up in another order, on some devices with few digits.
+# Share of the largest number of the actions by which they may differ: for the same question, and in
+# a batch of another size, in which a network adds up in another order.
 SAME, BESIDE_OTHERS = 1e-5, 1e-2
-# Factor and offset of a row, and of two others that a function for a batch must not mix with it:
-# one of its size, and one beyond all limits of a sum or a maximum.
+# Factor and offset of a row, and of two others that must not be mixed with it: one of its size, and
+# one beyond all limits of a sum or a maximum.
 ROWS = ((1.0, 0.0), (0.37, 1.61), (-1000.0, 1000.0))
+COMPARED = 2  # of these; the numbers of the last one are too large to show a small difference
 ROUNDING = 1e-4  # of the largest number of an action
 
 
-class SharedCheck:
-    """Asks a controller that all rows share again, in its calls 1, 2, 4, 8 and so on.
+class SharedError(ForeignError):
+    """A controller cannot be shared by all rows."""
 
-    Before and after the rows of such a call it is asked for one row of the last such call, and must
-    give the same action. Where it takes a batch, it must give the first row of the call the same
-    action alone. So the check costs two or three answers for one row, in ever fewer calls.
+
+def check_shared(
+    title: str, ask: Callable[[Sequence[Tensor]], Tensor], rows: Sequence[Tensor]
+) -> None:
+    """Ask a controller that all rows share for some rows: each alone, together, and alone again.
 
     Args:
         title: name of the controller, for messages.
+        ask: returns its actions for entries.
+        rows: what it reads, [n, ...] each.
+
+    Raises:
+        SharedError: if it remembers or draws something, or mixes the rows.
     """
+    count = len(rows[0])
 
-    def __init__(self, title: str) -> None:
-        self.title, self.calls = title, 0
-        self.earlier: list[Tensor] = []  # one row of an earlier call
+    def alone() -> list[Tensor]:
+        return [
+            _numbers(ask([entry[row : row + 1].clone() for entry in rows])) for row in range(count)
+        ]
 
-    def __call__(
-        self, ask: Callable[[Sequence[Tensor]], Tensor], entries: Sequence[Tensor], dims: int
-    ) -> Tensor:
-        """Return the actions for the entries.
-
-        Args:
-            ask: returns the actions of the controller for entries.
-            entries: what it reads, [*batch, ...] each.
-
-        Raises:
-            ForeignError: if the controller remembers or draws something, or mixes the rows.
-        """
-        if torch.compiler.is_compiling():  # a traced function cannot raise
-            return ask(entries)
-        self.calls += 1
-        if self.calls & (self.calls - 1):  # no power of two
-            return ask(entries)
-        first = [entry[(slice(0, 1),) * dims].clone() for entry in entries]
-        earlier = self.earlier if _alike(self.earlier, first) else first
-        before = _numbers(ask(earlier))
-        actions = ask(entries)
-        self._check_repeated(before, _numbers(ask(earlier)), _numbers(actions))
-        if entries[0].shape[:dims].numel() > 1:
-            self._check_alone(lambda: _numbers(ask(first)), actions, entries[0].shape[:dims])
-        self.earlier = first
-        return actions
-
-    def _check_repeated(self, before: Tensor, after: Tensor, actions: Tensor) -> None:
-        """Refuse two answers for one observation.
-
-        Args:
-            before: the first answer.
-            after: the second one.
-            actions: other ones, for their size.
-        """
-        if before.shape == after.shape and _near(before, after, SAME, actions):
-            return
-        raise ForeignError(
-            f"the controller {self.title} returned {shown(before)} and then {shown(after)} for "
-            "the same observation: all rows share it, so it must not remember or draw anything; "
-            "write a class with act(observation) and reset()"
-        )
-
-    def _check_alone(
-        self, ask_alone: Callable[[], Tensor], actions: Tensor, batch: torch.Size
-    ) -> None:
-        """Refuse an answer for the first row alone that is another one than in the batch.
-
-        Args:
-            ask_alone: returns the answer for the first row.
-        """
-        if actions.shape[: len(batch)] != batch:  # refused as an action
-            return
-        alone, beside = ask_alone(), _numbers(actions.reshape(batch.numel(), -1)[0])
-        tolerance = BESIDE_OTHERS if actions.is_floating_point() else 0.0
-        if alone.shape == beside.shape and _near(alone, beside, tolerance, _numbers(actions)):
-            return
-        self._check_repeated(alone, ask_alone(), beside)
-        raise ForeignError(
-            f"the controller {self.title} returned {shown(alone)} for an observation alone, but "
-            f"{shown(beside)} for it in a batch of {batch.numel()}: it mixes the rows, as by a "
-            "mean over the batch; write a class with act(observation), which gets one row"
-        )
+    before, actions = alone(), ask([entry.clone() for entry in rows])
+    for row, (one, other) in enumerate(zip(before, alone(), strict=True)):
+        if not _near(one, other, SAME, before):
+            raise SharedError(
+                f"the controller {title} returned {shown(one)} and then {shown(other)} for the "
+                "same observation: all rows share it, so it must not remember or draw anything; "
+                "write a class with act(observation) and reset()"
+            )
+        if actions.shape[:1] != rows[0].shape[:1] or row >= COMPARED:
+            continue  # other shapes are refused as actions
+        beside = _numbers(actions[row])
+        if not _near(one, beside, BESIDE_OTHERS if actions.is_floating_point() else 0.0, before):
+            raise SharedError(
+                f"the controller {title} returned {shown(one)} for an observation alone, but "
+                f"{shown(beside)} for it in a batch of {count}: it mixes the rows, as by a mean "
+                "over the batch; write a class with act(observation), which gets one row"
+            )
 
 
 def _numbers(action: Tensor) -> Tensor:
@@ -114,28 +79,24 @@ def _numbers(action: Tensor) -> Tensor:
     return torch.atleast_1d(action.detach()).double().flatten()
 
 
-def _near(one: Tensor, other: Tensor, tolerance: float, actions: Tensor) -> bool:
+def _near(one: Tensor, other: Tensor, tolerance: float, actions: Sequence[Tensor]) -> bool:
     """Return whether two answers differ by rounding only; true for what is refused as no number."""
-    numbers = torch.cat([one, other, actions])
+    if one.shape != other.shape:
+        return False
+    numbers = torch.cat([one, other, *actions[:COMPARED]])
     if not numbers.isfinite().all():
         return True
     return bool(((one - other).abs() <= tolerance * numbers.abs().max()).all())
-
-
-def _alike(earlier: Sequence[Tensor], first: Sequence[Tensor]) -> bool:
-    """Return whether two rows have entries of the same shapes, dtypes and devices."""
-    return len(earlier) == len(first) and all(
-        (one.shape, one.dtype, one.device) == (other.shape, other.dtype, other.device)
-        for one, other in zip(earlier, first, strict=True)
-    )
 
 
 class _Shared(HostedGuide):
     """Base of guides of one controller for all rows."""
 
     title: str
+    guard: Guard
     space: ActionSpace | None = None  # unknown outside of an env
     choices: OwnChoices = {}  # noqa: RUF012  replaced, never changed
+    asked = False  # whether it was checked that it can be shared
 
     def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Take the space of the actions, which decides what has the form of actions."""
@@ -146,6 +107,36 @@ class _Shared(HostedGuide):
     ) -> Exception | None:
         """Return the error for an action that does not fit the env."""
         return ForeignError(f"the controller {self.title}: its action {problem}")
+
+    def _actions(
+        self, ask: Callable[[Sequence[Tensor]], Tensor], entries: Sequence[Tensor], dims: int
+    ) -> Tensor:
+        """Return the actions for entries; before the first ones it is checked, see `check_shared`.
+
+        Args:
+            ask: returns the actions of the controller for entries.
+            entries: [*batch, ...].
+            dims: number of dimensions of the batch.
+        """
+        if torch.compiler.is_compiling():  # a traced function cannot raise
+            return ask(entries)
+        with self.guard:
+            if not self.asked:
+                rows = [entry.flatten(0, dims - 1) if dims else entry[None] for entry in entries]
+                self._check(ask, rows)
+                self.asked = True
+            return ask(entries)
+
+    def _check(self, ask: Callable[[Sequence[Tensor]], Tensor], rows: Sequence[Tensor]) -> None:
+        """Check it with the first row and others like it, or with rows where it refuses those."""
+        with torch.no_grad(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of numbers that no env has
+            try:
+                check_shared(self.title, ask, [_beside_others(entry[0]) for entry in rows])
+            except SharedError:
+                raise
+            except Exception:
+                check_shared(self.title, ask, [entry[: len(ROWS)] for entry in rows])
 
     def _write(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
         """Write the action, which may be one number for each row, as regressors predict it."""
@@ -169,8 +160,7 @@ class NetworkGuide(_Shared, TensorDictModule):
 
     def __init__(self, network: nn.Module, in_keys: Sequence[NestedKey], title: str) -> None:
         TensorDictModule.__init__(self, network, in_keys=list(in_keys), out_keys=["action"])
-        self.title = title
-        self.shared = SharedCheck(title)
+        self.title, self.guard = title, Guard()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
@@ -184,7 +174,7 @@ class NetworkGuide(_Shared, TensorDictModule):
             return action
 
         entries = [tensordict[key] for key in self.in_keys]
-        return self._write(tensordict, self.shared(ask, entries, tensordict.batch_dims))
+        return self._write(tensordict, self._actions(ask, entries, tensordict.batch_dims))
 
 
 class FunctionGuide(_Shared):
@@ -197,7 +187,7 @@ class FunctionGuide(_Shared):
     in the numbering of the env, as a Gymnasium env gives them. Which of the two it is, is found out
     at its first call: it is for a batch if it gives the same for a row beside quite other ones as
     for the row alone, in the form of actions, or if it cannot take a row alone. A function that
-    remembers something would mix the rows: `SharedCheck` finds it.
+    remembers something would mix the rows: `check_shared` finds it.
 
     Args:
         function: takes one value for each of `in_keys`; it must give the same action for the same
@@ -222,18 +212,18 @@ class FunctionGuide(_Shared):
         self.function = function
         self.title = title or getattr(function, "__name__", type(function).__name__)
         self.for_batch: bool | None = None  # unknown before the first call
-        self.shared = SharedCheck(self.title)
+        self.guard = Guard()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         if self.for_batch is None:
-            self.for_batch = self._takes_batch(self._rows(tensordict))
+            with self.guard:
+                self.for_batch = self._takes_batch(self._rows(tensordict))
         if self.for_batch:  # traced for an export, so that nothing here may depend on the rows
             entries = [tensordict[key] for key in self.in_keys]
-            return self._write(
-                tensordict, self.shared(self._of_batch, entries, tensordict.batch_dims)
-            )
-        action = self.shared(self._of_rows, self._rows(tensordict), 1).to(tensordict.device)
+            action = self._actions(self._of_batch, entries, tensordict.batch_dims)
+            return self._write(tensordict, action)
+        action = self._actions(self._of_rows, self._rows(tensordict), 1).to(tensordict.device)
         return self._write(tensordict, action.reshape(*tensordict.batch_size, *action.shape[1:]))
 
     def unfit(

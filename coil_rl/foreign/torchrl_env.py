@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
 from coil_rl.foreign.batch import SeededRows
+from coil_rl.foreign.guard import Guard
 from coil_rl.foreign.plant import TorchRLPlant
 from coil_rl.foreign.rows import Rows
 from coil_rl.ranges import Count, Seed, checked
@@ -20,8 +21,7 @@ class EnvBatch(SeededRows):
     """TorchRL envs without batch as one env of batch size [num_envs], stepped one after the other.
 
     The entries are those of the single env, with the batch dimension in front. Entries that the
-    single env reads beside its action come from its own last step. An env that draws from PyTorch's
-    global generator in its steps cannot be continued to the bit; see `continues` of `SeededRows`.
+    single env reads beside its action come from its own last step.
 
     Args:
         of: makes one env, without a batch and with one action; called once for each row.
@@ -49,7 +49,9 @@ class EnvBatch(SeededRows):
         first_seed: Seed | None = None,
         cases: Count | None = None,
     ) -> None:
-        envs = [of() for _ in range(num_envs)]
+        guard = Guard()
+        with guard.whole():
+            envs = [of() for _ in range(num_envs)]
         if max_steps is not None and isinstance(envs[0], EnvBase):
             envs = [TransformedEnv(env, StepCounter(max_steps)) for env in envs]
         one = envs[0]
@@ -68,7 +70,7 @@ class EnvBatch(SeededRows):
             raise ValueError(
                 f"{name} must have one action, it has {', '.join(map(str, one.action_keys))}"
             )
-        self.held = Rows([TorchRLPlant(env, row) for row, env in enumerate(envs)])
+        self.held = Rows([TorchRLPlant(env, row) for row, env in enumerate(envs)], guard)
         super().__init__(
             self.held,
             num_envs,

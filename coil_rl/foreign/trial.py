@@ -1,18 +1,21 @@
-"""Trial of an env and of a controller: a few steps, twice.
+"""Trial of an env and of controllers: a few steps, asked again in other ways.
 
-What is asked here is asked in the check before a run, and by `coil_rl.testing`: does the env obey
-its seed, does the controller act the same again, and does each row act alone?
+Does the env obey its seed, does the controller act the same again, does each row act alone, and do
+both live by their steps and not by the clock? It is the same in the check before a run, when a run
+is evaluated, driven or exported, and in `coil_rl.testing`.
 """
 
+import inspect
 import math
-import random
+import pickle
+import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from types import FunctionType, ModuleType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -21,44 +24,461 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
+from coil_rl.foreign.batch import SeededRows, optional_entries
 from coil_rl.foreign.controllers import PerRow
+from coil_rl.foreign.faults import ForeignError
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.host import called, is_of_user
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import (
     first_choices,
     observed_choices,
     own_shape,
     random_action,
+    written_key,
 )
+from coil_rl.transforms.guide_actions import UnfitActionError
 
-STEPS = 10
-LONGEST = 0.5  # s, after which a trial of a controller takes no further step
+STEPS, FEWEST = 10, 3
+PATIENCE = 0.02  # s, of a rollout; a slower env takes fewer steps
+PAUSE, PAUSED = 0.02, 3  # s, and how many steps have it
+DATA = (int, float, list, dict, set, np.ndarray, Tensor)  # what classes may hold of their rows
 LARGEST_SEED = 2**64  # of a person
 
+Kind = Literal["finite", "seed", "clock", "bounds", "input", "rows", "draws", "past"]
 
-def episodes(env: EnvBase, steps: int = STEPS) -> list[TensorDictBase]:
-    """Return two rollouts of one seed, between which another one lies; running episodes are lost.
+
+class Finding(NamedTuple):
+    """What a trial has found.
+
+    Attributes:
+        kind: of the fault.
+        text: one sentence, with a remedy.
+    """
+
+    kind: Kind
+    text: str
+
+
+class Trial:
+    """A few steps of an env, and of what acts in it.
 
     Args:
-        env: the env, with or without transforms.
-        steps: of random actions, the same ones in all rollouts.
+        env: with or without transforms, of two rows or more where rows are to be compared; its
+            running episodes are lost.
+        steps: of a rollout, of random actions.
+        patience: seconds of a rollout, after which it is shortened.
+
+    Attributes:
+        findings: what is wrong.
+        seconds: the shortest time of an action of one row, by the title of the controller.
     """
-    # Of the transforms, which have no seed.
-    state = env.state_dict() if isinstance(env, TransformedEnv) else None
-    act = partial(random_action, env) if len(env.action_keys) == 1 else None
-    rollouts = []
-    with torch.random.fork_rng():
-        for seed in (0, 1, 0):
-            if state is not None:
-                env.load_state_dict(state)
-            env.set_seed(seed)
-            torch.manual_seed(0)  # of the actions
-            rollouts.append(env.rollout(steps, act, break_when_any_done=False))
-    return rollouts[::2]
+
+    def __init__(self, env: EnvBase, steps: int = STEPS, patience: float = math.inf) -> None:
+        self.env, self.steps, self.patience = env, steps, patience
+        self.base = env.base_env if isinstance(env, TransformedEnv) else env
+        self.findings: list[Finding] = []
+        self.seconds: dict[str, float] = {}
+        if isinstance(self.base, GymnasiumEnv):
+            self.base.stay_in_process()
+        if patience < math.inf:
+            self._take_fewer()
+
+    def _take_fewer(self) -> None:
+        """Shorten the rollouts of a slow env."""
+        most, self.steps = self.steps, min(self.steps, FEWEST)
+        start = time.perf_counter()
+        self._rollout(0)
+        each = (time.perf_counter() - start) / self.steps
+        self.steps = min(most, max(self.steps, int(self.patience / each)))
+
+    def find(self, kind: Kind, text: str) -> None:
+        """Take a finding."""
+        self.findings.append(Finding(kind, text))
+
+    def ask_env(self) -> None:
+        """Ask the env: finite numbers, its seed, the clock, its bounds and its rows."""
+        shared = _Shared(self._kinds_of_env())
+        state = self.env.state_dict() if self.env is not self.base else None
+        with torch.random.fork_rng():
+            first, _, again = (self._rollout(seed, state) for seed in (0, 1, 0))
+            self._look_at_numbers(first)
+            changed = difference(first, again)
+            if changed is not None:
+                self._find_unrepeated(changed)
+            elif isinstance(self.base, SeededRows):
+                changed = difference(first, self._rollout(0, state, pause=PAUSE))
+                if changed is not None:
+                    self.find("clock", f"{_title(changed)} differs when {PAUSE:g} s pass {CLOCK}")
+            self._look_at_bounds(first)
+            self._step_leaves_its_input()
+            if changed is None and self.env.batch_size and self.env.batch_size[0] > 1:
+                self._reset_of_one_row(shared)
+
+    def _rollout(
+        self, seed: int, state: Mapping[str, Any] | None = None, pause: float = 0.0
+    ) -> TensorDictBase:
+        """Return a rollout of random actions, the same ones for each seed of the env.
+
+        Args:
+            state: of the transforms, which have no seed.
+            pause: before each of the first steps, in seconds.
+        """
+        act = _random(self.env)
+        clock, left = _Clock(), [PAUSED if pause else 0]
+
+        def policy(data: TensorDictBase) -> TensorDictBase:
+            if left[0]:
+                left[0] -= 1
+                clock.pause(pause)
+            return act(data)
+
+        if state is not None:
+            self.env.load_state_dict(state)
+        self.env.set_seed(seed)
+        torch.manual_seed(0)  # of the actions
+        with clock:
+            return self.env.rollout(self.steps, policy, break_when_any_done=False)
+
+    def _look_at_numbers(self, rollout: TensorDictBase) -> None:
+        optional = {part for key in optional_entries(self.env) for part in (key, ("next", *key))}
+        for key, value in rollout.items(True, True):
+            numbers = value.nan_to_num() if key in optional else value
+            if value.is_floating_point() and not numbers.isfinite().all():
+                self.find("finite", f"{key} holds a number that is not finite")
+
+    def _find_unrepeated(self, key: NestedKey) -> None:
+        """Say that an entry differs when an episode is repeated."""
+        if isinstance(key, tuple) and key[-2:-1] == ("controller",):
+            self.find(
+                "draws",
+                f"the controller {key[-1]} beside the env gives other actions when an episode is "
+                f"repeated: {UNREPEATED}",
+            )
+            return
+        self.find(
+            "seed",
+            f"the same seed gives other values of {written_key(key)}: the env does not obey its "
+            "seed, so the cases of an evaluation are not the same for each policy; draw random "
+            "numbers from self.np_random or another seeded generator, count time by steps, and "
+            "begin each episode anew (env.fresh=true makes a new env for each)",
+        )
+
+    def _look_at_bounds(self, rollout: TensorDictBase) -> None:
+        """Find each entry of the observation with a number outside of its space."""
+        if not isinstance(self.base, GymnasiumEnv):
+            return
+        if self.base is not self.env:  # transforms may leave out entries
+            act = _random(self.base)
+            rollout = self.base.rollout(self.steps, act, break_when_any_done=False)
+        for entry in self.base.codec.entries:
+            parts = [rollout[entry.key], rollout["next", *entry.key]]
+            values = torch.cat([part.reshape(-1, *entry.given) for part in parts])
+            found = entry.outside(values.cpu().numpy())
+            if found is not None:
+                index, value, low, high = found
+                self.find(
+                    "bounds",
+                    f"number {index} of {entry.title} is {value:g}, but the observation_space of "
+                    f"{entry.id} has it from {low:g} to {high:g}; correct its bounds, or the "
+                    "number",
+                )
+
+    def _step_leaves_its_input(self) -> None:
+        data = _random(self.env)(self.env.reset())
+        copy = data.clone()
+        self.env.step(data)
+        changed = difference(copy, data)
+        if changed is not None:
+            self.find("input", f"a step changed {changed} of the data before it; write new tensors")
+
+    def _reset_of_one_row(self, shared: "_Shared") -> None:
+        """Compare a step after the reset of row 0 with the same step without it.
+
+        An env that draws random numbers in its steps may differ anyway: so the step is compared
+        only if another seed makes no difference.
+        """
+        env, act = self.base, _random(self.base)
+
+        def seed(present: TensorDictBase) -> TensorDictBase:
+            env.set_seed(1)
+            return present
+
+        def reset(present: TensorDictBase) -> TensorDictBase:
+            mask = torch.zeros_like(present["done"])
+            mask[0] = True
+            return env.reset(present.set("_reset", mask))
+
+        def second_step(change: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:
+            env.set_seed(0)
+            torch.manual_seed(0)
+            present = change(env.step_mdp(env.step(act(env.reset()))))
+            torch.manual_seed(0)  # of the action
+            return env.step(act(present))["next"]
+
+        plain, seeded = second_step(lambda present: present), second_step(seed)
+        changed = difference(plain[1:], second_step(reset)[1:])
+        if difference(plain, seeded) is None and changed is not None:
+            self.find(
+                "rows",
+                f"resetting row 0 changed {written_key(changed)} of other rows in the next step: "
+                f"all rows share {shared.changed() or SOMETHING}; make it in __init__, for each "
+                "object its own",
+            )
+
+    def _kinds_of_env(self) -> list[type]:
+        if not isinstance(self.base, GymnasiumEnv):
+            return []
+        return [type(layer) for layer in _layers(self.base.held.plants[0].env)]
+
+    def recorded(self) -> TensorDictBase:
+        """Return data [B, T] of random actions, with at least two rows.
+
+        For an env without batch dimension these are two episodes.
+
+        Raises:
+            ValueError: for an env of one row.
+        """
+        env, act = self.env, _random(self.env)
+        with torch.no_grad():
+            if env.batch_size:
+                recorded: TensorDictBase = env.rollout(self.steps, act, break_when_any_done=False)
+            else:
+                pair = [env.rollout(self.steps, act, break_when_any_done=False) for _ in range(2)]
+                shortest = min(map(len, pair))
+                recorded = TensorDict.stack([episode[:shortest] for episode in pair])
+        if len(recorded.batch_size) != 2 or len(recorded) < 2:
+            raise ValueError(
+                "check_guide needs an env with one batch dimension of at least 2 rows, not "
+                f"{list(env.batch_size)}; make it with more, such as GymnasiumEnv(ID, num_envs=2)"
+            )
+        return recorded
+
+    def ask_guide(
+        self,
+        guide: TensorDictModuleBase,
+        recorded: TensorDictBase,
+        action_key: NestedKey,
+        tolerance: float,
+    ) -> None:
+        """Ask a guide without random numbers what its advice depends on over an episode.
+
+        Args:
+            guide: it is asked itself.
+            recorded: along this data, see `recorded`.
+            action_key: of the action.
+            tolerance: allowed effect of other rows.
+        """
+        asked, middle = AskedGuide(guide, self.env, recorded, action_key), recorded.shape[1] // 2
+        first, again, fresh = asked.advice(), asked.advice(), asked.advice(begin=middle)
+        try:
+            interrupted = asked.advice(reset_at=middle)
+        except (IndexError, RuntimeError) as error:
+            self.find(
+                "past",
+                "the guide fails after a single row was reset, so it may remember in itself, not "
+                f"in entries: {error}",
+            )
+            return
+        equal = partial(torch.allclose, rtol=0, atol=tolerance)
+        if not torch.equal(first, again):
+            self.find(
+                "draws",
+                "the guide's action is another one for the same history; it draws, or remembers "
+                "earlier episodes",
+            )
+        if not equal(interrupted[1:], first[1:]):
+            self.find("rows", "the guide's action for a row depends on the reset of another row")
+        if not equal(interrupted[0, middle:], fresh[0]):
+            self.find(
+                "past",
+                "the guide's action after the reset of a row depends on what was before it",
+            )
+        if not torch.equal(first, asked.advice(pause=PAUSE)) and torch.equal(first, again):
+            self.find("clock", f"the guide's action is another one when {PAUSE:g} s pass {CLOCK}")
+
+    def ask_controller(self, guide: TensorDictModuleBase) -> None:
+        """Ask objects of a controller along a few steps, each time new ones.
+
+        Random numbers without a seed are others each time: those of NumPy's generators in copies of
+        one object would be as alike as the copies. What a controller raises ends the trial: it is
+        said where it acts for the run.
+
+        Args:
+            guide: one that has no object for each row is not asked.
+        """
+        own = getattr(guide, "guide", guide)
+        if not isinstance(own, PerRow):
+            return
+        shared = _Shared([_kind_of(own.make)])
+        with suppress(ForeignError, UnfitActionError), torch.random.fork_rng():
+            torch.manual_seed(0)
+            self._ask_objects(own, self.recorded(), shared)
+
+    def _ask_objects(self, own: PerRow, recorded: TensorDictBase, shared: "_Shared") -> None:
+        first, start = _new(own, own.make), time.perf_counter()
+        advice = AskedGuide(first, self.env, recorded).advice()
+        slow = math.ceil((time.perf_counter() - start) / self.patience)
+        if slow > 1:
+            recorded = recorded[:, : max(FEWEST, recorded.shape[1] // slow)]
+            advice = advice[:, : recorded.shape[1]]
+        self.seconds[own.title] = min(host.seconds for host in first.hosts.values())
+
+        def ask(data: TensorDictBase, **how: Any) -> Tensor:
+            again = _new(own, lambda: _reseeded(own.make(), first))
+            return AskedGuide(again, self.env, data).advice(**how)
+
+        title = f"the controller {own.title}"
+        if not torch.allclose(advice, ask(recorded)):
+            text = "gives other actions for the same observations from the same start"
+            names = shared.changed()
+            shared.restore()
+            if names and torch.allclose(advice, ask(recorded)):
+                self.find("rows", f"{title} {text}: {_shares(names)}")
+            else:
+                self.find("draws", f"{title} {text}: {UNREPEATED}")
+            return
+        alone, reset = ask(recorded[:1]), ask(recorded, reset_at=recorded.shape[1] // 2)
+        if not torch.allclose(advice[:1], alone) or not torch.allclose(advice[1:], reset[1:]):
+            self.find(
+                "rows",
+                f"{title} gives a row other actions beside other rows: "
+                f"{_shares(shared.changed() or SOMETHING)}",
+            )
+        elif not torch.allclose(advice, ask(recorded, pause=PAUSE)):
+            self.find("clock", f"{title} gives other actions when {PAUSE:g} s pass {CLOCK}")
 
 
-def unrepeated(env: EnvBase) -> NestedKey | None:
-    """Return an entry that differs when an episode is repeated; None if none does."""
-    return difference(*episodes(env))
+SOMETHING = "something, such as an attribute or a default argument of their class"
+CLOCK = (
+    "between two steps: it reads the clock, so the result depends on how busy the machine is; "
+    "count time by steps, such as sample_time=None of a PID controller"
+)
+UNREPEATED = (
+    "it draws random numbers that no seed of the run reaches, such as from a generator without a "
+    "seed, or reads the clock, so the run cannot be repeated or resumed to the bit; give it a "
+    "generator of its own with a seed, such as np.random.default_rng(0), and count time by steps, "
+    "such as sample_time=None of a PID controller"
+)
+
+
+def _shares(names: str) -> str:
+    return f"all rows share {names}; make it in __init__, for each object its own"
+
+
+def _title(key: NestedKey) -> str:
+    if isinstance(key, tuple) and key[-2:-1] == ("controller",):
+        return f"the action of the controller {key[-1]}"
+    return f"{written_key(key)} of the env"
+
+
+class _Clock:
+    """The clock of Python, which stands still in a block, but for the pauses that are made there.
+
+    What is asked twice at two speeds is then asked the same, unless it reads another clock.
+    """
+
+    names = ("time", "monotonic", "perf_counter")
+
+    def __enter__(self) -> "_Clock":
+        self.passed, self.read = 0.0, {name: getattr(time, name) for name in self.names}
+        for name, read in self.read.items():
+            setattr(time, name, partial(self._now, read()))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for name, read in self.read.items():
+            setattr(time, name, read)
+
+    def _now(self, start: float) -> float:
+        return start + self.passed
+
+    def pause(self, seconds: float) -> None:
+        """Wait, also by every other clock."""
+        self.passed += seconds
+        time.sleep(seconds)
+
+
+class _Shared:
+    """What all objects of some classes share: attributes, default arguments, names of the module.
+
+    Args:
+        kinds: the classes.
+    """
+
+    def __init__(self, kinds: Sequence[type]) -> None:
+        own = [each for kind in kinds for each in kind.__mro__ if is_of_user(each)]
+        self.kinds = dict.fromkeys(own)
+        self.before = {name: _pickled(value) for name, value, _ in self._things()}
+
+    def changed(self) -> str:
+        """Return the names of what has changed; empty for nothing."""
+        return " and ".join(name for name, *_ in self._changed())
+
+    def restore(self) -> None:
+        """Give everything the content that it had."""
+        for name, value, put in list(self._changed()):
+            old = pickle.loads(self.before[name])
+            for now, then in zip(value, old, strict=True) if put is None else [(value, old)]:
+                if isinstance(now, (list, np.ndarray)):
+                    now[:] = then
+                elif isinstance(now, (dict, set)):
+                    now.clear()
+                    now.update(then)
+                elif put is not None:
+                    put(then)
+
+    def _changed(self) -> Iterator[tuple[str, Any, Any]]:
+        for name, value, put in self._things():
+            if self.before.get(name) and _pickled(value) != self.before[name]:
+                yield name, value, put
+
+    def _things(self) -> Iterator[tuple[str, Any, Any]]:
+        """Yield name, value, and what sets it; None for default arguments, a tuple of values."""
+        for kind in self.kinds:
+            for name, value in vars(kind).items():
+                if isinstance(value, FunctionType):
+                    given = [each for each in value.__defaults__ or () if isinstance(each, DATA)]
+                    yield f"a default of {kind.__name__}.{name}", given, None
+                elif isinstance(value, DATA) and not name.startswith("__"):
+                    yield f"{kind.__name__}.{name}", value, partial(setattr, kind, name)
+            module = sys.modules.get(kind.__module__)
+            for name, value in vars(module).items() if module else ():
+                if isinstance(value, DATA) and not name.startswith("__"):
+                    yield f"{kind.__module__}.{name}", value, partial(setattr, module, name)
+
+
+def _pickled(value: Any) -> bytes:
+    """Return the content of a value; empty for what cannot be pickled."""
+    try:
+        return pickle.dumps(value)
+    except Exception:  # whatever the pickling of somebody else's object raises
+        return b""
+
+
+def _random(env: EnvBase) -> Callable[[TensorDictBase], TensorDictBase]:
+    """Return what writes a random action, also where it has no bound."""
+    return partial(random_action, env) if len(env.action_keys) == 1 else env.rand_action
+
+
+def _layers(env: Any) -> Iterator[Any]:
+    """Yield an env and what is in its wrappers."""
+    while env is not None:
+        yield env
+        env = getattr(env, "env", None)
+
+
+def _kind_of(make: Callable[[], Any]) -> type:
+    """Return the class of what a maker makes, without making one."""
+    kind: Any = called(make)
+    if inspect.isclass(kind):
+        return kind
+    given = make.args if isinstance(make, partial) else ()
+    return type(given[-1] if given else make)
+
+
+def _new(own: PerRow, make: Callable[[], Any]) -> PerRow:
+    return PerRow(make, own.read, own.out_keys[0], own.title)
 
 
 def difference(one: TensorDictBase, other: TensorDictBase) -> NestedKey | None:
@@ -87,7 +507,8 @@ class Recorded(EnvBase):
         rows = data.batch_size[0]
         for name in ("observation_spec", "full_action_spec", "full_reward_spec", "full_done_spec"):
             spec = getattr(env, name).clone()
-            setattr(self, name, spec if env.batch_size else spec.expand(rows, *spec.shape))
+            own = spec[:rows] if env.batch_size else spec.expand(rows, *spec.shape)
+            setattr(self, name, own)
         self.data, self.step_number = data, 0
         plant = getattr(env, "base_env", env)
         self.first_choices, self.own_shape = first_choices(plant), own_shape(plant)
@@ -131,16 +552,23 @@ class AskedGuide:
         advise = GuideActions({"guide": guide}, action_key)
         self.env = TransformedEnv(Recorded(env, recorded), advise)
 
-    def advice(self, begin: int = 0, reset_at: int | None = None) -> Tensor:
+    def advice(self, begin: int = 0, reset_at: int | None = None, pause: float = 0.0) -> Tensor:
         """Return the advice at each step, [B, T - begin].
 
         Args:
             begin: step of the data with which the episodes begin.
             reset_at: step at which an episode of row 0 begins anew; None for no reset.
+            pause: before each of the first steps, in seconds.
         """
-        data, taken = self.recorded[:, begin:].exclude("next"), []
+        data = self.recorded[:, begin:].exclude("next")
         self.env.base_env.data = data
-        present = self.env.reset()
+        with _Clock() as clock:
+            return self._asked(data, reset_at, pause, clock)
+
+    def _asked(
+        self, data: TensorDictBase, reset_at: int | None, pause: float, clock: "_Clock"
+    ) -> Tensor:
+        present, taken = self.env.reset(), []
         for step in range(data.shape[1]):
             if step == reset_at:
                 mask = torch.zeros(len(data), 1, dtype=torch.bool, device=self.env.device)
@@ -148,69 +576,13 @@ class AskedGuide:
                 present = self.env.reset(present.set("_reset", mask))
             taken.append(present["guide_action"])
             if step + 1 < data.shape[1]:
+                if pause and step < PAUSED:
+                    clock.pause(pause)
                 action = TensorDict(
                     {self.action_key: data[self.action_key][:, step]}, present.batch_size
                 )
                 present = self.env.step(present.update(action))["next"]
         return torch.stack(taken, 1)
-
-
-class Tried(NamedTuple):
-    """Result of a trial of a controller in a few steps.
-
-    Attributes:
-        title: of the controller; empty for a guide that has no object for each row.
-        unseeded: whether it does not act the same again.
-        seconds: for an action of one row; infinite if it was not measured.
-    """
-
-    title: str = ""
-    unseeded: bool = False
-    seconds: float = math.inf
-
-
-def tried(guide: TensorDictModuleBase, env: EnvBase) -> Tried:
-    """Ask two objects of a controller along a few steps of an env, with other random numbers.
-
-    Other are the global numbers of Python and NumPy, and those of NumPy's generators without a seed
-    in copies of one object, which would be as alike as the copies. Those of torch are the same for
-    both: a run seeds and saves them. What a controller raises ends the trial: it is said where the
-    controller acts for the run.
-
-    Args:
-        guide: the guide; one that has no object for each row is not asked.
-        env: of one row; its running episode is lost.
-    """
-    own = getattr(guide, "guide", guide)
-    if not isinstance(own, PerRow):
-        return Tried()
-    first = PerRow(own.make, own.read, own.out_keys[0], own.title)
-    again = PerRow(lambda: _reseeded(own.make(), first), own.read, own.out_keys[0], own.title)
-    answers = []
-    try:
-        with _global_numbers_kept():
-            recorded = _few_steps(env)
-            for seed, probe in enumerate((first, again)):
-                torch.manual_seed(0)
-                random.seed(seed)
-                np.random.seed(seed)
-                answers.append(AskedGuide(probe, env, recorded).advice())
-    except Exception:
-        return Tried()
-    one, other = answers
-    is_same = first.hosts[0].thing is again.hosts[0].thing or torch.allclose(one, other)
-    return Tried(own.title, not is_same, first.hosts[0].seconds)
-
-
-def _few_steps(env: EnvBase) -> TensorDictBase:
-    """Return data [1, T] of random actions until an episode, or the patience, is over."""
-    data, end = env.reset(), time.perf_counter() + LONGEST
-    taken: list[TensorDictBase] = []
-    while len(taken) < STEPS and time.perf_counter() < end and not data["done"].any():
-        step = env.step(random_action(env, data))
-        taken.append(step)
-        data = env.step_mdp(step)
-    return torch.stack(taken, 1)
 
 
 def _reseeded(thing: Any, first: PerRow) -> Any:
@@ -245,15 +617,3 @@ def _unseeded(thing: Any) -> Iterator[tuple[int, Any]]:
             waiting.extend(value)
         elif hasattr(value, "__dict__"):
             waiting.extend(vars(value).values())
-
-
-@contextmanager
-def _global_numbers_kept() -> Iterator[None]:
-    """Restore the states of the global random generators after the block."""
-    states = random.getstate(), np.random.get_state()
-    try:
-        with torch.random.fork_rng():
-            yield
-    finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])

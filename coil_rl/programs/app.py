@@ -38,6 +38,7 @@ from omegaconf.errors import OmegaConfBaseException
 import coil_rl.config  # noqa: F401  registers the root configurations
 from coil_rl import programs
 from coil_rl.config.compose import keep_written, key_of
+from coil_rl.config.folder import make_folder
 from coil_rl.config.messages import is_no_bug, refuse
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
@@ -278,7 +279,7 @@ def _do(
     try:
         check(config)
         if has_folder:
-            Path(config.run_dir).mkdir(parents=True, exist_ok=True)
+            make_folder(Path(config.run_dir))
         programs.imported()
         if signals.received:
             raise KeyboardInterrupt

@@ -53,7 +53,8 @@ def check(config: DictConfig) -> None:
 
     Otherwise make their folder.
     """
-    from coil_rl.config.check import check_proxies, make_folder
+    from coil_rl.config.check import check_proxies
+    from coil_rl.config.folder import make_folder
     from coil_rl.config.values import check_values
 
     used = ("preset", "track", "env", "disturb", "guide", "evaluation", "proxy")

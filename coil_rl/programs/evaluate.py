@@ -37,18 +37,20 @@ def evaluate(config: DictConfig) -> float:
 
     torch.set_num_threads(config.threads)
     results = Path(config.run_dir)
-    if config.run is None:
-        judge(trial(config, env_maker(config)), None, results, config.seed)
-        return report_outcome(results)
-    folder = run_folder(config.run)
-    of_run = configured(folder, config)
+    alone = config
+    if config.run is not None:
+        folder = run_folder(config.run)
+        alone = configured(folder, config)
     if config.exported is not None:
-        exported = with_exported(of_run, config.exported)
-        judge(trial(exported, env_maker(exported)), None, results, config.seed)
-        return report_outcome(results)
-    run = assemble(of_run, folder)
-    policy = run.policy(run.trial.env(SOME_ROWS))  # not of the training, whose env may be another
-    judge(run.trial, policy, results, config.seed, run.drivers(policy))
+        alone = with_exported(alone, config.exported)
+    if config.run is None or config.exported is not None:
+        judge(trial(alone, env_maker(alone)), None, results, config.seed)
+    else:
+        run = assemble(alone, folder)
+        env = run.trial.env(SOME_ROWS)  # not of the training, whose env may be another
+        run.try_out(env)
+        policy = run.policy(env)
+        judge(run.trial, policy, results, config.seed, run.drivers(policy))
     return report_outcome(results)
 
 
@@ -151,10 +153,7 @@ def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> l
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in the configuration.
-
-    Otherwise make the folder of the results.
-    """
+    """Raise a `UserError` for the first mistake in the configuration."""
     given = config.run is not None
     if config.exported is not None and not given:
         raise UserError(

@@ -6,7 +6,6 @@ import os
 import shlex
 import shutil
 import sys
-import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.config.compose import keep_written
-from coil_rl.config.messages import is_no_bug, refuse, sentence
+from coil_rl.config.messages import reason_of, refuse
 from coil_rl.errors import RunningError, UserError
 from coil_rl.files import FAILED_JOBS
 from coil_rl.output import say
@@ -231,11 +230,7 @@ class Jobs:
         if isinstance(error, RunningError):
             say(f"{self.name}: {job} is left to the process that works on it", error=True)
             return math.nan
-        reason = sentence(error)
-        if not is_no_bug(error):
-            traceback.print_exception(error)
-            reason = f"{type(error).__name__}: {reason}"
-        line = f"{job}: {reason}"
+        line = f"{job}: {reason_of(error)}"
         say(f"{self.name}: {line}; the other jobs go on", error=True)
         with contextlib.suppress(OSError):  # it is empty
             Path(hydra_config.runtime.output_dir).rmdir()

@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -16,7 +17,7 @@ from coil_rl.output import say
 from coil_rl.programs import app, folders, imported, sweeps
 
 # What may be given beside resume=FOLDER.
-BESIDE_RESUME = ("trust=", "budget.frames=")
+BESIDE_RESUME = ("trust=", "budget.frames=", "env.workers=", "changed=")
 
 
 def train(config: DictConfig) -> float:
@@ -47,8 +48,15 @@ def check(config: DictConfig) -> None:
             say(f"{sentence}, if no other run of this sweep reads it", error=True)
 
 
-def resume(folder: Path, frames: int | None = None) -> float:
+def resume(
+    folder: Path, frames: int | None = None, workers: Any = None, changed: str = ""
+) -> float:
     """Finish a run that was stopped, or train it for longer, and return the same as `train`.
+
+    Args:
+        frames: new length.
+        workers: number of processes of the env; its numbers do not depend on it.
+        changed: as of `Run.train`.
 
     Raises:
         UserError: for a folder without a run, or one that cannot be resumed or would write outside
@@ -64,6 +72,10 @@ def resume(folder: Path, frames: int | None = None) -> float:
     folder = folder.absolute()
     _refuse_links(folder)
     config.run_dir = str(folder)
+    if workers is not None:
+        if "workers" not in config.env:
+            raise UserError(f"env.workers={workers} has no effect on the env of {folder}")
+        config.env.workers = workers
     if config.proxy:
         config.proxy["folder"] = str(folder / "distilled")  # not the folder that the file names
     with locked(folder):
@@ -77,7 +89,7 @@ def resume(folder: Path, frames: int | None = None) -> float:
                 check(config)
         except UserError as error:
             raise UserError(f"{folder / 'config.yaml'}: {error}") from error
-        return run.finish_begun()
+        return run.finish_begun(changed)
 
 
 def _refuse_links(folder: Path) -> None:
@@ -108,10 +120,13 @@ def resume_from_command_line(resumed: str, others: Sequence[str]) -> None:
     unknown = [argument for argument in others if not argument.startswith(BESIDE_RESUME)]
     if unknown:
         raise UserError(
-            f"{resumed} takes no argument but trust=[PACKAGE] and budget.frames=NUMBER: the run "
-            f"has its own config.yaml; leave out {' '.join(unknown)}"
+            f"{resumed} takes no argument but trust=[PACKAGE], budget.frames=NUMBER, "
+            "env.workers=NUMBER and changed=accept: the run has its own config.yaml; leave out "
+            f"{' '.join(unknown)}"
         )
-    given = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.from_dotlist(list(others)))
+    words = OmegaConf.from_dotlist(list(others))
+    changed = str(words.pop("changed", ""))
+    given = OmegaConf.merge(OmegaConf.structured(TrainConfig), words)
     trust_packages(given.trust)
     lengthens = any(argument.startswith("budget.frames=") for argument in others)
     name = resumed.removeprefix("resume=")
@@ -121,7 +136,8 @@ def resume_from_command_line(resumed: str, others: Sequence[str]) -> None:
             f"init={name}"
         )
     folder = folders.folder(name)
-    resume(folder, given.budget.frames if lengthens else None)
+    frames = given.budget.frames if lengthens else None
+    resume(folder, frames, OmegaConf.select(words, "env.workers"), changed)
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 
 from coil_rl.errors import UserError
 from coil_rl.files import folder_to_disk, read_file, whole_file
@@ -62,6 +63,27 @@ def load(path: Path, device: str = "cpu") -> Any:
         raise UserError(
             f"{path} is damaged ({type(error).__name__}); train again or use another"
         ) from error
+
+
+def put_weights(policy: TensorDictModuleBase, state: Any, path: Path) -> None:
+    """Put the weights that were read from a file into a policy.
+
+    Raises:
+        UserError: if they do not fit the policy, or are not finite.
+    """
+    try:
+        policy.load_state_dict(state)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} does not fit the networks in {path.parent / 'config.yaml'}; one of them was "
+            "changed after the run"
+        ) from error
+    if not all(parameter.isfinite().all() for parameter in policy.parameters()):
+        raise UserError(
+            f"{path} holds weights that are NaN or infinite; train again or use another"
+        )
 
 
 def save_newest(state: Any, folder: Path) -> None:

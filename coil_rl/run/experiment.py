@@ -23,7 +23,7 @@ from coil_rl.run.folder import check_same, weights_file
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.reasons import start_test
 from coil_rl.run.rollout import Rollout
-from coil_rl.run.stopping import STOP, resume_command
+from coil_rl.run.stopping import STOP
 
 PUT_BACK = "put the files of the run back, or train again in another folder"
 
@@ -56,6 +56,7 @@ class Experiment:
         before: frames that were taken before the run, by what prepared it.
         identity: values of the configuration, which a checkpoint keeps and a resumed run must have.
         stages: earlier lengths of a run that was made longer, in frames.
+        resume_command: what to type to go on with it, for messages.
     """
 
     EPISODES: ClassVar[int] = 100  # the return is the mean over this many finished episodes
@@ -75,6 +76,7 @@ class Experiment:
     before: int = 0
     identity: Mapping[str, Any] = field(default_factory=dict)
     stages: Sequence[int] = ()
+    resume_command: str = ""
 
     def __post_init__(self) -> None:
         self.metrics = Metrics(self.folder / "metrics.csv", self.logger)
@@ -301,7 +303,7 @@ class Experiment:
                 kept = "the last good checkpoint is kept"
             raise UserError(
                 f"{error}; {kept}: correct the cause and continue with "
-                f"{resume_command(self.folder)}, or train again with other values"
+                f"{self.resume_command}, or train again with other values"
             ) from error
 
     def _describe(self, batch: TensorDictBase) -> dict[str, float]:

@@ -17,10 +17,11 @@ from coil_rl import record
 from coil_rl.errors import RunningError, UserError
 from coil_rl.files import remove_unfinished, write_text
 from coil_rl.output import say
-from coil_rl.plain_yaml import yaml_of
+from coil_rl.plain_yaml import read_yaml, yaml_of
 from coil_rl.run.stopping import resume_command
 
 CONFIG = "config.yaml"
+CODE, CODE_BEFORE = "code", "code_before"  # keys of it, see `code_of`
 HANDED_OVER = "handed_over"  # the policy that `delivery` chose
 OLD_HANDED_OVER = "policy_best.pt"  # its file in older folders
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,20 +59,26 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
         ) from None
 
 
-def begin(folder: Path, saved: Mapping[str, Any], command: Sequence[str] = ()) -> None:
+def begin(
+    folder: Path,
+    saved: Mapping[str, Any],
+    command: Sequence[str] = (),
+    trust: Sequence[str] = (),
+) -> None:
     """Write the versions, the configuration and the command of a new run.
 
     Args:
         saved: the configuration, plain values only; written as `config.yaml`.
         command: what was typed; written as `command.txt`, if there is any.
+        trust: packages that a command which goes on with the run must trust.
 
     Raises:
         UserError: if there is a run already.
     """
     if (folder / CONFIG).exists():
         raise UserError(
-            f"{folder} already holds a run; resume it with {resume_command(folder)}, or choose "
-            "another folder with hydra.run.dir=FOLDER"
+            f"{folder} already holds a run; resume it with {resume_command(folder, trust)}, or "
+            "choose another folder with hydra.run.dir=FOLDER"
         )
     record.VERSIONS.write(folder, versions())
     if command:
@@ -82,6 +89,27 @@ def begin(folder: Path, saved: Mapping[str, Any], command: Sequence[str] = ()) -
 def write_config(folder: Path, saved: Mapping[str, Any]) -> None:
     """Write the configuration of a run."""
     write_text(folder / CONFIG, yaml_of(saved))
+
+
+def code_of(folder: Path) -> dict[str, Any]:
+    """Return what the configuration in a folder says about the code of the user.
+
+    It is the SHA-256 of each file by its module (`CODE`), and what these were before changes that
+    the user accepted (`CODE_BEFORE`). Folders of earlier versions say nothing.
+    """
+    saved = read_yaml(folder / CONFIG)
+    return {key: saved[key] for key in (CODE, CODE_BEFORE) if isinstance(saved.get(key), Mapping)}
+
+
+def changed_code(folder: Path, present: Mapping[str, str]) -> str:
+    """Return the names of the modules whose file is another one than in a folder; empty for none.
+
+    Args:
+        present: SHA-256 of each file by its module.
+    """
+    begun = code_of(folder).get(CODE, present)
+    names = [name for name in {**begun, **present} if begun.get(name) != present.get(name)]
+    return " and ".join(sorted(names))
 
 
 def weights_file(folder: Path, which: str = "last") -> Path:

@@ -5,6 +5,7 @@ The other parts of a run are its learner and its callbacks, see `coil_rl.learner
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Protocol
@@ -21,7 +22,9 @@ from torchrl.envs import (
 )
 
 from coil_rl.errors import UserError
+from coil_rl.foreign.batch import SeededRows
 from coil_rl.foreign.limit import limits_of
+from coil_rl.foreign.trial import PATIENCE, Trial
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.normalised_action import normalising
@@ -166,6 +169,23 @@ class EnvMaker:
         env = transformed(env, transforms, "disturb, degrade" if disturb else "degrade")
         of_row = [guide for guide in range(len(guides)) for _ in range(rows)]
         return env, FollowAdvice(env, of_row)
+
+
+def try_out(env: EnvBase, guides: Mapping[str, TensorDictModuleBase]) -> Trial:
+    """Try an env of others and the controllers that act in it, and warn of what is found.
+
+    Args:
+        env: without transforms, of `SOME_ROWS`.
+        guides: by name.
+    """
+    trial = Trial(env, patience=PATIENCE)
+    if isinstance(env, SeededRows):
+        trial.ask_env()
+    for guide in guides.values():
+        trial.ask_controller(guide)
+    for finding in trial.findings:
+        warnings.warn(finding.text, stacklevel=2)
+    return trial
 
 
 def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> EnvBase:

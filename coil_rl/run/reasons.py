@@ -1,16 +1,19 @@
-"""Sentences on a run: what its returns are, which guide it holds, and what is handed over."""
+"""Sentences on a run: its returns, the guide it holds, what is handed over, what to type next."""
 
 import math
-from collections.abc import Mapping
+import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from coil_rl.learners.anchor import StartTest
 from coil_rl.record import DELIVERY, UNTESTED
-from coil_rl.report.runs import EVALUATION, SELECTION
+from coil_rl.report.runs import EVALUATION, RETURN, SELECTION
 from coil_rl.report.sentences import Sentences
 from coil_rl.report.table import return_format
+from coil_rl.run.stopping import command_of, resume_command
 
 SENTENCES = Sentences("coil_rl.run", "evaluation.j2")
+RISE = 0.05  # of the range of a curve: a rise of its last quarter that is worth more training
 FIRST = "first"  # policy of a run that holds its guide
 POLICIES = {
     "last": "the last policy",
@@ -73,3 +76,36 @@ def handed_over(folder: Path) -> list[str]:
         tested={names.get(name, name): value for name, value in report.returns.items()},
         ahead=[f"{value:+{spec}}" for value in report.ahead or ()],
     )
+
+
+def still_rising(rows: Sequence[Mapping[str, float]]) -> bool:
+    """Return whether the return of the kept policies was still rising at the end of a run.
+
+    Args:
+        rows: of `metrics.csv`.
+    """
+    returns = [row[RETURN] for row in rows if not math.isnan(row.get(RETURN, math.nan))]
+    quarter = len(returns) // 4
+    if quarter < 1:
+        return False
+    before, last = max(returns[:-quarter]), max(returns[-quarter:])
+    return last - before > RISE * (max(returns) - min(returns))
+
+
+def next_step(
+    folder: Path,
+    frames: int,
+    rows: Sequence[Mapping[str, float]] = (),
+    trust: Sequence[str] = (),
+) -> str:
+    """Return a line with the commands that usually follow a finished training.
+
+    Args:
+        rows: of `metrics.csv`.
+        trust: packages that these commands must trust.
+    """
+    longer = f"{resume_command(folder, trust)} budget.frames={2 * frames}"
+    report = f"coil-report folder={shlex.quote(str(folder.parent))}"
+    if still_rising(rows):
+        return f"Still rising at the end: {longer}"
+    return f"Next: {command_of('coil-evaluate', 'run', folder, trust)} | {report} | {longer}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
@@ -17,6 +18,8 @@ from torchrl.envs import EnvBase
 
 from coil_rl import record
 from coil_rl.errors import NO_SPACE, UserError, is_outside
+from coil_rl.foreign.batch import SeededRows
+from coil_rl.foreign.controllers import PerRow
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.measures import Measure
 from coil_rl.output import decoration, say
@@ -29,9 +32,13 @@ from coil_rl.run.curve import Watch
 from coil_rl.run.delivery import guide_of
 from coil_rl.run.experiment import PUT_BACK
 from coil_rl.run.folder import (
+    CODE,
+    CODE_BEFORE,
     HANDED_OVER,
     begin,
+    changed_code,
     check_same,
+    code_of,
     is_begun,
     is_evaluated,
     locked,
@@ -41,15 +48,15 @@ from coil_rl.run.folder import (
 )
 from coil_rl.run.guide_returns import guide_returns
 from coil_rl.run.judge import Trial, judge, report_outcome
-from coil_rl.run.next_step import next_step
-from coil_rl.run.parts import TRAIN, EnvMaker
-from coil_rl.run.reasons import SENTENCES, handed_over, start_test
+from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, try_out
+from coil_rl.run.reasons import SENTENCES, handed_over, next_step, start_test
 from coil_rl.run.stopping import resume_command
 from coil_rl.run.training import training_of
-from coil_rl.run.weights import put_weights
 
 if TYPE_CHECKING:
     import pandas as pd
+
+ACCEPT = "accept"  # what a user says to go on with changed code
 
 
 @dataclass(frozen=True)
@@ -110,6 +117,8 @@ class Run:
             `method.needs_guide` and `evaluation.measures` for reports.
         identity: values on which the numbers depend, by name; a resumed run must have the same.
         command: what was typed to make the run.
+        trust: packages that a command which goes on with it must trust.
+        code: returns the SHA-256 of each file of the user that it depends on, by module.
 
     Example:
         >>> import coil_rl
@@ -141,6 +150,8 @@ class Run:
     settings: Mapping[str, Any] = field(default_factory=dict)
     identity: Mapping[str, Any] = field(default_factory=dict)
     command: Sequence[str] = ()
+    trust: Sequence[str] = ()
+    code: Callable[[], Mapping[str, str]] = dict
 
     def __post_init__(self) -> None:
         self.folder = Path(self.folder)
@@ -159,6 +170,11 @@ class Run:
         """Whether the run has a policy, and not only a guide that acts alone."""
         return self.make_learner is not None
 
+    @property
+    def resume_command(self) -> str:
+        """The command that continues the run, as a shell reads it."""
+        return resume_command(self.folder, self.trust)
+
     def weights(self, which: str) -> Path:
         """Return the file of a policy, "handed_over" or "last".
 
@@ -172,7 +188,7 @@ class Run:
             )
         return weights_file(self.folder, which if self.delivery == "tested" else "last")
 
-    def train(self, frames: int | None = None) -> Run:
+    def train(self, frames: int | None = None, *, changed: str = "") -> Run:
         """Train to the end, evaluate, and return the run.
 
         A run that was stopped, or is shorter, goes on.
@@ -180,16 +196,18 @@ class Run:
         Args:
             frames: new length of the run. Schedules over the run, such as a learning rate, then
                 refer to the new length.
+            changed: "accept" to go on although the code of the env or of another part was changed
+                since the run began.
 
         Raises:
-            UserError: if another process uses the folder, if it holds another run, if the run is
-                longer than `frames`, or if that is no whole number.
+            UserError: if another process uses the folder, if it holds another run or its code was
+                changed, if the run is longer than `frames`, or if that is no whole number.
         """
         with locked(self.folder):
             if frames is not None:
                 self.lengthen(whole("frames", frames))
             if is_begun(self.folder):
-                self.finish_begun()
+                self.finish_begun(changed)
             else:
                 self.begin()
                 self.finish()
@@ -217,7 +235,9 @@ class Run:
         trial = self.trial
         if cases is not None:
             trial = trial_with_cases(trial, whole("cases", cases))
-        policy = self.policy()
+        env = self.make_env(SOME_ROWS, TEST)
+        self.try_out(env)
+        policy = self.policy(env)
         with tempfile.TemporaryDirectory() as temporary:
             place = Path(temporary) if folder is None else Path(folder).expanduser()
             judgement = judge(trial, policy, place, self.seed, self.drivers(policy))
@@ -234,11 +254,29 @@ class Run:
         """
         which = self.which if which is None else which
         self.weights(which)
-        env = self.make_env(1, TRAIN)
         if not self.has_agent:
             env, policy = self.make_env.guided(1, TRAIN)
+            self.try_out(env)
             return Controller(env, policy, self.folder)
+        env = self.make_env(1, TRAIN)
+        self.try_out(env)
         return Controller(env, self.load_policy(env, which), self.folder, which)
+
+    def try_out(self, env: EnvBase) -> None:
+        """Try what others wrote of the run, and warn of what is found; see `Trial`.
+
+        Args:
+            env: of the run, which shows whether there is anything.
+        """
+        names = changed_code(self.folder, self.code()) if is_begun(self.folder) else ""
+        if names:
+            warnings.warn(
+                f"{self.folder} was trained with another file of {names}: what follows is of the "
+                "present one",
+                stacklevel=2,
+            )
+        if any(isinstance(part, (SeededRows, PerRow)) for part in env.modules()):
+            try_out(self.make_env.bare(SOME_ROWS, TEST, None), self.make_env.guides())
 
     def policy(self, env: EnvBase | None = None, which: str | None = None) -> Any:
         """Return the policy of a finished run for an env; None without an agent.
@@ -253,7 +291,9 @@ class Run:
 
     def begin(self) -> None:
         """Write the configuration of a new run; a `UserError` if the folder holds one already."""
-        begin(self.folder, self.settings, self.command)
+        code = dict(self.code())
+        settings = {**self.settings, **({CODE: code} if code else {})}
+        begin(self.folder, settings, self.command, self.trust)
 
     def lengthen(self, frames: int) -> None:
         """Set a new length, before the run goes on.
@@ -277,7 +317,7 @@ class Run:
         self.identity = dict(self.identity) | {"budget.frames": frames, "budget.stages": stages}
         if not begun:
             return
-        write_config(self.folder, self.settings)
+        write_config(self.folder, {**self.settings, **code_of(self.folder)})
         for file in (record.EVALUATION, record.PAGE, record.SECONDS, record.DELIVERY):
             (self.folder / file.name).unlink(missing_ok=True)
         say(
@@ -286,18 +326,41 @@ class Run:
             error=True,
         )
 
-    def finish_begun(self) -> float:
+    def finish_begun(self, changed: str = "") -> float:
         """Finish the run in the folder, and return the mean test reward of its policy.
 
+        Args:
+            changed: as of `train`.
+
         Raises:
-            UserError: if its configuration was edited since it began.
+            UserError: if its configuration or its code was edited since it began.
         """
         if is_evaluated(self.folder):
             self.check_unchanged()
             reward = report_outcome(self.folder)
             self._say_next()
             return reward
+        self._take_code(changed)
         return self.finish(resumed=True)
+
+    def _take_code(self, changed: str) -> None:
+        """Go on with the code as it is; a `UserError` if it was changed and nobody accepts that."""
+        if changed not in ("", ACCEPT):
+            raise UserError(f"changed={changed} must be {ACCEPT}, or be left out")
+        present = dict(self.code())
+        names = changed_code(self.folder, present)
+        if names and changed != ACCEPT:
+            raise UserError(
+                f"{self.folder} was begun with another file of {names}, so one curve would be of "
+                "two tasks; put the file back, train another run, or go on with "
+                f"{resume_command(self.folder)} changed={ACCEPT}"
+            )
+        if names:
+            begun = code_of(self.folder)
+            before = begun.get(CODE_BEFORE, {}) | begun[CODE]
+            saved = {**self.settings, CODE: present, CODE_BEFORE: before}
+            write_config(self.folder, saved)
+            say(f"{self.folder} goes on with another file of {names}", error=True)
 
     def check_unchanged(self) -> None:
         """Check that the configuration of a finished run was not edited.
@@ -326,20 +389,20 @@ class Run:
             judge(self._trial_with_reasons(), policy, self.folder, self.seed, drivers)
             reward = report_outcome(self.folder)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"continue with: {resume_command(self.folder)}") from None
+            raise KeyboardInterrupt(f"continue with: {self.resume_command}") from None
         except ValueError as error:  # of env or controller, before or after the training
             if isinstance(error, UserError) or not is_outside(error):
                 raise
             raise UserError(
                 f"{error}; what is finished is kept: correct the cause and continue with "
-                f"{resume_command(self.folder)}"
+                f"{self.resume_command}"
             ) from error
         except OSError as error:
             if error.errno not in NO_SPACE:
                 raise
             raise UserError(
                 f"{error.filename or self.folder} cannot be written ({error.strerror}); make room, "
-                f"and continue with {resume_command(self.folder)}"
+                f"and continue with {self.resume_command}"
             ) from error
         self._say_next()
         return reward
@@ -348,7 +411,7 @@ class Run:
         """Print the command that usually follows a training."""
         if self.has_agent:
             rows = record.METRICS.need(self.folder)
-            say(next_step(self.folder, self.budget.frames, rows))
+            say(next_step(self.folder, self.budget.frames, rows, self.trust))
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
         """Train, draw the learning curve and return the policy to evaluate."""
@@ -439,7 +502,7 @@ class Run:
         guide = guide_of(state, env)
         if guide is not None:
             return guide
-        put_weights(policy, state, path)
+        checkpoint.put_weights(policy, state, path)
         return policy
 
     def _trial_with_reasons(self) -> Trial:

@@ -1,11 +1,9 @@
 """How a run is stopped by a signal, and by which command it goes on."""
 
 import shlex
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-
-_trusted: list[str] = []  # packages that a later command must trust, for the runs of this process
 
 
 class Stop:
@@ -51,21 +49,17 @@ class Stop:
 STOP = Stop()
 
 
-def remember_trust(packages: Iterable[str]) -> None:
-    """Set the packages that a command which takes the folder of a run must trust, too."""
-    _trusted[:] = packages
-
-
-def command_of(program: str, key: str, folder: Path) -> str:
+def command_of(program: str, key: str, folder: Path, trust: Sequence[str] = ()) -> str:
     """Return the command that takes the folder of a run, as a shell reads it.
 
     Args:
         key: by which it takes it.
+        trust: packages that it must trust.
     """
-    trust = [f"trust=[{','.join(_trusted)}]"] if _trusted else []
-    return shlex.join([program, f"{key}={folder}", *trust])
+    words = [f"trust=[{','.join(trust)}]"] if trust else []
+    return shlex.join([program, f"{key}={folder}", *words])
 
 
-def resume_command(folder: Path) -> str:
+def resume_command(folder: Path, trust: Sequence[str] = ()) -> str:
     """Return the command that continues a run, as a shell reads it."""
-    return command_of("coil-train", "resume", folder)
+    return command_of("coil-train", "resume", folder, trust)

@@ -20,7 +20,6 @@ from coil_rl.run.experiment import Experiment, watched_keys
 from coil_rl.run.folder import weights_file
 from coil_rl.run.parts import TESTS, EnvMaker
 from coil_rl.run.rollout import Rollout
-from coil_rl.run.weights import load_weights
 from coil_rl.transforms.normalised_action import given_units, units_of
 
 if TYPE_CHECKING:
@@ -41,7 +40,8 @@ def training_of(run: Run, before: int) -> Experiment:
         compile_steps(env)
     learner = run.require_agent()(env)
     if run.init is not None:
-        load_weights(learner.policy, _copy_of_init(run.folder, run.init), run.device)
+        init = _copy_of_init(run.folder, run.init)
+        checkpoint.put_weights(learner.policy, checkpoint.load(init, run.device), init)
     keys = [*learner.keys, *watched_keys(env, run.watch)]
     rollout = Rollout(env, learner.policy, run.budget.steps, keys, run.noise_correlation)
     make_env = partial(run.make_env, cases=TESTS)
@@ -68,6 +68,7 @@ def training_of(run: Run, before: int) -> Experiment:
         before=before,
         identity=run.identity,
         stages=run.budget.stages,
+        resume_command=run.resume_command,
     )
 
 

@@ -31,7 +31,7 @@ from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.parts import TESTS
 from coil_rl.run.run import Run
-from coil_rl.run.stopping import STOP, resume_command
+from coil_rl.run.stopping import STOP
 from coil_rl.tune.candidates import Candidates
 from coil_rl.tune.search import BEST, MEAN, OWN, MakeGuide, Number, Search, Tuner, Values, chosen
 
@@ -69,8 +69,9 @@ class TunedRun(Run):
             UserError: if the run is not finished, or its files are damaged.
         """
         if read_tuned(self.folder, self.numbers) is None:
-            finish = resume_command(self.folder)
-            raise UserError(f"{self.folder} has no {TUNED.name} yet; finish it with {finish}")
+            raise UserError(
+                f"{self.folder} has no {TUNED.name} yet; finish it with {self.resume_command}"
+            )
         return self._loaded(GuideActs(env), env, which)
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:

@@ -204,12 +204,9 @@ def described(result: Drive) -> list[str]:
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in the configuration.
-
-    Otherwise make the folder of the results.
-    """
+    """Raise a `UserError` for the first mistake in the configuration."""
     from coil_rl import check_values
-    from coil_rl.for_guests import check_used, make_folder
+    from coil_rl.for_guests import check_used
 
     check_values(config)
     if (config.run is None) == (not config.controller):
@@ -229,7 +226,6 @@ def check(config: DictConfig) -> None:
     what = ("controller",) if config.run is None else ("run", "policy")
     reason = f"nothing reads it with a {what[0]} and where={config.where}"
     check_used((*OF_ALL, *what, *OF_PLACES[config.where]), reason)
-    make_folder(Path(config.run_dir))
 
 
 main = partial(run_program, drive, "drive", check, "pkg://coil_robot.conf")

@@ -185,12 +185,9 @@ def _check_unique(key: str, paths: Sequence[Path]) -> None:
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in the configuration.
-
-    Otherwise make the folder of the results.
-    """
+    """Raise a `UserError` for the first mistake in the configuration."""
     from coil_rl import check_values
-    from coil_rl.for_guests import check_unused, check_used, make_folder
+    from coil_rl.for_guests import check_unused, check_used
 
     check_values(config)
     if config.recording is None:
@@ -205,7 +202,6 @@ def check(config: DictConfig) -> None:
         check_used(USED, "nothing in a replay without runs reads it")
     check_unused("env", ("num_envs",), "each recording has a row of its own")
     check_unused("env", ("smooth",), "a replay earns no reward")
-    make_folder(Path(config.run_dir))
 
 
 main = partial(run_program, replay, "replay", check, "pkg://coil_robot.conf")

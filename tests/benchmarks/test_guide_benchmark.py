@@ -28,7 +28,7 @@ from benchmarks.guide_benchmark.rows import (
     read_rows,
     references,
 )
-from coil_rl.config.check import check_parts
+from coil_rl.config.check import check
 from coil_rl.errors import UserError
 from coil_rl.report.runs import read_runs
 
@@ -365,7 +365,7 @@ def test_every_arm_and_every_method_of_a_task_can_be_started(task, tmp_path):
     for arm, method in jobs(task):
         words = [f"+experiment=guide_benchmark/{task}", f"+arm={arm}", f"method={method}"]
         with initialize_config_module("coil_rl.conf", version_base="1.3"):
-            check_parts(compose("train", [*words, f"run_dir={tmp_path}"]))
+            check(compose("train", [*words, f"run_dir={tmp_path}"]))
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from gymnasium import spaces
 from hydra import compose, initialize_config_module
 from programs import shipped
 
-from coil_rl.config.check import WITH_CHOICES, check_parts
+from coil_rl.config.check import WITH_CHOICES, check
 from coil_rl.errors import UserError
 
 METHODS = shipped("method")
@@ -41,7 +41,7 @@ def checked(method, tmp_path, *words):
     guide = ["guide=controller", f"guide.controller.of={__name__}:on"]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose("train", [*env, *guide, f"method={method}", f"run_dir={tmp_path}", *words])
-    check_parts(config)
+    check(config)
 
 
 @pytest.mark.fast(3)

@@ -11,7 +11,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from programs import called
 
-from coil_rl.config.check import check_parts
+from coil_rl.config.check import check
 from coil_rl.config.compose import compose_train
 from coil_rl.config.messages import is_no_bug, sentence
 from coil_rl.config.parts import env_maker
@@ -74,7 +74,7 @@ def answer(*words):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             config = compose_train([*words, "run_dir=run"])
-            check_parts(config)
+            check(config)
             check_read(config, words)
     except Exception as error:
         from_hydra = isinstance(error, (HydraException, OmegaConfBaseException))

@@ -3,7 +3,14 @@
 import decimal
 import fractions
 import itertools
+import logging
+import os
+import random
+import re
+import signal
 import sys
+import time
+import warnings
 from functools import partial
 
 import gymnasium
@@ -16,6 +23,8 @@ from torchrl.envs import TransformedEnv
 
 from coil_rl import GymnasiumEnv
 from coil_rl.foreign.faults import ForeignError
+from coil_rl.foreign.guard import SETTINGS
+from coil_rl.foreign.trial import Trial
 from coil_rl.guides import ControllerGuide, PerRow
 from coil_rl.transforms import GuideActions
 
@@ -441,3 +450,307 @@ def test_what_a_controller_does_with_its_observation_changes_nothing():
 
     data = stepped(ControllerGuide(spoils), controllers={"careless": spoils})
     assert (data["observation"] != 0).all()
+
+
+class Drift(Plant):
+    """Its state moves with its action, and a little at random."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.begin(seed)
+        return self.seen(), {}
+
+    def step(self, action):
+        self.time += 1
+        self.move(float(np.ravel(action)[0]))
+        return self.seen(), float(self.state[0]), False, self.time == 20, {}
+
+    def begin(self, seed):
+        self.state = [self.np_random.uniform(), 0.0]
+
+    def move(self, action):
+        self.state[0] += action + 0.1 * self.draw()
+        self.state[1] += 1.0
+
+    def draw(self):
+        return 0.0
+
+    def seen(self):
+        return np.array(self.state, np.float32)
+
+
+MEMORY = []
+
+
+class SharesDefault(Drift):
+    def __init__(self, state=[0.0, 0.0], **options):  # noqa: B006
+        super().__init__(**options)
+        self.state = state
+
+    def begin(self, seed):
+        self.state[:] = [self.np_random.uniform(), 0.0]
+
+
+class SharesAttribute(SharesDefault):
+    shared = [0.0, 0.0]  # noqa: RUF012
+
+    def __init__(self, **options):
+        super().__init__(self.shared, **options)
+
+
+class Remembers:
+    """A controller of each row alone; its variants share their memory."""
+
+    def __init__(self):
+        self.memory = []
+
+    def reset(self):
+        self.memory.clear()
+
+    def act(self, observation):
+        self.memory.append(float(observation[0]))
+        return [0.1 * sum(self.memory[-3:])]
+
+
+class OfClass(Remembers):
+    memory = []  # noqa: RUF012
+
+    def __init__(self):
+        pass
+
+    def reset(self):
+        pass
+
+
+class OfClassCleared(OfClass):
+    def reset(self):
+        self.memory.clear()
+
+
+class OfModule(OfClass):
+    def act(self, observation):
+        MEMORY.append(float(observation[0]))
+        return [0.1 * sum(MEMORY[-3:])]
+
+
+class OfClock:
+    """Gives a new output only after 10 ms, as a PID controller of a package does."""
+
+    def __init__(self):
+        self.last, self.output = -np.inf, [0.0]
+
+    def reset(self):
+        self.last = -np.inf
+
+    def act(self, observation):
+        now = time.monotonic()
+        if now - self.last > 0.01:
+            self.last, self.output = now, [float(observation[0])]
+        return self.output
+
+
+class Slow(Drift):
+    """Moves with the time that has passed."""
+
+    def begin(self, seed):
+        super().begin(seed)
+        self.began = time.monotonic()
+
+    def move(self, action):
+        super().move(action)
+        self.state[1] = float(time.monotonic() - self.began > 0.03)
+
+
+def findings(env=Drift, controller=None):
+    """Return the sentences of the trial of an env of two rows, or of a controller in it."""
+    trial = Trial(GymnasiumEnv(env, 2, first_seed=0))
+    if controller is None:
+        trial.ask_env()
+    else:
+        trial.ask_controller(ControllerGuide(controller))
+    return [(kind, text) for kind, text in trial.findings if kind != "bounds"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "kind", "message"),
+    [
+        ({"env": SharesDefault}, "rows", "all rows share a default of SharesDefault.__init__; mak"),
+        ({"env": SharesAttribute}, "rows", "all rows share SharesAttribute.shared; make it in __i"),
+        ({"controller": OfClass}, "rows", "all rows share OfClass.memory; make it in __init__"),
+        ({"controller": OfClassCleared}, "rows", "all rows share OfClass.memory; make it in __"),
+        ({"controller": OfModule}, "rows", r"all rows share .*test_faults\.MEMORY; make it in"),
+        (
+            {"controller": OfClock},
+            "clock",
+            "when 0.02 s pass between two steps: it reads the clock",
+        ),
+        ({"controller": OfClock()}, "clock", "the controller OfClock gives other actions when"),
+        ({"env": Slow}, "clock", "observation of the env differs when 0.02 s pass between two"),
+    ],
+)
+def test_trial_names_what_rows_share_and_what_lives_by_the_clock(asked, kind, message):
+    ((found, text),) = findings(**asked)
+    assert found == kind
+    assert re.search(message, text)
+
+
+@pytest.mark.parametrize("asked", [{}, {"controller": Remembers}, {"controller": Remembers()}])
+def test_trial_blames_nothing_that_is_right(asked):
+    assert findings(**asked) == []
+
+
+class Seeds(Drift):
+    """Seeds the process at each reset, and draws from it."""
+
+    def begin(self, seed):
+        torch.manual_seed(seed), np.random.seed(seed), random.seed(seed)
+        super().begin(seed)
+
+    def draw(self):
+        return torch.rand(()).item() + np.random.rand() + random.random()
+
+
+class Draws(Seeds):
+    """Draws from the process without a seed."""
+
+    def begin(self, seed):
+        self.state = [self.draw(), 0.0]
+
+
+class DrawsLate(Draws):
+    def begin(self, seed):
+        Drift.begin(self, seed)
+
+    def draw(self):
+        return super().draw() if self.time > 12 else 0.0
+
+
+def actions(env, count=30):
+    """Return the entries of steps with given actions."""
+    generator, rows = torch.Generator().manual_seed(0), []
+    carrier = env.reset()
+    for _ in range(count):
+        action = torch.rand(env.action_spec.shape, generator=generator)
+        step, carrier = env.step_and_maybe_reset(carrier.set("action", action))
+        rows.append(torch.cat([step["observation"], step["next", "reward"]], -1))
+    return torch.stack(rows)
+
+
+@pytest.mark.parametrize("id", [Drift, Seeds, Draws])
+def test_rows_that_use_the_numbers_of_the_process_are_separate_and_repeat(id):
+    one, again, workers = (
+        actions(GymnasiumEnv(id, 3, seed=5, workers=number)) for number in (0, 0, 2)
+    )
+    assert torch.equal(one, again)
+    assert torch.equal(one, workers)
+    alone = actions(GymnasiumEnv(id, 1, first_seed=7), 10)
+    beside = GymnasiumEnv(id, 2, first_seed=7)
+    if id is not Drift:  # the actions of a row are drawn for all
+        assert torch.equal(alone[0, 0], actions(beside, 10)[0, 0])
+
+
+def chdir(*_):
+    os.chdir("/")
+
+
+CHANGES = {
+    "torch": lambda: torch.manual_seed(0),
+    "torch drawn": lambda: torch.rand(3),
+    "numpy": lambda: np.random.seed(0),
+    "numpy drawn": lambda: np.random.rand(),
+    "random": lambda: random.seed(0),
+    "random drawn": random.random,
+    "folder": chdir,
+    "dtype": lambda: torch.set_default_dtype(torch.float64),
+    "grad": lambda: torch.set_grad_enabled(False),
+    "threads": lambda: torch.set_num_threads(3),
+    "printing": lambda: np.set_printoptions(precision=1),
+    "torch printing": lambda: torch.set_printoptions(precision=1),
+    "errors": lambda: np.seterr(all="raise"),
+    "warnings": lambda: warnings.simplefilter("ignore"),
+    "level": lambda: logging.root.setLevel(1),
+    "disable": lambda: logging.disable(logging.CRITICAL),
+    "output": lambda: setattr(sys, "stderr", sys.stdout),
+}
+MADE = {
+    "signal": lambda: signal.signal(signal.SIGTERM, signal.SIG_IGN),
+    "device": lambda: torch.set_default_device("meta"),
+    "deterministic": lambda: torch.use_deterministic_algorithms(True),
+}
+
+
+def state():
+    """Return what belongs to the process."""
+    drawn = (torch.rand(()).item(), float(np.random.rand()), random.random())
+    filters = [each[0] for each in warnings.filters]
+    return (*drawn, filters, *(repr(get()) for get, put in SETTINGS))
+
+
+def seeded():
+    torch.manual_seed(9), np.random.seed(9), random.seed(9)
+
+
+def process_after(change, place):
+    """Return the state of the process after a place of an env or a controller has changed it."""
+
+    class Does(Drift):
+        def __init__(self, **options):
+            super().__init__(**options)
+            self.at("the maker")
+
+        def at(self, here):
+            if here == place:
+                change()
+
+        def begin(self, seed):
+            self.at("reset")
+            super().begin(seed)
+
+        def move(self, action):
+            self.at("step")
+            super().move(action)
+
+    class Controller:
+        def act(self, observation):
+            change()
+            return [0.0]
+
+    def function(observation):
+        change()
+        return observation[..., :1]
+
+    seeded()
+    env = GymnasiumEnv(Does, 2, first_seed=0)
+    if place in ("act", "function"):
+        guide = ControllerGuide(Controller if place == "act" else function)
+        env = TransformedEnv(env, GuideActions({"theirs": guide}))
+    carrier = env.reset()
+    for _ in range(6):
+        carrier = env.step_mdp(env.step(carrier.set("action", torch.zeros(2, 1))))
+    return state()
+
+
+@pytest.mark.parametrize("place", ["the maker", "reset", "step", "act", "function"])
+@pytest.mark.parametrize("change", [*CHANGES, *MADE])
+def test_process_is_as_before_whatever_foreign_code_does_to_it(change, place):
+    if change in MADE and place not in ("the maker", "reset"):
+        pytest.skip("it is restored where an env or a controller is made")
+    seeded()
+    before = state()
+    assert process_after((CHANGES | MADE)[change], place) == before
+
+
+def test_foreign_code_finds_again_what_it_has_set():
+    seen = []
+
+    class Home(Drift):
+        def __init__(self, **options):
+            super().__init__(**options)
+            os.chdir("/tmp")
+            torch.set_default_dtype(torch.float64)
+
+        def move(self, action):
+            seen.append((os.getcwd(), torch.get_default_dtype()))
+
+    GymnasiumEnv(Home, 1).rollout(3)
+    assert set(seen) == {("/tmp", torch.float64)}

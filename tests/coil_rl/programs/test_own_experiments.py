@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from programs import called, shipped, shipped_file
 
-from coil_rl.config.check import check_parts
+from coil_rl.config.check import check
 from coil_rl.programs.sweeps import described
 
 # What each experiment needs besides an env of one's own.
@@ -100,7 +100,7 @@ def test_jobs_of_an_experiment_can_be_started_in_an_own_env(experiment, tmp_path
             frames = {"method=oil": 18_900, "method=dagger": 22_400}.get(job[0], 200_000)
             assert config.budget.frames == frames  # those of the env, not of the cone world
         if job[0] != "learner=dqn" and not checked.issuperset(job):
-            check_parts(config)
+            check(config)
         checked.update(job)
 
 

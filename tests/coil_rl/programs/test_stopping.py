@@ -50,11 +50,7 @@ def test_signal_saves_the_present_update_and_says_how_to_go_on(tmp_path, number)
 
 
 def test_command_that_goes_on_is_quoted_and_keeps_its_trust(tmp_path):
-    stopping.remember_trust(["one", "two"])
-    try:
-        words = shlex.split(stopping.resume_command(tmp_path / "it's a run"))
-    finally:
-        stopping.remember_trust([])
+    words = shlex.split(stopping.resume_command(tmp_path / "it's a run", ["one", "two"]))
     assert words == ["coil-train", f"resume={tmp_path}/it's a run", "trust=[one,two]"]
 
 

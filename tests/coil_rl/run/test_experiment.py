@@ -17,6 +17,7 @@ from coil_rl.run.curve import EvaluationCurve
 from coil_rl.run.experiment import Experiment, watched_keys
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.rollout import Rollout
+from coil_rl.run.stopping import resume_command
 from coil_rl.transforms import GuideActions
 
 WATCH = {"episode": {"crashed": ["info", "crashed"]}, "step": {"cone": ["info", "reward", "cone"]}}
@@ -39,7 +40,14 @@ def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=()):
         batches=2,
     )
     return Experiment(
-        learner, rollout, frames, folder, watch=WATCH, checkpoint_every=2, curve=curve
+        learner,
+        rollout,
+        frames,
+        folder,
+        watch=WATCH,
+        checkpoint_every=2,
+        curve=curve,
+        resume_command=resume_command(folder),
     )
 
 

@@ -1,14 +1,18 @@
-"""Sentences on the tests of a run: what an anchored policy holds, and what is handed over."""
+"""Sentences on a run: what an anchored policy holds, what is handed over, what to type next."""
 
 import json
 import math
+import shlex
+from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
+from coil_rl.config.trust import to_trust, trust_packages
 from coil_rl.errors import UserError
 from coil_rl.learners.anchor import StartTest
 from coil_rl.record import DELIVERY
-from coil_rl.run.reasons import handed_over, start_test
+from coil_rl.run.reasons import handed_over, next_step, start_test, still_rising
 
 
 def row(*numbers):
@@ -61,3 +65,47 @@ def test_damaged_file_is_one_sentence(tmp_path):
     (tmp_path / DELIVERY.name).write_text("{")
     with pytest.raises(UserError, match="remove it, and the sentence is left out"):
         handed_over(tmp_path)
+
+
+def curve_of(*returns):
+    return [{"frames": 10 * n, "evaluation/return": value} for n, value in enumerate(returns)]
+
+
+@pytest.mark.parametrize(
+    ("returns", "rising"),
+    [
+        ((0, 1, 2, 3, 4, 5, 6, 7), True),
+        ((0, 5, 7, 8, 8, 8, 8, 8.1), False),
+        ((0, 8, 3, 8, 2, 8, 1, 8), False),
+        ((0, math.nan, 1, 2, 3, 4, 5, math.nan), True),
+        ((1, 2, 3), False),
+        ((), False),
+    ],
+)
+def test_curve_is_rising_if_its_last_quarter_is_above_the_rest(returns, rising):
+    assert still_rising(curve_of(*returns)) is rising
+
+
+def test_next_command_is_quoted_and_doubles_the_frames():
+    line = next_step(Path("my runs/one"), 1000, curve_of(0, 1, 2, 3))
+    assert line == "Still rising at the end: coil-train 'resume=my runs/one' budget.frames=2000"
+    line = next_step(Path("runs/one"), 1000)
+    assert "coil-evaluate run=runs/one | coil-report folder=runs |" in line
+
+
+def test_next_command_trusts_what_the_command_of_the_run_named():
+    command = OmegaConf.create(
+        {
+            "guide": {"of": "my_plant:PI"},
+            "env": {"_target_": "one.Env"},
+            "learner": {"_target_": "coil_rl.learners.PPO"},
+            "logger": {"_target_": "torchrl.record.loggers.csv.CSVLogger"},  # taken by its name
+        }
+    )
+    try:
+        trust_packages(["other"], command)
+        line = next_step(Path("runs/one"), 1000, trust=to_trust(command))
+    finally:
+        trust_packages([])
+    words = shlex.split(line.split(" | ")[0].removeprefix("Next: "))
+    assert words == ["coil-evaluate", "run=runs/one", "trust=[my_plant,one,other]"]

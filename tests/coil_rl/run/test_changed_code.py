@@ -1,0 +1,89 @@
+"""A run folder knows the files of a user that its env and its guide are defined in."""
+
+import importlib
+import subprocess
+import sys
+
+import pytest
+
+import coil_rl
+from coil_rl import UserError
+from coil_rl.run.folder import CODE, CODE_BEFORE, code_of
+
+PLANT = """
+import gymnasium, numpy as np
+from gymnasium import spaces
+from rewards_of_mine import cost
+
+class Tank(gymnasium.Env):
+    observation_space = spaces.Box(-1, 1, (1,))
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time, self.level = 0, self.np_random.uniform(-1, 1)
+        return np.array([self.level], np.float32), {}
+
+    def step(self, action):
+        self.time += 1
+        self.level = float(np.clip(self.level + 0.1 * action[0], -1, 1))
+        return np.array([self.level], np.float32), -cost(self.level), False, self.time >= 8, {}
+"""
+TINY = [
+    "learner.minibatches=1",
+    "budget.num_envs=2",
+    "budget.steps=8",
+    "evaluation.cases=2",
+    "evaluation.curve.points=1",
+]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    (tmp_path / "tank_of_mine.py").write_text(PLANT)
+    (tmp_path / "rewards_of_mine.py").write_text("def cost(level):\n    return abs(level)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.invalidate_caches()
+    yield tmp_path
+    for name in ("tank_of_mine", "rewards_of_mine"):
+        sys.modules.pop(name, None)
+
+
+def test_change_of_a_file_is_said_and_refused_where_the_run_would_go_on(place, capsys):
+    folder = place / "run"
+    run = coil_rl.train("tank_of_mine:Tank", frames=32, folder=folder, overrides=TINY)
+    begun = code_of(folder)[CODE]
+    assert set(begun) == {"tank_of_mine", "rewards_of_mine"}
+    assert coil_rl.open_run(folder, trust=["tank_of_mine"]).train(frames=48).budget.frames == 48
+    run.evaluate(cases=1)
+    (place / "rewards_of_mine.py").write_text("def cost(level):\n    return level**2\n")
+    with pytest.warns(UserWarning, match="was trained with another file of rewards_of_mine: what"):
+        run.evaluate(cases=1)
+    again = coil_rl.open_run(folder, trust=["tank_of_mine"])
+    with pytest.warns(UserWarning, match="another file of rewards_of_mine"):
+        again.controller()
+    with pytest.raises(UserError, match=r"another file of rewards_of_mine.* changed=accept"):
+        again.train(frames=64)
+    assert code_of(folder)[CODE] == begun
+    again.train(frames=64, changed="accept")
+    assert "goes on with another file of rewards_of_mine" in capsys.readouterr().err
+    now = code_of(folder)
+    assert now[CODE_BEFORE] == begun
+    assert now[CODE]["rewards_of_mine"] != begun["rewards_of_mine"]
+
+
+def test_program_goes_on_where_the_change_is_accepted(place):
+    folder = place / "run"
+    coil_rl.train("tank_of_mine:Tank", frames=32, folder=folder, overrides=TINY)
+    (place / "tank_of_mine.py").write_text(PLANT + "\n# another file\n")
+
+    def resumed(*words):
+        program = "from coil_rl.programs.train import main; main()"
+        command = [sys.executable, "-c", program, f"resume={folder}", "trust=[tank_of_mine]"]
+        given = ["budget.frames=48", "env.workers=0", *words]
+        return subprocess.run([*command, *given], cwd=place, capture_output=True, text=True)
+
+    refused = resumed()
+    assert refused.returncode == 2
+    assert "begun with another file of tank_of_mine" in refused.stderr
+    assert resumed("changed=accept").returncode == 0
