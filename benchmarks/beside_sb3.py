@@ -158,13 +158,13 @@ def our_learner(
         "starts": values["starts"],
         "capacity": CAPACITY,
         "batch_size": values["minibatch"],
-        "ratio": values["minibatch"] / values["every"],
+        "updates_per_step": 1 / values["every"],
     }
     if algorithm == "sac":
         # The default of Stable-Baselines3 is for actions in [-1, 1], ours for those of the env.
         high, size = env.action_spec.space.high, env.action_spec.shape[-1]
         entropy = -size + size * math.log(float(high.max()))
-        return SAC(env, target_entropy=entropy, temperature=1.0, max_grad_norm=1e6, **common)
+        return SAC(env, target_entropy=entropy, temperature=1.0, **common)
     epsilon = Linear(1.0, values["epsilon"], until=values["explore"])
     return DQN(env, epsilon=epsilon, double=False, **common)
 

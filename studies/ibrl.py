@@ -12,22 +12,23 @@ an edit by a second policy.
 """
 
 from collections.abc import Sequence
-from functools import cached_property, partial
+from contextlib import ExitStack
 from typing import Any, Unpack
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.envs import EnvBase, ExplorationType, exploration_type, set_exploration_type
-from torchrl.objectives import LossModule, SACLoss
 
 from coil_rl.learners.critics import Critics
 from coil_rl.learners.encoders import Mlp
-from coil_rl.learners.policy import Policy
+from coil_rl.learners.n_step import discount
+from coil_rl.learners.policy import ByKey, Entries, Policy, next_of
 from coil_rl.learners.sac import SAC, SACSettings
+from coil_rl.learners.weights import Weights
 from coil_rl.ranges import NonNegative, checked
 from coil_rl.transforms.action_space import ActionSpace
 
@@ -74,47 +75,77 @@ class IBRL(SAC):
                 f"IBRL chooses between actions, but the env has no {ADVICE}; "
                 "put GuideActions before it"
             )
-        self.choice = partial(Proposals, guide=guide, sharpness=sharpness, edit=edit)
+        self.guide, self.sharpness, self.edit = guide, sharpness, edit
         super().__init__(env, in_keys, **settings)
         self.also_store(ADVICE)
 
-    def build_loss(
-        self,
-        env: EnvBase,
-        in_keys: Sequence[NestedKey],
-        network: Mlp,
-        target_critics: int | None,
-        arguments: dict[str, Any],
-    ) -> LossModule:
-        """Return the loss, with the second policy if there is one."""
-        space, editor = ActionSpace(env.action_spec, len(env.batch_size)), None
-        if self.choice.keywords["edit"]:
-            if space.bounds is None or not torch.stack(space.bounds).isfinite().all():
+    def build_actor(self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp) -> Policy:
+        """Return the policy, and build the second one if there is one."""
+        self.space, self.editor = ActionSpace(env.action_spec, len(env.batch_size)), None
+        if self.edit:
+            if self.space.bounds is None or not torch.stack(self.space.bounds).isfinite().all():
                 raise ValueError(
                     "edit is a fraction of the range of the action, but it has no bounds; "
                     "take edit=0"
                 )
-            editor = self.build_actor(env, [*in_keys, ADVICE], network)
-        loss = ProposalLoss(partial(self.choice, space=space, editor=editor), arguments)
-        loss.target_entropy  # noqa: B018  becomes part of the state at the first access
-        return loss
+            self.editor = super().build_actor(env, [*in_keys, ADVICE], network)
+        return super().build_actor(env, in_keys, network)
 
-    def build_policy(self) -> TensorDictSequential:
+    def build_policy(self) -> TensorDictModuleBase:
         """Return the policy that collects the batches: it chooses between the proposals."""
-        before = [] if self.inputs is None else [self.inputs]
-        return TensorDictSequential(*before, self.loss.proposals)
+        self.proposals = Proposals(
+            self.actor,
+            self.target,
+            space=self.space,
+            editor=self.editor,
+            guide=self.guide,
+            sharpness=self.sharpness,
+            edit=self.edit,
+        )
+        return self.proposals if self.inputs is None else ByKey(self.inputs, self.proposals)
 
-    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+    def further_weights(self) -> list[Weights]:
+        """Return the weights of the second policy."""
+        self.of_editor = [] if self.editor is None else [Weights(self.editor)]
+        return self.of_editor
+
+    def losses(self, minibatch: Entries) -> dict[str, Tensor]:
         """Return the losses of a minibatch [N] and other values, such as the `guide_share`."""
-        return super().losses(minibatch).set("guide_share", self.loss.guide_share)
+        with ExitStack() as stack:
+            for weights in self.of_editor:
+                stack.enter_context(weights.used())
+            return super().losses(minibatch)
+
+    def critic_losses(self, minibatch: Entries) -> dict[str, Tensor]:
+        """Return the loss of all critics, and the share of the guide in the choice."""
+        with torch.no_grad(), self.of_target.used(), set_exploration_type(ExplorationType.RANDOM):
+            _, values = self.proposals.rate(next_of(minibatch))
+            shares = self.proposals.shares(values)
+            value = (shares * values).sum(0)
+            reward = minibatch["next", "reward"].squeeze(-1).to(value.dtype)
+            target = (reward + discount(minibatch, self.gamma) * value).unsqueeze(-1)
+        losses = self.distances(self.critics.outputs(minibatch, train=True), target)
+        return losses | {"guide_share": shares[0].mean()}
+
+    def actor_losses(self, minibatch: Entries) -> dict[str, Tensor]:
+        """Return the losses of both policies and of the temperature."""
+        losses = super().actor_losses(minibatch)
+        if self.editor is None:
+            return losses
+        states = minibatch.copy()
+        change, log_prob = self.editor.density(states).draw()
+        states.set("action", self.proposals.edited(states, change))
+        value = self.critics.values(states).amin(0)
+        losses["loss_actor"] = losses["loss_actor"] + (self.alpha * log_prob - value).mean()
+        return losses
 
 
-class Proposals(Critics):
+class Proposals(TensorDictModuleBase):
     """The choice between the actions of guide, policy and perhaps an editor; it writes `action`.
 
     Args:
         actor: the policy.
-        loss: has the target critics, which rate the actions.
+        critics: rate the actions.
         space: of the actions.
         editor: the second policy, which edits the guide's action; None: there is none.
         guide: index of the guide in the advice.
@@ -122,10 +153,12 @@ class Proposals(Critics):
         edit: largest change of the guide's action, as a fraction of half the range of the action.
     """
 
+    by_key = True
+
     def __init__(
         self,
         actor: Policy,
-        loss: SACLoss,
+        critics: Critics,
         *,
         space: ActionSpace,
         editor: Policy | None,
@@ -133,38 +166,35 @@ class Proposals(Critics):
         sharpness: float | None,
         edit: float,
     ) -> None:
-        super().__init__(loss, loss.target_qvalue_network_params)
         self.in_keys, self.out_keys = list(dict.fromkeys([*actor.in_keys, ADVICE])), ["action"]
-        self.actor, self.editor, self.space = actor, editor, space
+        super().__init__()
+        self.actor, self.critics, self.editor, self.space = actor, critics, editor, space
         self.guide, self.sharpness, self.edit = guide, sharpness, edit
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def forward(self, tensordict: Any) -> Any:
         """Write the chosen action."""
         proposals, values = self.rate(tensordict)
         chosen = values.argmax(0)
         if self.sharpness is not None and exploration_type() == ExplorationType.RANDOM:
             chosen = Categorical(self.shares(values).movedim(0, -1)).sample()
-        return tensordict.set(
-            "action", proposals.gather(0, expand_as_right(chosen[None], proposals[:1]))[0]
-        )
+        index = expand_as_right(chosen[None], proposals[:1])
+        return tensordict.set("action", proposals.gather(0, index)[0])
 
-    def rate(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def rate(self, entries: Any) -> tuple[Tensor, Tensor]:
         """Return the proposals, the guide's first, [P, *B, A], and their values [P, *B]."""
-        proposals = [
-            tensordict[ADVICE][..., self.guide, :],
-            self.actor(tensordict.copy())["action"],
-        ]
+        read = Entries({key: entries[key] for key in self.in_keys})
+        proposals = [read[ADVICE][..., self.guide, :], self.actor(read.copy())["action"]]
         if self.editor is not None:
-            proposals.append(self.edited(tensordict, self.editor(tensordict.copy())["action"]))
+            proposals.append(self.edited(read, self.editor(read.copy())["action"]))
         actions = torch.stack(proposals)
-        data = tensordict.select(*self.actor.in_keys).expand(len(proposals), *tensordict.batch_size)
-        return actions, self.values(data.set("action", actions)).amin(0)
+        repeated = {key: value.expand(len(actions), *value.shape) for key, value in read.items()}
+        return actions, self.critics.values(Entries(repeated).set("action", actions)).amin(0)
 
-    def edited(self, tensordict: TensorDictBase, change: Tensor) -> Tensor:
+    def edited(self, entries: Any, change: Tensor) -> Tensor:
         """Return the guide's action with a change, which is an action of the second policy."""
         low, high = self.space.bounds  # type: ignore[misc]
         return self.space.clamp(
-            tensordict[ADVICE][..., self.guide, :] + self.edit * (change - (low + high) / 2)
+            entries[ADVICE][..., self.guide, :] + self.edit * (change - (low + high) / 2)
         )
 
     def shares(self, values: Tensor) -> Tensor:
@@ -172,46 +202,3 @@ class Proposals(Critics):
         if self.sharpness is not None:
             return (self.sharpness * values).softmax(0)
         return torch.zeros_like(values).scatter(0, values.argmax(0, keepdim=True), 1)
-
-
-class ProposalLoss(SACLoss):
-    """TorchRL's loss of SAC with the target of IBRL, and perhaps the loss of the second policy.
-
-    Args:
-        choice: makes `Proposals` of a policy and this loss, and has the keyword `editor`.
-        arguments: of TorchRL's loss.
-    """
-
-    def __init__(self, choice: partial[Proposals], arguments: dict[str, Any]) -> None:
-        super().__init__(**arguments)
-        self.make_proposals = partial(choice, arguments["actor_network"])
-        self.editor = choice.keywords["editor"]
-
-    @cached_property  # no submodule, because the loss holds the weights
-    def proposals(self) -> Proposals:
-        """The choice between the actions."""
-        return self.make_proposals(self)
-
-    def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
-        data = tensordict.copy()
-        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            _, values = self.proposals.rate(data["next"])
-            shares = self.proposals.shares(values)
-            self.guide_share = shares[0].mean()
-            data["next", self.value_estimator.tensor_keys.value] = (
-                (shares * values).sum(0).unsqueeze(-1)
-            )
-            target: Tensor = self.value_estimator.value_estimate(data).squeeze(-1)
-        return target
-
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of the policy plus that of the second one, and TorchRL's other values."""
-        loss, values = super().actor_loss(tensordict)
-        if self.editor is None:
-            return loss, values
-        change, log_prob = self.editor.get_dist(tensordict).draw()
-        data = tensordict.select(*self.qvalue_network.in_keys, strict=False)
-        data.set("action", self.proposals.edited(tensordict, change))
-        rated = self._vmap_qnetworkN0(data, self._cached_detached_qvalue_params)
-        value = rated["state_action_value"].amin(0).squeeze(-1)
-        return loss + (self._alpha * log_prob - value).mean(), values

@@ -11,11 +11,11 @@ from coil_rl.export.contract import CONTRACT, FORMAT, ONNX, VERSION, checksum
 Change = Callable[[dict], None]
 
 
-def model() -> bytes:
+def model(advised: bool = True, batch: str | int = "b", seen: str = "observation") -> bytes:
     """Return a file that adds the observation, the advice and what it remembers: their sum."""
-    rows = [("observation", 2), ("guide_action", 1), ("state.sum", 1)]
+    rows = [(seen, 2), *([("guide_action", 1)] if advised else []), ("state.sum", 1)]
     inputs = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["b", size]) for name, size in rows
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, [batch, size]) for name, size in rows
     ]
     outputs = [
         helper.make_tensor_value_info(name, TensorProto.FLOAT, ["b", 1])
@@ -23,8 +23,8 @@ def model() -> bytes:
     ]
     axes = helper.make_tensor("axes", TensorProto.INT64, [1], [1])
     nodes = [
-        helper.make_node("ReduceSum", ["observation", "axes"], ["total"], keepdims=1),
-        helper.make_node("Add", ["total", "guide_action"], ["advised"]),
+        helper.make_node("ReduceSum", [seen, "axes"], ["total"], keepdims=1),
+        helper.make_node("Add", ["total", "guide_action" if advised else "total"], ["advised"]),
         helper.make_node("Add", ["advised", "state.sum"], ["action"]),
         helper.make_node("Identity", ["action"], ["next.sum"]),
     ]
@@ -33,9 +33,9 @@ def model() -> bytes:
     return helper.make_model(graph, opset_imports=opset, ir_version=9).SerializeToString()
 
 
-def write(folder: Path, change: Change = lambda contract: None) -> Path:
+def write(folder: Path, change: Change = lambda contract: None, content: bytes = b"") -> Path:
     """Write the file and its contract, perhaps changed, and return the folder."""
-    content = model()
+    content = content or model()
     contract = {
         "format": FORMAT,
         "version": VERSION,

@@ -9,7 +9,7 @@ SHORT = ["evaluation.cases=2", "evaluation.gif=false", f"env.max_steps={STEPS + 
 # No test looks at a curve.
 TINY = ["budget.num_envs=2", "budget.steps=16", "logger=none", *SHORT]
 TINY += [f"~evaluation.curve.cases.{name}" for name in ("evaluation", "selection")]
-REPLAY = ["learner.starts=16", "learner.ratio=1", "learner.batch_size=16"]
+REPLAY = ["learner.starts=16", "learner.updates_per_step=0.0625", "learner.batch_size=16"]
 ON_POLICY = ["learner.minibatches=2", "learner.epochs=1", "learner.action_gain=1"]
 FOREST = ["learner.regressor.n_estimators=3"]
 # What makes a method small, and its policy do something before it has learned anything.

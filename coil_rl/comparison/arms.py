@@ -2,9 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 
-import yaml
 from omegaconf import DictConfig
 from torchrl.envs import EnvBase
 
@@ -15,6 +13,7 @@ from coil_rl.errors import UserError
 GUIDE, OPPOSITE, ZERO, RANDOM, NETWORK = "guide", "opposite", "zero", "random", "first network"
 PPO, ANCHORED, RESIDUAL, SAC, TUNE = "ppo", "coil_anchored", "residual", "sac", "tune"
 SLOW_STEP = 1e-3  # s of an env step, from which SAC, which needs fewer steps, is tried too
+SAC_UPDATE = 5e-3  # s, about; SAC takes an update in each step
 SHARE = 0.1  # of the budget, for each job
 POINTS = 4  # kept policies of a training, besides the first one
 MOST_CURVE_CASES = 8
@@ -125,16 +124,8 @@ def job_of(given: Named, arm: Arm, seed: int, frames: int | None, short: Sequenc
     if frames is not None:
         words = [word for word in words if key_of(word) != "budget.frames"]
         words.append(f"budget.frames={frames}")
-        if arm.name == SAC and not any(key_of(word) == "learner.starts" for word in words):
-            words.append(f"learner.starts={min(_starts_of_sac(), frames // 2)}")
     words += [*short, *arm.words, f"label='{arm.name}'", f"seed={seed}"]
     nodes = dict(given.nodes)
     if arm.name != TUNE:
         nodes.pop("tune", None)
     return Named(words, nodes, shared=True)
-
-
-def _starts_of_sac() -> int:
-    """Return the default of `learner.starts` for SAC: the stored steps before it learns."""
-    file = resources.files("coil_rl.conf") / "learner" / "sac.yaml"
-    return int(yaml.safe_load(file.read_text("utf-8"))["learner"]["starts"])

@@ -3,15 +3,14 @@
 import itertools
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.comparison.arms import POINTS, SHARE, TUNE, Arm, curve_cases
+from coil_rl.comparison.arms import POINTS, SAC, SAC_UPDATE, SHARE, TUNE, Arm, curve_cases
 from coil_rl.comparison.baselines import Acting
 from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.run.evaluation import episodes
@@ -94,10 +93,6 @@ class Plan:
             f"{_duration(self.seconds)}{more}."
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return asdict(self)
-
 
 def _duration(seconds: float) -> str:
     """Return a duration in words."""
@@ -167,7 +162,8 @@ def plan(config: DictConfig, pace: Pace, arms: Sequence[Arm], minutes: float) ->
     """
     cases = _cases(config, pace, arms, minutes)
     fixed = _measuring(config, pace, arms, cases)
-    each = [pace.step if arm.name == TUNE else pace.learning for arm in arms]
+    other = {TUNE: pace.step, SAC: pace.step + SAC_UPDATE}
+    each = [other.get(arm.name, pace.learning) for arm in arms]
     a_frame = SEEDS * sum(
         cost + pace.guide * arm.asks for cost, arm in zip(each, arms, strict=True)
     )

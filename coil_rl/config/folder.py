@@ -162,7 +162,7 @@ def run_folder(text: str | Path) -> Path:
     """
     if str(text).startswith(PREFIX):
         return folder_of(str(text).removeprefix(PREFIX))
-    return Path(text).expanduser()
+    return Path(text).expanduser().absolute()
 
 
 def folder_of(name: str) -> Path:

@@ -129,6 +129,7 @@ def prepare(
     Raises:
         UserError: for a mistake in an argument.
     """
+    folder = Path(folder).absolute()
     given = named(env, guide, str(folder))
     words = list(given.words)
     words.append(f"method={method or method_for(guide)}")

@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import read_file, read_text
@@ -19,6 +22,7 @@ from coil_rl.files import read_file, read_text
 FORMAT, VERSION = "coil-rl policy", 1
 CONTRACT, ONNX, TORCH, DRIVER = "contract.json", "policy.onnx", "policy.pt2", "drive.py"
 LARGEST_CONTRACT, LARGEST_POLICY = 10_000_000, 500_000_000  # bytes
+LARGEST_ENTRY = 100_000_000  # numbers of an input or output
 REMEDY = "export the policy again: coil-export run=RUN"
 
 
@@ -78,12 +82,74 @@ def read_contract(file: Path) -> tuple[dict[str, Any], bytes]:
     return contract, content
 
 
-def _check(contract: Mapping[str, Any]) -> None:
-    """Read everything that is used once, so that what is missing is an error here."""
-    for entry in contract["inputs"]:
-        _ = entry["name"], list(entry["key"]), list(map(int, entry["shape"])), entry["dtype"]
-    for entry in contract["state"]:
-        _ = entry["input"], entry["output"], list(entry["shape"]), entry["dtype"], entry["first"]
-    action = contract["outputs"][0]
-    _ = list(action["shape"]), list(action["space"]["shape"]), action["space"]["dtype"]
-    _ = contract["guide"]["place"], contract["env"]["title"]
+def _number_type(name: str) -> str:
+    if np.dtype(name).kind not in "fiub":
+        raise ValueError(f"{name} is no type of numbers")
+    return name
+
+
+def _shape(sizes: list[int]) -> list[int]:
+    if any(size < 1 for size in sizes) or math.prod(sizes) > LARGEST_ENTRY:
+        raise ValueError(f"{sizes} is no shape of at most {LARGEST_ENTRY} numbers")
+    return sizes
+
+
+Shape = Annotated[list[int], AfterValidator(_shape)]
+NumberType = Annotated[str, AfterValidator(_number_type)]
+
+
+class _Input(BaseModel):
+    name: str
+    key: Annotated[list[str], Field(min_length=1)]
+    shape: Shape
+    dtype: NumberType
+
+
+class _State(BaseModel):
+    input: str
+    output: str
+    shape: Shape
+    dtype: NumberType
+    first: float | list[Any]
+
+
+class _Space(BaseModel):
+    shape: Shape
+    dtype: NumberType
+
+
+class _Output(BaseModel):
+    shape: Shape
+    space: _Space
+    choices: list[int] = []
+    lowest: list[int] = []
+    bounds: dict[str, Any] | None = None
+
+
+class _Guide(BaseModel):
+    place: Literal["absent", "inside", "outside"]
+    names: list[str] = []
+    reason: str = ""
+
+
+class _Env(BaseModel):
+    title: str
+
+
+class _Contract(BaseModel):
+    """What is used of a contract; it may say more."""
+
+    inputs: list[_Input]
+    state: list[_State]
+    outputs: Annotated[list[_Output], Field(min_length=1)]
+    guide: _Guide
+    env: _Env
+
+
+def _check(contract: Any) -> None:
+    """Raise a `ValueError` for the first part of a contract that is missing or of another type."""
+    try:
+        _Contract.model_validate(contract)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error

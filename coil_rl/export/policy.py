@@ -43,6 +43,7 @@ class ExportedPolicy:
         self.contract, content = read_contract(self.file)
         names = ["action", *(entry["output"] for entry in self.contract["state"])]
         self.session = Session(content, names, threads)
+        self.session.check(self.contract)
         self.reset()
 
     def reset(self) -> None:

@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from torchrl.modules import GRUModule
 
 from coil_rl.export.gru import WrittenGru
-from coil_rl.learners.critics import Critics
 from coil_rl.run.controller import Controller
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import space_of
@@ -180,8 +179,6 @@ def _flat(policy: TensorDictModuleBase) -> Iterable[TensorDictModuleBase]:
         raise NotExportableError("it is a forest, not a network")
     elif isinstance(policy, GRUModule):
         yield WrittenGru(policy)
-    elif isinstance(policy, Critics):
-        yield policy.written_out()
     else:
         yield policy
 

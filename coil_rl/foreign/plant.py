@@ -34,6 +34,7 @@ from coil_rl.foreign.host import Host, maker_beside
 from coil_rl.foreign.limit import limit_of, warn_of_limit
 from coil_rl.foreign.makers import Env
 
+OLD_LIMIT = "TimeLimit.truncated"  # in info: how older envs say that the time was over
 MASKS = {"action_mask", "action_masks"}  # in info: which actions are possible
 
 
@@ -227,6 +228,13 @@ class GymnasiumPlant(Plant):
                 raise ForeignError(f"info of step is {shown(info)}, not a dictionary")
             reward = number(reward, "the reward", self.codec.floats)
             terminated, truncated = flag(terminated, "terminated"), flag(truncated, "truncated")
+        if terminated and not truncated and info.get(OLD_LIMIT):
+            warnings.warn(
+                f"info of the env {self.name} says {OLD_LIMIT} at a step with terminated=True: it "
+                "is a termination, after which nothing is earned; where only the time was over "
+                "return terminated=False, truncated=True",
+                stacklevel=2,
+            )
         self.reward, self.info = float(reward), info
         self.terminated, self.truncated = terminated, truncated
 

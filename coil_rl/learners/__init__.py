@@ -2,6 +2,7 @@
 
 from coil_rl.learners.a2c import A2C as A2C
 from coil_rl.learners.anchor import Anchor as Anchor
+from coil_rl.learners.crossq import CrossQ as CrossQ
 from coil_rl.learners.dqn import DQN as DQN
 from coil_rl.learners.dynamic_coil import AfterFrames as AfterFrames
 from coil_rl.learners.dynamic_coil import AtConvergence as AtConvergence
@@ -15,4 +16,5 @@ from coil_rl.learners.kickstart import KickstartLoss as KickstartLoss
 from coil_rl.learners.ppo import PPO as PPO
 from coil_rl.learners.reinforce import Reinforce as Reinforce
 from coil_rl.learners.sac import SAC as SAC
+from coil_rl.learners.tqc import TQC as TQC
 from coil_rl.learners.trpo import TRPO as TRPO

@@ -1,63 +1,155 @@
-"""Critics of actions as one module, for policies and losses that compare values of actions."""
+"""Several critics of actions, which are computed at once."""
 
-import copy
-from typing import Self
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.objectives import REDQLoss, SACLoss
+from torch.nn import functional as F
+from torchrl.envs import EnvBase
+
+from coil_rl.learners.encoders import ACTIVATIONS, ConcatObservations, Mlp
+from coil_rl.learners.networks import Inputs, action_shape
+
+
+class BatchNorm(nn.Module):
+    """Normalisation of the numbers of several networks over a batch, [critics, N, width].
+
+    Unless it learns, it normalises by the running statistics of the batches that it has learned.
+
+    Args:
+        critics: number of networks.
+        width: numbers of each.
+        momentum: share of a batch in the running statistics.
+    """
+
+    def __init__(
+        self, critics: int, width: int, device: torch.device | None, momentum: float = 0.01
+    ) -> None:
+        super().__init__()
+        self.momentum = momentum
+        shape = (critics, 1, width)
+        self.gain = nn.Parameter(torch.ones(shape, device=device))
+        self.shift = nn.Parameter(torch.zeros(shape, device=device))
+        self.mean: Tensor = nn.Buffer(torch.zeros(shape, device=device))
+        self.variance: Tensor = nn.Buffer(torch.ones(shape, device=device))
+
+    def forward(self, x: Tensor, train: bool) -> Tensor:
+        """Normalise numbers; with `train` by those of this batch, which are learned."""
+        mean, variance = self.mean, self.variance
+        if train:
+            variance, mean = torch.var_mean(x, 1, keepdim=True, correction=0)
+            with torch.no_grad():
+                self.mean.lerp_(mean, self.momentum)
+                self.variance.lerp_(variance, self.momentum)
+        return (x - mean) * (variance + 1e-3).rsqrt() * self.gain + self.shift
+
+
+class Layer(nn.Module):
+    """The same layer of several networks, computed at once.
+
+    Args:
+        each: the layer of each network.
+        biased: whether there is a bias.
+    """
+
+    def __init__(self, each: Sequence[nn.Linear], *, biased: bool = True) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.stack([layer.weight.detach().T for layer in each]))
+        self.bias: nn.Parameter | None = None
+        if biased:
+            self.bias = nn.Parameter(torch.stack([layer.bias.detach()[None] for layer in each]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [critics, N, inputs] to [critics, N, outputs]."""
+        if self.bias is None:
+            return torch.bmm(x, self.weight)
+        return torch.baddbmm(self.bias, x, self.weight)
 
 
 class Critics(TensorDictModuleBase):
-    """The critics of a loss of TorchRL, all at once.
+    """Networks that estimate the return of an action, with one tensor for a layer of all of them.
 
-    They read entries that have been normalised already. As a module it writes their uncertainty:
-    the standard deviation of the values of an action, in the unit of the return, as `("next",
-    "uncertainty")` [*B, 1].
+    As a module it writes their uncertainty: the standard deviation of the values of an action, in
+    the unit of the return, as `("next", "uncertainty")` [*B, 1].
 
     Args:
-        loss: has the critics.
-        weights: of the critics, perhaps those of the target networks; None: those that learn.
+        env: the env, for its specs.
+        in_keys: entries that they observe, besides the action.
+        network: architecture of each; convolutions are shared.
+        count: how many they are.
+        outputs: numbers that each gives for an action.
+        norm: of the hidden layers, before their activation; "batch" normalises the inputs too, and
+            leaves out the biases that it would cancel.
+        dropout: share of the numbers of a hidden layer that are left out in learning.
+        inputs: has written what they read in place of some of `in_keys` already.
+        action_key: entry with the action.
     """
 
-    def __init__(self, loss: SACLoss | REDQLoss, weights: TensorDictBase | None = None) -> None:
-        # Without weights; a tuple, so that it is no submodule.
-        self._network = (loss.qvalue_network,)
-        self.in_keys: list[NestedKey] = list(loss.qvalue_network.in_keys)
+    by_key = True
+
+    def __init__(
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey],
+        network: Mlp,
+        count: int,
+        *,
+        outputs: int = 1,
+        norm: Literal["none", "layer", "batch"] = "none",
+        dropout: float = 0.0,
+        inputs: Inputs | None = None,
+        action_key: NestedKey = "action",
+    ) -> None:
+        keys: list[NestedKey] = [*in_keys, action_key]
+        self.in_keys = keys if inputs is None else inputs.reads(keys)
         self.out_keys: list[NestedKey] = [("next", "uncertainty")]
         super().__init__()
-        self.weights = loss.qvalue_network_params if weights is None else weights
-        self.networks: nn.ModuleList | None = None  # written out, one for each critic
+        self.count, self.dropout = count, dropout
+        self.concat = ConcatObservations(env, keys, {action_key: action_shape(env)}, network)
+        each = [
+            Mlp(network.hidden, network.activation).layers(
+                self.concat.width, outputs, 1.0, env.device
+            )
+            for _ in range(count)
+        ]
+        linear = [[layer for layer in mlp if isinstance(layer, nn.Linear)] for mlp in each]
+        *hidden, last = zip(*linear, strict=True)
+        biased = norm != "batch"
+        self.layers = nn.ModuleList([*(Layer(same, biased=biased) for same in hidden), Layer(last)])
+        self.activation = ACTIVATIONS[network.activation]()
+        self.layer_norm = norm == "layer" or network.layer_norm
+        widths = [self.concat.width, *network.hidden] if norm == "batch" else []
+        self.norms = nn.ModuleList(BatchNorm(count, width, env.device) for width in widths)
 
-    def written_out(self) -> Self:
-        """Return a copy in which each critic is a network of its own, for export."""
-        copied = copy.deepcopy(self)
-        (network,) = self._network
-        copied.networks = nn.ModuleList()
-        for weights in self.weights.data.unbind(0):
-            own = copy.deepcopy(network)
-            weights.to_module(own)
-            copied.networks.append(own)
-        del copied.weights
-        return copied
+    def outputs(self, entries: Any, *, train: bool = False) -> Tensor:
+        """Return the numbers of each critic for the action of entries, [critics, *B, outputs].
 
-    def values(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the values of the action, [critics, *B]."""
-        (network,) = self._network
-        data = tensordict.select(*network.in_keys)
-        if self.networks is not None:
-            values = [each(data.copy())["state_action_value"] for each in self.networks]
-            return torch.stack(values).squeeze(-1)
+        Args:
+            entries: [*B] with `in_keys`.
+            train: whether dropout acts, and batches are normalised by their own statistics.
+        """
+        read = self.concat(*(entries[key] for key in self.in_keys))
+        x = read.reshape(-1, read.shape[-1]).expand(self.count, -1, -1)
+        for place, layer in enumerate(self.layers):
+            if place and self.dropout and train:
+                x = F.dropout(x, self.dropout)
+            if place and self.layer_norm:
+                x = F.layer_norm(x, x.shape[-1:])
+            if self.norms:
+                x = self.norms[place](x, train)
+            if place:
+                x = self.activation(x)
+            x = layer(x)
+        return x.view(self.count, *read.shape[:-1], x.shape[-1])
 
-        def one(weights: TensorDictBase) -> Tensor:
-            with weights.to_module(network):
-                value: Tensor = network(data.copy())["state_action_value"]
-            return value
+    def values(self, entries: Any) -> Tensor:
+        """Return the values of the action of entries [*B], [critics, *B]."""
+        return self.outputs(entries).mean(-1)
 
-        return torch.vmap(one)(self.weights).squeeze(-1)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def forward(self, tensordict: Any) -> Any:
         """Write the uncertainty for the next step of the env."""
-        return tensordict.set(("next", "uncertainty"), self.values(tensordict).std(0).unsqueeze(-1))
+        tensordict.set(("next", "uncertainty"), self.values(tensordict).std(0).unsqueeze(-1))
+        return tensordict

@@ -1,7 +1,7 @@
 """Distributions of actions, written out.
 
 They are light: a rollout and an update of a small network make one in each step, and the objects of
-`torch.distributions` then take longer than the arithmetic. The numbers are the same to the bit.
+`torch.distributions` then take longer than the arithmetic. The samples are the same to the bit.
 TorchRL's losses take them as any other distribution.
 """
 
@@ -68,13 +68,11 @@ class Normal(Density):
     def __init__(self, loc: Tensor, scale: Tensor, event_dims: int) -> None:
         self.loc, self.scale, self.event_dims = loc, scale, event_dims
 
-    def number(self, noise: Tensor | None) -> Tensor:
-        """Return normal numbers, from given standard normal ones or new ones."""
-        if noise is None:
-            noise = torch.empty(
-                self.loc.shape, dtype=self.loc.dtype, device=self.loc.device
-            ).normal_()
-        return self.loc + noise * self.scale
+    def drawn(self) -> tuple[Tensor, Tensor]:
+        """Return random normal numbers, and their logarithmic normal density [*batch]."""
+        noise = torch.empty(self.loc.shape, dtype=self.loc.dtype, device=self.loc.device).normal_()
+        log_prob = self.summed(-noise.square() / 2 - self.scale.log() - LOG_ROOT)
+        return self.loc + noise * self.scale, log_prob
 
     def density(self, number: Tensor) -> Tensor:
         """Return the logarithmic normal density [*batch] of numbers."""
@@ -87,7 +85,9 @@ class Normal(Density):
 
     def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return a sample and its logarithmic density."""
-        number = self.number(noise)
+        if noise is None:
+            return self.drawn()
+        number = self.loc + noise * self.scale
         return number, self.density(number)
 
     def log_prob(self, sample: Tensor) -> Tensor:
@@ -130,11 +130,11 @@ class SquashedNormal(Normal):
 
     def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return a sample and its logarithmic density."""
-        number = self.number(noise)
-        sample = self.squashed(number)
-        if noise is not None:  # as an update computes it, from the sample
+        if noise is not None:  # the density as an update computes it, from the sample
+            sample = self.squashed(self.loc + noise * self.scale)
             return sample, self.log_prob(sample)
-        return sample, self.density(number) - self._stretch(number)
+        number, log_prob = self.drawn()
+        return self.squashed(number), log_prob - self._stretch(number)
 
     def log_prob(self, sample: Tensor) -> Tensor:
         """Return the logarithmic density of a sample."""

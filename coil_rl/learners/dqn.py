@@ -5,7 +5,7 @@ Q(s, a) is moved towards y = r + gamma * Q'(s', argmax_b Q(s', b)), or y = r whe
 terminated. Q' is a target network that follows Q slowly. The policy is epsilon-greedy.
 """
 
-import math
+import copy
 from collections.abc import Sequence
 from typing import Unpack
 
@@ -13,15 +13,18 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.data import Categorical, OneHot
 from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueModule
-from torchrl.objectives import DQNLoss
 
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import AnchoredInputs, AnchoredValues, hold_of
 from coil_rl.learners.encoders import Mlp, ObservationNetwork, without_memory
-from coil_rl.learners.off_policy import OffPolicy, Ratio, ReplaySettings
+from coil_rl.learners.n_step import discount
+from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerStep
+from coil_rl.learners.policy import Entries, next_of
+from coil_rl.learners.weights import Weights
 from coil_rl.ranges import NonNegative, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.action_space import nested_key
@@ -58,8 +61,9 @@ class DQN(OffPolicy):
         >>> metrics = dqn.update(Rollout(env, dqn.policy, steps=8, keys=dqn.keys).collect())
     """
 
-    parts = ("policy", *OffPolicy.parts)
-    minimised = reported = ("loss",)
+    parts = ("target", *OffPolicy.parts)
+    minimised = ("loss",)
+    reported = ("loss", "value")
 
     def __init__(
         self,
@@ -71,15 +75,15 @@ class DQN(OffPolicy):
         action_gain: NonNegative = 1.0,
         epsilon: Share | Schedule = Linear(1.0, 0.05, until=0.3),
         double: bool = True,
-        tau: Share = 0.01,
-        ratio: Ratio = 16.0,
+        updates_per_step: UpdatesPerStep = 0.25,
         **settings: Unpack[ReplaySettings],
     ) -> None:
         self.epsilon = schedule(epsilon)
         check_actions(env)
         in_keys = [nested_key(key) for key in in_keys]
         network = without_memory(network or Mlp(hidden, "relu"), "DQN")
-        super().__init__(env, in_keys, tau=tau, ratio=ratio, **settings)
+        super().__init__(env, in_keys, updates_per_step=updates_per_step, **settings)
+        self.one_hot = isinstance(env.action_spec, OneHot)
         single = env.action_spec_unbatched  # the network is evaluated on batches of any size
         numbers = ObservationNetwork(
             env, in_keys, network, single.space.n, action_gain, dtype=env.reward_spec.dtype
@@ -92,17 +96,11 @@ class DQN(OffPolicy):
             first = min(first, HELD_EPSILON)
         self.explorer = EGreedyModule(single, eps_init=first, eps_end=0.0, device=env.device)
         self.policy = self.build_policy(env)
-        # Huber's loss estimates medians. These ignore the rare step that ends an episode, unless
-        # rewards are tiny.
-        self.set_loss(
-            DQNLoss(
-                self.network,
-                action_space=single,
-                double_dqn=double,
-                delay_value=True,
-                loss_function="l2",
-            )
-        )
+        self.double, (self.values, _) = double, self.network.module
+        self.target = copy.deepcopy(self.values).requires_grad_(False)
+        self.of_values, self.of_target = Weights(self.values), Weights(self.target)
+        buffers = [*self.values.buffers(), *self.target.buffers()]
+        self.set_update([self.of_values.vector], [self.of_target.vector, *buffers])
         self.extend([])
 
     def build_policy(self, env: EnvBase) -> TensorDictSequential:
@@ -116,12 +114,43 @@ class DQN(OffPolicy):
             modules.append(networks.FastTensorDictModule(bonus, keys, ["action_value"]))
         return TensorDictSequential(*modules, choice, self.explorer)
 
+    @torch.no_grad()
+    def after_update(self) -> None:
+        """Move the target network."""
+        self.of_target.vector.lerp_(self.of_values.vector, self.tau)
+
+    def losses(self, minibatch: Entries) -> dict[str, Tensor]:
+        """Return the loss of a minibatch [N] and the mean value of the best action, scalars.
+
+        Huber's loss estimates medians. These ignore the rare step that ends an episode, unless
+        rewards are tiny.
+        """
+        action = minibatch["action"]
+        index = action.argmax(-1) if self.one_hot else action
+        with self.of_values.used():
+            values = self.values(minibatch.copy())["action_value"]
+            with torch.no_grad():
+                target = self.targets(minibatch)
+        chosen = values.gather(-1, index.long().unsqueeze(-1)).squeeze(-1)
+        return {
+            "loss": (chosen - target).square().mean(),
+            "value": values.detach().amax(-1).mean(),
+        }
+
+    def targets(self, minibatch: Entries) -> Tensor:
+        """Return y of a minibatch, [N]."""
+        with self.of_target.used(fixed=True):
+            values = self.target(next_of(minibatch))["action_value"]
+        selecting = self.values(next_of(minibatch))["action_value"] if self.double else values
+        best = values.gather(-1, selecting.argmax(-1, keepdim=True)).squeeze(-1)
+        reward = minibatch["next", "reward"].squeeze(-1).to(best.dtype)
+        return reward + discount(minibatch, self.gamma) * best
+
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Store the steps of a batch and learn; arguments as for `OffPolicy.update`.
 
         Returns:
-            The metrics of `OffPolicy`; `value`, the mean value of the best action in the last
-            minibatch, NaN without one; and `epsilon`.
+            The metrics of `OffPolicy`, and `epsilon`.
         """
         metrics = super().update(batch, progress)
         epsilon = self.epsilon(progress)
@@ -130,13 +159,6 @@ class DQN(OffPolicy):
             epsilon = min(epsilon, HELD_EPSILON)
         self.explorer.eps.fill_(epsilon)
         return metrics | {"epsilon": epsilon}
-
-    @torch.no_grad()
-    def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
-        """Return the mean value of the best action in the last minibatch, NaN without one."""
-        if minibatch is None:
-            return {"value": math.nan}
-        return {"value": float(self.network(minibatch)["chosen_action_value"].mean())}
 
 
 def check_actions(env: EnvBase) -> None:

@@ -7,11 +7,11 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from coil_rl.compiled import Compiled
 from coil_rl.errors import UserError
+from coil_rl.learners.policy import Entries
 from coil_rl.learners.state import Stateful
 from coil_rl.ranges import checked
 
@@ -29,10 +29,12 @@ class GradientStep(Stateful):
     Args:
         losses: returns scalars by name for a minibatch, and other tensors that are reported.
         groups: parameters, grouped by learning rate.
-        modules: hold the tensors that the losses read, besides the parameters.
+        reads: other tensors that the losses, or `after`, read or change.
         rates: returns the learning rate of each group for the progress of the run.
         eps: of Adam.
-        max_grad_norm: gradients are scaled down to this norm, over all parameters together.
+        betas: of Adam.
+        max_grad_norm: gradients are scaled down to this norm, over all parameters together; None:
+            they stay as they are.
         after: is called after each step.
         compile: whether to compile the step, which changes the last digits; "auto": after the first
             update with any steps, if the run will have `ENOUGH` steps or more.
@@ -43,11 +45,12 @@ class GradientStep(Stateful):
 
     losses: Callable[[Any], Mapping[str, Tensor]]
     groups: Sequence[Sequence[nn.Parameter]]
-    modules: Sequence[nn.Module]
+    reads: Sequence[Tensor]
     rates: Callable[[float], Sequence[float]]
     _: KW_ONLY
     eps: float
-    max_grad_norm: float
+    betas: tuple[float, float] = (0.9, 0.999)
+    max_grad_norm: float | None
     after: Callable[[], Any] | None = None
     compile: bool | Literal["auto"] = "auto"
     compilable: bool = True
@@ -65,7 +68,10 @@ class GradientStep(Stateful):
             raise ValueError("compile=true: code is compiled for the CPU only; take compile=auto")
         self.compile = self.compile if self.compilable and on_cpu else False
         self.adam = torch.optim.Adam(
-            [{"params": group} for group in self.groups], eps=self.eps, fused=True
+            [{"params": group} for group in self.groups],
+            eps=self.eps,
+            betas=self.betas,
+            fused=True,
         )
         self.compiled = Compiled(self._on_tensors)
         self.steps, self.begun = 0, 0.0  # progress of the run at the first step
@@ -102,12 +108,16 @@ class GradientStep(Stateful):
                 return values
         losses = self.losses(minibatch)
         self.steps += 1
-        self.minimise(sum(weight * losses[name] for name, weight in weights.items()))
+        self.minimise(
+            sum(
+                losses[name] if weight == 1 else weight * losses[name]
+                for name, weight in weights.items()
+            )
+        )
         return {name: each.detach() for name, each in losses.items()}
 
     def _compiled(self, minibatch: Any, weights: Mapping[str, float]) -> dict[str, Tensor]:
-        nested = isinstance(minibatch, TensorDictBase)
-        self.keys = list(minibatch.keys(True, True) if nested else minibatch)
+        self.keys = list(minibatch)
         self.weighted = list(weights)
         rates = [group["lr"] for group in self.adam.param_groups]
         numbers = torch.tensor([*weights.values(), *rates], device=self.parameters[0].device)
@@ -120,7 +130,8 @@ class GradientStep(Stateful):
         for parameter in self.parameters:  # as `zero_grad`, which takes as long as the step
             parameter.grad = None
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
+        if self.max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
         self._step()
 
     def _step(self) -> None:
@@ -137,8 +148,7 @@ class GradientStep(Stateful):
         tensors: list[Tensor] = [*self.parameters]
         for parameter in self.parameters:
             tensors += state[parameter].values()
-        for module in self.modules:
-            tensors += [*module.parameters(), *module.buffers()]
+        tensors += self.reads
         return list({id(tensor): tensor for tensor in tensors}.values())
 
     def _on_tensors(self, numbers: Tensor, *tensors: Tensor) -> list[Tensor]:
@@ -146,10 +156,7 @@ class GradientStep(Stateful):
 
         `tensors` are the entries `keys`, then those of `_state`.
         """
-        minibatch = TensorDict(dict(zip(self.keys, tensors, strict=False)), len(tensors[0]))
-        # TorchRL's losses keep detached parameters, which would be constants here.
-        for module in self.modules:
-            module.__dict__.get("_cache", {}).clear()
+        minibatch = Entries(zip(self.keys, tensors, strict=False))
         count = len(self.weighted)
         weights, rates = numbers[:count].unbind(0), numbers[count:].unbind(0)
         losses = self.losses(minibatch)
@@ -161,7 +168,8 @@ class GradientStep(Stateful):
             gradients = torch.autograd.grad(total, self.parameters, allow_unused=True)
             for parameter, gradient in zip(self.parameters, gradients, strict=True):
                 parameter.grad = gradient
-            torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm, foreach=False)
+            if self.max_grad_norm is not None:
+                torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm, foreach=False)
             self._step()
         # Copies, as a result may be an argument.
         return [each.detach().clone() for each in losses.values()]
@@ -194,3 +202,8 @@ def means(steps: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
         return {}
     values = torch.stack([torch.stack([step[name] for name in names]) for step in steps])
     return dict(zip(names, values.mean(0).tolist(), strict=True))
+
+
+def tensors_of(*modules: nn.Module) -> list[Tensor]:
+    """Return all parameters and buffers of some modules."""
+    return [each for module in modules for each in (*module.parameters(), *module.buffers())]

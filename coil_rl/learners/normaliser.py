@@ -14,7 +14,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import Categorical, OneHot
+from torchrl.data import Categorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.encoders import entry_specs
@@ -213,6 +213,8 @@ def normaliser(
         chosen = vectors_of_measurements(env, in_keys)
     elif isinstance(normalise, bool):
         chosen = vectors_of_measurements(env, in_keys) if normalise else []
+        if normalise:
+            _warn_of_pictures(env, in_keys)
     else:
         chosen = list(normalise)
         if unread := [str(key) for key in chosen if key not in in_keys]:
@@ -221,6 +223,18 @@ def normaliser(
                 f"observed are {', '.join(map(str, in_keys))}"
             )
     return Normaliser(env, chosen, automatic=normalise == "auto") if chosen else None
+
+
+def _warn_of_pictures(env: EnvBase, in_keys: Sequence[NestedKey]) -> None:
+    """Say which entries keep their numbers although all are to be normalised."""
+    for key, spec in zip(in_keys, entry_specs(env, in_keys), strict=True):
+        if spec.dtype == torch.uint8:
+            why = "it holds bytes, which networks divide by 255"
+        elif _is_image(env, spec):
+            why = "it is a picture"
+        else:
+            continue
+        warnings.warn(f"normalise=true leaves {_name(key)} as it is: {why}", stacklevel=3)
 
 
 class RawObservations:
@@ -237,7 +251,11 @@ class RawObservations:
     ) -> None:
         # Whether each is normalised: perhaps by a decision of the first batch.
         self.used: dict[NestedKey, Tensor | None] = {}
-        vectors = vectors_of_measurements(env, in_keys)
+        specs = zip(in_keys, entry_specs(env, in_keys), strict=True)
+        self.images = [
+            key for key, spec in specs if _is_image(env, spec) and spec.dtype.is_floating_point
+        ]
+        vectors = [*vectors_of_measurements(env, in_keys), *self.images]
         moments = {}
         if normaliser is not None:
             moments = dict(zip(normaliser.in_keys, normaliser.moments, strict=True))
@@ -263,10 +281,12 @@ class RawObservations:
             moments.add(batch[key])
             if found := moments.described(moments.size > LARGE):
                 del self.used[key]
-                remedy = "auto or true" if used is None else "true"
+                remedy = f"use learner.normalise={'auto or true' if used is None else 'true'}"
+                if key in self.images:
+                    remedy = "a picture of 0 to 255 needs a space of uint8, or a division by 255"
                 warnings.warn(
                     f"{_name(key)} is observed as it is, but is far out of scale for a network: "
-                    f"{', '.join(found)}; use learner.normalise={remedy}",
+                    f"{', '.join(found)}; {remedy}",
                     stacklevel=2,
                 )
 
@@ -285,11 +305,13 @@ def _name(key: NestedKey) -> str:
 
 def vectors_of_measurements(env: EnvBase, keys: Sequence[NestedKey]) -> list[NestedKey]:
     """Return those of some entries of an env that are not advice, choices or images."""
-    advice, batch_dims = advice_keys(env), len(env.batch_size)
-    chosen = []
+    advice, chosen = advice_keys(env), []
     for key, spec in zip(keys, entry_specs(env, keys), strict=True):
         is_choice = isinstance(spec, CHOICES) or not spec.dtype.is_floating_point
-        is_image = len(spec.shape) - batch_dims >= 3
-        if not (key in advice or is_choice or is_image):
+        if not (key in advice or is_choice or _is_image(env, spec)):
             chosen.append(key)
     return chosen
+
+
+def _is_image(env: EnvBase, spec: TensorSpec) -> bool:
+    return len(spec.shape) - len(env.batch_size) >= 3

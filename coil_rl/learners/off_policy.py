@@ -1,15 +1,15 @@
 """Off-policy learning with a replay buffer, the base class of `DQN` and `SAC`."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, ClassVar, Literal, TypedDict
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import expand_as_right
+from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
-from torchrl.objectives import LossModule, SoftUpdate
 
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import Anchor, start_tests
@@ -18,16 +18,18 @@ from coil_rl.learners.extensions import Extensions
 from coil_rl.learners.gradient import GradientStep, means
 from coil_rl.learners.guided_steps import AGENT_ACTS, guide_may_act
 from coil_rl.learners.learner import Callback, Cases, Learner
+from coil_rl.learners.n_step import NStep
 from coil_rl.learners.normaliser import RawObservations, normaliser
-from coil_rl.learners.policy import UNCLIPPED
+from coil_rl.learners.policy import Entries, next_of
 from coil_rl.learners.reward_scale import RewardScale
 from coil_rl.learners.state import Stateful
 from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Seed, Share, checked
-from coil_rl.schedules import Linear, Schedule, schedule
+from coil_rl.schedules import Schedule, schedule
 from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
 from coil_rl.transforms.guide_transform import GuideTransform
 
-Ratio = Annotated[float, Interval(ge=0, le=10_000)]
+UpdatesPerStep = Annotated[float, Interval(ge=0, le=1_000)]
+AT_ONCE = 100  # minibatches that are sampled by one call, which takes as long as a step
 
 
 class ReplaySettings(TypedDict, total=False):
@@ -35,9 +37,11 @@ class ReplaySettings(TypedDict, total=False):
 
     normalise: bool | Literal["auto"] | Sequence[NestedKey]
     scale_rewards: bool
+    tau: Share
+    n_step: Annotated[int, Interval(ge=1, le=1_000)]
     learning_rate: NonNegative | Schedule
     gamma: Share
-    max_grad_norm: Positive
+    max_grad_norm: Positive | None
     capacity: int
     batch_size: Count
     starts: Index
@@ -64,10 +68,10 @@ class OffPolicy(Stateful, Learner):
     Where the agent acts its own action is stored, also a residual, because the sum is a part of the
     env.
 
-    A subclass builds its networks, calls `set_loss` and then `extend`. It names the losses to
-    minimise the sum of (`minimised`) and the values to report (`reported`). A value out of range is
-    a `ValueError`, and so is an env in which the effect or the reward of an action changes over the
-    run.
+    A subclass builds its networks, calls `set_update` and then `extend`, and defines `losses`. It
+    names the losses to minimise the sum of (`minimised`) and the values to report (`reported`). A
+    value out of range is a `ValueError`, and so is an env in which the effect or the reward of an
+    action changes over the run.
 
     Args:
         env: the env, for its device and transforms.
@@ -77,10 +81,14 @@ class OffPolicy(Stateful, Learner):
         scale_rewards: whether rewards are divided by the running deviation of returns, see
             `RewardScale`.
         tau: step of the target networks towards the networks after each minibatch, as a fraction.
-        ratio: how often a step is sampled, on average over the run.
+        updates_per_step: minibatches for each step that is stored once learning has started (the
+            UTD ratio of the literature).
+        n_step: number of consecutive steps whose rewards are summed before the value of the next
+            state is added, see `NStep`.
         learning_rate: of Adam, a number or a schedule.
         gamma: discount.
-        max_grad_norm: gradients are scaled down to this norm, over all networks together.
+        max_grad_norm: gradients are scaled down to this norm, over all networks together; None:
+            they stay as they are.
         capacity: maximum number of stored steps; the newest replace the oldest.
         batch_size: N, steps in a minibatch.
         starts: number of stored steps before learning starts.
@@ -94,15 +102,15 @@ class OffPolicy(Stateful, Learner):
     Attributes:
         keys: entries that a batch must have.
         extensions: what is added to the algorithm.
-        action_key: entry of the learner's own action.
     """
 
     compilable: ClassVar[bool] = True
     parts: ClassVar[tuple[str, ...]] = (
-        "loss",
+        "policy",
         "gradient",
         "generator",
         "pending_updates",
+        "sums",
         "normaliser",
         "reward_scale",
         "extensions",
@@ -117,14 +125,15 @@ class OffPolicy(Stateful, Learner):
         *,
         normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         scale_rewards: bool = False,
-        tau: Share,
-        ratio: Ratio,
-        learning_rate: NonNegative | Schedule = Linear(1e-3, 0.0),
+        tau: Share = 0.005,
+        updates_per_step: UpdatesPerStep,
+        n_step: Annotated[int, Interval(ge=1, le=1_000)] = 1,
+        learning_rate: NonNegative | Schedule = 1e-3,
         gamma: Share = 0.99,
-        max_grad_norm: Positive = 10.0,
-        capacity: int = 100_000,
+        max_grad_norm: Positive | None = None,
+        capacity: int = 1_000_000,
         batch_size: Count = 256,
-        starts: Index = 5_000,
+        starts: Index = 500,
         prior: Share = 0.0,
         compile: bool | Literal["auto"] = "auto",
         anchor: Anchor | None = None,
@@ -138,16 +147,10 @@ class OffPolicy(Stateful, Learner):
         self.normaliser = normaliser(env, in_keys, normalise)
         self.reward_scale = RewardScale(gamma) if scale_rewards else None
         self.inputs = networks.inputs_of(env, self.normaliser, anchor)
-        numbers = env.action_spec.dtype.is_floating_point
-        self.action_key = UNCLIPPED if anchor is not None and numbers else "action"
         self.raw = RawObservations(env, in_keys, self.normaliser)
-        self.gamma, self.tau, self.max_grad_norm = gamma, tau, max_grad_norm
+        self.max_grad_norm = max_grad_norm
+        self.sums = NStep(n_step, gamma)
         self.guide_may_act = guide_may_act(env)
-        if self.guide_may_act and anchor is not None:
-            raise ValueError(
-                "anchor: a guide acts in place of the agent in some steps of this env, which an "
-                "anchored policy cannot learn from; leave anchor out"
-            )
         self.of_guide = stored_of_guide(env)
         if prior and self.of_guide == "nothing":
             raise ValueError(
@@ -157,7 +160,7 @@ class OffPolicy(Stateful, Learner):
         after = (*in_keys, "reward", "done", "terminated")
         self.stored_keys: list[NestedKey] = [
             *in_keys,
-            self.action_key,
+            "action",
             *(unravel_key(("next", key)) for key in after),
         ]
         self.keys = [*self.stored_keys]
@@ -168,9 +171,11 @@ class OffPolicy(Stateful, Learner):
         if anchor is not None:
             self.also_store(anchor.advice_key)
         self.capacity, self.batch_size = capacity, batch_size
-        self.ratio, self.starts = ratio, starts
+        self.updates_per_step, self.starts = updates_per_step, starts
         self.pending_updates = 0.0
         self.device = env.device or torch.device("cpu")
+        # Tensors, so that one compiled update serves all values.
+        self.gamma, self.tau = torch.tensor([gamma, tau], device=self.device).unbind(0)
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.buffer, self.guide_buffer = self._new_buffer(), self._new_buffer()
         self.prior = round(prior * batch_size)
@@ -190,24 +195,31 @@ class OffPolicy(Stateful, Learner):
                     if each not in known:
                         known.append(each)
 
-    def set_loss(self, loss: LossModule) -> None:
-        """Set TorchRL's loss, and make its target networks and the optimiser."""
-        self.loss = loss
-        self.loss.make_value_estimator(gamma=self.gamma)
-        if self.action_key != "action":
-            self.loss.set_keys(action=self.action_key)
-        self.target = SoftUpdate(self.loss, tau=self.tau)
+    def set_update(
+        self, parameters: Sequence[nn.Parameter], reads: Sequence[Tensor], **options: Any
+    ) -> None:
+        """Make the optimiser.
+
+        Args:
+            parameters: that it changes.
+            reads: other tensors that `losses` and `after_update` read.
+            options: further ones of `GradientStep`.
+        """
         self.gradient = GradientStep(
             self.losses,
-            [list(loss.parameters())],
-            [loss],
+            [parameters],
+            [self.gamma, self.tau, *reads],
             lambda progress: [self.learning_rate(progress)],
             eps=1e-8,
             max_grad_norm=self.max_grad_norm,
-            after=self.target.step,
+            after=self.after_update,
             compile=self.compile,
             compilable=self.compilable,
+            **options,
         )
+
+    def after_update(self) -> None:
+        """Act after each minibatch, such as to move target networks; by default do nothing."""
 
     def extend(self, extensions: Sequence[Extension]) -> None:
         """Add extensions."""
@@ -252,23 +264,27 @@ class OffPolicy(Stateful, Learner):
         """Store the steps of a batch [*B, T], with the rewards as they are."""
         if self.reward_scale is not None:
             self.reward_scale.learn(batch)
-        steps = batch.select(*self.stored_keys).reshape(-1)
+        entries = [*self.stored_keys, *([AGENT_ACTS] if self.guide_may_act else [])]
+        steps = batch.select(*entries)
+        if self.guide_may_act and self.of_guide != "nothing":
+            acts = expand_as_right(batch[AGENT_ACTS].squeeze(-1), steps["action"])
+            of_guide: Tensor | float = 0.0
+            if self.of_guide == "executed":
+                of_guide = batch["next", EXECUTED].reshape(steps["action"].shape)
+            steps["action"] = torch.where(acts, steps["action"], of_guide)
+        steps = self.sums.summed(steps)
         if not self.guide_may_act:
             self._store(steps, self.buffer)
             return
-        agent_acts = batch[AGENT_ACTS].reshape(-1)
-        if self.of_guide == "nothing":
-            steps = steps[agent_acts]
-        elif self.of_guide == "executed":  # where the agent acts it is its own action
-            steps["action"] = batch["next", EXECUTED].reshape(steps["action"].shape)
-        else:
-            is_own = expand_as_right(agent_acts, steps["action"])
-            steps["action"] = torch.where(is_own, steps["action"], 0)
+        agent_acts = steps.pop(AGENT_ACTS).reshape(-1)
+        self._store(steps if self._together else steps[agent_acts], self.buffer)
         if self.prior:
-            self._store(steps[agent_acts], self.buffer)
             self._store(steps[~agent_acts], self.guide_buffer)
-        else:
-            self._store(steps, self.buffer)
+
+    @property
+    def _together(self) -> bool:
+        """Whether steps of agent and guide are stored together."""
+        return not self.prior and self.of_guide != "nothing"
 
     def _store(self, steps: TensorDictBase, buffer: ReplayBuffer) -> None:
         if len(steps) == 0:
@@ -276,36 +292,45 @@ class OffPolicy(Stateful, Learner):
         if self.normaliser is not None:
             self.normaliser.learn(steps)
         buffer.extend(steps[-self.capacity :])
-        self.pending_updates += len(steps) * self.ratio / self.batch_size
+        if self.kept >= self.starts:
+            self.pending_updates += len(steps) * self.updates_per_step
 
-    def samples(self) -> Sequence[TensorDictBase]:
-        """Return as many minibatches [N] as are due for the steps stored so far."""
-        due = int(self.pending_updates) if self.kept >= self.starts else 0
-        if not due:
-            return []
+    def samples(self) -> Iterator[Entries]:
+        """Yield as many minibatches [N] as are due for the steps stored so far."""
+        due = int(self.pending_updates)
         self.pending_updates -= due
+        while due:
+            count = min(due, AT_ONCE)
+            due -= count
+            yield from self._sampled(count)
+
+    def _sampled(self, count: int) -> Iterator[Entries]:
+        """Yield some minibatches."""
         prior = self.prior
         if not len(self.guide_buffer):
             prior = 0
         elif not len(self.buffer):
             prior = self.batch_size
         sizes = {self.guide_buffer: prior, self.buffer: self.batch_size - prior}
-        # All at once: a call of the buffer takes as long as a step.
         parts = [
-            buffer.sample(due * size).view(due, size) for buffer, size in sizes.items() if size
+            buffer.sample(count * size).view(count, size) for buffer, size in sizes.items() if size
         ]
-        minibatches: TensorDictBase = torch.cat(parts, 1)
+        drawn: TensorDictBase = torch.cat(parts, 1) if len(parts) > 1 else parts[0]
+        entries = Entries(drawn.items(True, True))
+        reward = ("next", "reward")
         if self.reward_scale is not None:
-            rewards = minibatches["next", "reward"]
-            minibatches["next", "reward"] = self.reward_scale.scaled(rewards)
+            entries[reward] = self.reward_scale.scaled(entries[reward])
         if self.inputs is not None:
-            minibatches["next"] = self.inputs(minibatches["next"])
-            minibatches = self.inputs(minibatches)
-        return minibatches.unbind(0)
+            after = self.inputs(next_of(entries))
+            entries = self.inputs(entries)
+            entries |= {unravel_key(("next", key)): value for key, value in after.items()}
+        columns = {key: value.unbind(0) for key, value in entries.items()}
+        for each in range(count):
+            yield Entries({key: column[each] for key, column in columns.items()})
 
-    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return the losses of a minibatch [N] and other values, scalars."""
-        return self.loss(minibatch)
+    def losses(self, minibatch: Entries) -> dict[str, Tensor]:
+        """Return the losses of a minibatch [N] by name, and other values, scalars."""
+        raise NotImplementedError
 
     def loss_weights(self, progress: float) -> dict[str, float]:
         """Return the weights of the losses in the sum that an update minimises."""
@@ -315,7 +340,7 @@ class OffPolicy(Stateful, Learner):
         """Return the start test of an anchored policy."""
         return start_tests(self.anchor, self.policy, cases)
 
-    def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
+    def describe(self, minibatch: Entries | None) -> dict[str, float]:
         """Return further metrics of the last minibatch, which is None if there is none."""
         return {}
 
@@ -333,7 +358,7 @@ class OffPolicy(Stateful, Learner):
         for buffer, stored in zip((self.buffer, self.guide_buffer), state["buffers"], strict=True):
             buffer.empty()
             if entries := stored["steps"]:
-                steps = TensorDict.from_dict(entries, batch_size=entries[self.action_key].shape[:1])
+                steps = TensorDict.from_dict(entries, batch_size=entries["action"].shape[:1])
                 buffer.extend(steps.to(self.device))
             buffer.writer.load_state_dict(stored["writer"])
 

@@ -31,6 +31,21 @@ class Entries(dict[NestedKey, Tensor]):
         self[key] = value
         return self
 
+    def copy(self) -> "Entries":
+        """Return the same entries, to which others can be added."""
+        return Entries(self)
+
+
+def next_of(entries: Entries) -> Entries:
+    """Return the entries after a step by the keys of those before it."""
+    return Entries(
+        {
+            key[1:] if len(key) > 2 else key[1]: value
+            for key, value in entries.items()
+            if isinstance(key, tuple) and key[0] == "next"
+        }
+    )
+
 
 class Sample(ProbabilisticTensorDictModule):
     """The last module of a policy, which samples from its distribution.

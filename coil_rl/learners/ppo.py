@@ -25,7 +25,7 @@ from coil_rl.learners.anchor import Anchor, start_tests
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.extensions import extensions_of
-from coil_rl.learners.gradient import GradientStep, means
+from coil_rl.learners.gradient import GradientStep, means, tensors_of
 from coil_rl.learners.guided_steps import AGENT_ACTS, guide_may_act, of_agent
 from coil_rl.learners.learner import Callback, Cases, Learner
 from coil_rl.learners.minibatches import RowMinibatches, minibatches_of
@@ -188,7 +188,7 @@ class PPO(Stateful, Learner):
         self.gradient = GradientStep(
             self.all_losses,
             self.parameter_groups(),
-            [self.policy, self.critic],
+            tensors_of(self.policy, self.critic),
             self.learning_rates,
             eps=1e-5,
             max_grad_norm=max_grad_norm,

@@ -1,37 +1,44 @@
 """Soft actor-critic with a learned temperature (Haarnoja et al. 2018).
 
 Two critics estimate the return of an action, to which each step adds an entropy reward: r - alpha
-log pi(a). For stored steps sampled at random, both are moved towards y = r + gamma * (min Q'(s', b)
-- alpha log pi(b | s')) with b drawn from the policy, or y = r where the episode terminated. Q' are
-target networks that follow the critics slowly. The policy maximises min Q(s, a) - alpha log pi(a |
-s), and alpha is adjusted to keep the entropy of the policy near a target.
+log pi(a). For stored steps sampled at random, both are moved towards
+
+    y = r + gamma (min Q'(s', b) - alpha log pi(b | s')),  b from pi(. | s'),
+
+or y = r where the episode terminated. Q' are target networks that follow the critics slowly. The
+policy maximises min Q(s, a) - alpha log pi(a | s), and alpha is adjusted to keep the entropy of the
+policy near a target.
 
 With many critics, y has the minimum over a random few of them, and the policy maximises their mean
-(REDQ, Chen et al. 2021); RLPD is this with layer normalisation and a share of prior steps in each
-minibatch (Ball et al. 2023).
+(REDQ, Chen et al. 2021). With dropout in two critics it is DroQ (Hiraoka et al. 2022). RLPD is this
+with a share of prior steps in each minibatch (Ball et al. 2023).
 """
 
+import copy
 import math
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Annotated, Any, Unpack
+from typing import Annotated, Literal, Unpack
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.objectives import LossModule, REDQLoss, SACLoss
 
 from coil_rl.learners import networks
 from coil_rl.learners.critics import Critics
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.kickstart import KickstartLoss
-from coil_rl.learners.off_policy import OffPolicy, Ratio, ReplaySettings
-from coil_rl.learners.policy import Policy
+from coil_rl.learners.n_step import discount
+from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerStep
+from coil_rl.learners.policy import ByKey, Entries, Policy, next_of
+from coil_rl.learners.weights import Weights
 from coil_rl.ranges import Interval, NonNegative, Positive, Share, checked
 from coil_rl.transforms.action_space import ChoicesError, nested_key
+
+NORMS = Literal["none", "layer", "batch"]
 
 
 class SACSettings(ReplaySettings, total=False):
@@ -46,10 +53,10 @@ class SACSettings(ReplaySettings, total=False):
     critics: Annotated[int, Interval(ge=2, le=1_000)]
     target_critics: int | None
     critic_layer_norm: bool
+    dropout: Share
     uncertainty: bool
+    updates_per_step: UpdatesPerStep
     auxiliary: Sequence[Extension]
-    tau: Share
-    ratio: Ratio
 
 
 @checked
@@ -63,8 +70,9 @@ class SAC(OffPolicy):
         env: the env, with continuous actions.
         in_keys: entries that policy and critics observe.
         hidden: widths of the hidden layers of all networks, without `network`.
-        network: architecture of all networks; None: `Mlp(hidden)`.
-        action_scale: initial standard deviation of the policy, before squashing.
+        network: architecture of all networks; None: `Mlp(hidden, "relu")`.
+        action_scale: initial standard deviation of the policy, before squashing. With 1 the first
+            actions are almost uniform between the bounds.
         action_gain: initial scale of the last weights of the policy; with 0 its mean is 0.
         temperature: initial alpha.
         target_entropy: of the policy, for actions in the unit of the env; None: minus the number of
@@ -74,16 +82,18 @@ class SAC(OffPolicy):
             mean in place of the minimum for the policy; None: the minimum of all for both.
         critic_layer_norm: whether the critics normalise their layers, which bounds the values of
             actions never tried.
+        dropout: share of the numbers of a hidden layer of the critics that are left out at random.
         uncertainty: whether the policy writes that of the critics, see `Critics`, for
             `AdaptiveMixedAction`.
         auxiliary: extensions, such as losses of the policy (`KickstartLoss`).
-        settings: further ones of `OffPolicy`. Take a large `max_grad_norm` for returns in the
-            hundreds, as of a pendulum: otherwise the gradients of the critics dominate those of
-            the policy.
+        settings: further ones of `OffPolicy`.
     """
 
+    parts = ("critics", "target", "temperature", *OffPolicy.parts)
     minimised = ("loss_actor", "loss_qvalue", "loss_alpha")
-    reported: tuple[str, ...] = (*minimised, "alpha", "entropy")
+    reported: tuple[str, ...] = (*minimised, "alpha", "entropy", "value")
+    betas = (0.9, 0.999)  # of Adam
+    values_of_a_critic = 1
 
     def __init__(
         self,
@@ -92,17 +102,17 @@ class SAC(OffPolicy):
         *,
         hidden: Sequence[int] = (64, 64),
         network: Mlp | None = None,
-        action_scale: Positive = 0.5,
+        action_scale: Positive = 1.0,
         action_gain: NonNegative = 0.01,
-        temperature: Positive = 0.2,
+        temperature: Positive = 0.01,
         target_entropy: float | None = None,
         critics: Annotated[int, Interval(ge=2, le=1_000)] = 2,
         target_critics: int | None = None,
-        critic_layer_norm: bool = False,
+        critic_layer_norm: bool = True,
+        dropout: Share = 0.0,
         uncertainty: bool = False,
         auxiliary: Sequence[Extension] = (),
-        tau: Share = 0.02,
-        ratio: Ratio = 8.0,
+        updates_per_step: UpdatesPerStep = 1.0,
         **settings: Unpack[ReplaySettings],
     ) -> None:
         if target_critics is not None and not 1 <= target_critics < critics:
@@ -112,31 +122,26 @@ class SAC(OffPolicy):
             )
         if not env.action_spec.dtype.is_floating_point:
             raise ChoicesError(
-                "SAC needs continuous actions, but this env has discrete ones; use "
-                "action=continuous, or a learner for discrete actions, such as DQN"
+                f"{type(self).__name__} needs continuous actions, but this env has discrete ones; "
+                "use action=continuous, or a learner for discrete actions, such as DQN"
             )
         in_keys = [nested_key(key) for key in in_keys]
-        network = without_memory(network or Mlp(hidden), "SAC")
-        super().__init__(env, in_keys, tau=tau, ratio=ratio, **settings)
+        network = without_memory(network or Mlp(hidden, "relu"), type(self).__name__)
+        super().__init__(env, in_keys, updates_per_step=updates_per_step, **settings)
         self.action_scale, self.action_gain = action_scale, action_gain
         self.actor = self.build_actor(env, in_keys, network)
-        if target_entropy is None:
-            target_entropy = -networks.action_shape(env).numel()
-        critic = replace(network, layer_norm=True) if critic_layer_norm else network
-        arguments = {
-            "actor_network": self.actor,
-            "qvalue_network": [
-                networks.action_critic(env, in_keys, critic, self.inputs, self.action_key)
-                for _ in range(critics)
-            ],
-            "num_qvalue_nets": critics,
-            "alpha_init": temperature,
-            "target_entropy": float(target_entropy),
-            "loss_function": "l2",
-        }
-        self.set_loss(self.build_loss(env, in_keys, network, target_critics, arguments))
-        self.critics, self.writes_uncertainty = Critics(self.loss), uncertainty
+        self.critics = self.build_critics(
+            env, in_keys, network, critics, "layer" if critic_layer_norm else "none", dropout
+        )
+        self.target = copy.deepcopy(self.critics).requires_grad_(False)
+        log_alpha = torch.tensor(math.log(temperature), device=self.device)
+        self.temperature = nn.ParameterDict({"log_alpha": log_alpha})
+        size = networks.action_shape(env).numel()
+        entropy = -float(size) if target_entropy is None else target_entropy
+        self.target_entropy = torch.tensor(entropy, device=self.device)
+        self.target_critics, self.writes_uncertainty = target_critics, uncertainty
         self.policy = self.build_policy()
+        self._set_weights()
         self._extend(auxiliary)
 
     def build_actor(self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp) -> Policy:
@@ -155,33 +160,50 @@ class SAC(OffPolicy):
             inputs=self.inputs,
             anchor=self.anchor,
         )
-        if self.inputs is None:
-            return policy
-        return Policy(*policy.module[1:])
+        return policy if self.inputs is None else Policy(*policy.module[1:])
 
-    def build_loss(
+    def build_critics(
         self,
         env: EnvBase,
         in_keys: Sequence[NestedKey],
         network: Mlp,
-        target_critics: int | None,
-        arguments: dict[str, Any],
-    ) -> LossModule:
-        """Return TorchRL's loss, given its `arguments`; the networks observe `in_keys`."""
-        if target_critics is None:
-            loss = SACLoss(**arguments)
-        else:
-            # Its own bounds of alpha are for rewards of about 1.
-            bounds = {"min_alpha": 1e-8, "max_alpha": 1e8}
-            loss = REDQLoss(**arguments, sub_sample_len=target_critics, **bounds)
-        loss.target_entropy  # noqa: B018  becomes part of the state at the first access
-        return loss
+        count: int,
+        norm: NORMS,
+        dropout: float,
+    ) -> Critics:
+        """Return the critics, which read entries that have been normalised already."""
+        return Critics(
+            env,
+            in_keys,
+            network,
+            count,
+            outputs=self.values_of_a_critic,
+            norm=norm,
+            dropout=dropout,
+            inputs=self.inputs,
+        )
 
-    def build_policy(self) -> TensorDictSequential:
+    def build_policy(self) -> TensorDictModuleBase:
         """Return the policy that collects the batches."""
         before = [] if self.inputs is None else [self.inputs]
         policy = Policy(*before, *self.actor.module)
-        return TensorDictSequential(policy, self.critics) if self.writes_uncertainty else policy
+        return ByKey(policy, self.critics) if self.writes_uncertainty else policy
+
+    def further_weights(self) -> list[Weights]:
+        """Return the weights that are learned besides those of policy and critics."""
+        return []
+
+    def _set_weights(self) -> None:
+        self.of_actor, self.of_critics, self.of_target = map(
+            Weights, (self.actor, self.critics, self.target)
+        )
+        learned = [self.of_actor, self.of_critics, *self.further_weights()]
+        buffers = [*self.policy.buffers(), *self.critics.buffers(), *self.target.buffers()]
+        self.set_update(
+            [*(each.vector for each in learned), self.temperature["log_alpha"]],
+            [self.of_target.vector, self.target_entropy, *buffers],
+            betas=self.betas,
+        )
 
     def _extend(self, auxiliary: Sequence[Extension]) -> None:
         for each in auxiliary:
@@ -190,15 +212,87 @@ class SAC(OffPolicy):
         self.extend(auxiliary)
         self.reported = (*self.reported, *self.extensions.weights({}, 0.0))
 
-    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return the losses of a minibatch [N] and other values, scalars."""
-        losses = super().losses(minibatch)
-        for name, loss in self.extensions.losses(self.actor, minibatch).items():
-            losses[name] = loss
+    @torch.no_grad()
+    def after_update(self) -> None:
+        """Move the target networks."""
+        self.of_target.vector.lerp_(self.of_critics.vector, self.tau)
+
+    def losses(self, minibatch: Entries) -> dict[str, Tensor]:
+        """Return the losses of a minibatch [N] by name, and other values, scalars."""
+        with self.of_actor.used():
+            with self.of_critics.used():
+                losses = self.critic_losses(minibatch)
+            with self.of_critics.used(fixed=True):
+                losses |= self.actor_losses(minibatch)
+                if self.extensions.has_losses:
+                    steps = TensorDict(dict(minibatch), len(minibatch["action"]))
+                    losses |= self.extensions.losses(self.actor, steps)
         return losses
 
+    @property
+    def alpha(self) -> Tensor:
+        """The weight of the entropy, a scalar without gradient."""
+        return self.temperature["log_alpha"].detach().exp()
+
+    def acted(self, states: Entries) -> tuple[Entries, Tensor]:
+        """Return states [N] with a random action of the policy, and its log-probability [N]."""
+        entries, sample = states.copy(), self.actor.module[-1]
+        drawn, log_prob = self.actor.density(entries).draw()
+        entries.set(sample.sample_key, drawn)
+        sample.write_action(entries)
+        return entries, log_prob
+
+    def critic_losses(self, minibatch: Entries) -> dict[str, Tensor]:
+        """Return the loss of all critics."""
+        with torch.no_grad(), self.of_target.used():
+            after, log_prob = self.acted(next_of(minibatch))
+            target = self.returns(minibatch, self.target.outputs(after, train=True), log_prob)
+        return self.distances(self.critics.outputs(minibatch, train=True), target)
+
+    def returns(self, minibatch: Entries, outputs: Tensor, log_prob: Tensor) -> Tensor:
+        """Return y of a minibatch, [N, n].
+
+        Args:
+            outputs: of the critics for the next state and an action of the policy, [critics, N, n].
+            log_prob: of this action, [N].
+        """
+        value = self.next_values(outputs) - (self.alpha * log_prob).unsqueeze(-1)
+        reward = minibatch["next", "reward"].to(value.dtype)
+        return reward + discount(minibatch, self.gamma).unsqueeze(-1) * value
+
+    def next_values(self, outputs: Tensor) -> Tensor:
+        """Return the values of the next state, [N, n], from those of all critics."""
+        if self.target_critics is not None:
+            drawn = torch.randperm(len(outputs), device=outputs.device)[: self.target_critics]
+            outputs = outputs[drawn]
+        return outputs.amin(0)
+
+    def distances(self, outputs: Tensor, target: Tensor) -> dict[str, Tensor]:
+        """Return the loss of all critics from what they give, [critics, N, n], and y."""
+        return {
+            "loss_qvalue": (outputs - target).square().sum(0).mean(),
+            "value": outputs.detach().mean(),
+        }
+
+    def values(self, outputs: Tensor) -> Tensor:
+        """Return the values of actions of the policy, [N], from those of all critics."""
+        values = outputs.squeeze(-1)
+        return values.amin(0) if self.target_critics is None else values.mean(0)
+
+    def actor_losses(self, minibatch: Entries) -> dict[str, Tensor]:
+        """Return the losses of policy and temperature."""
+        states, log_prob = self.acted(minibatch)
+        value = self.values(self.critics.outputs(states))
+        log_alpha, entropy = self.temperature["log_alpha"], -log_prob.detach().mean()
+        return {
+            "loss_actor": (self.alpha * log_prob - value).mean(),
+            "loss_alpha": log_alpha * (entropy - self.target_entropy),
+            "alpha": self.alpha,
+            "entropy": entropy,
+        }
+
     @torch.no_grad()
-    def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
+    def describe(self, minibatch: Entries | None) -> dict[str, float]:
         """Return the mean uncertainty about the last minibatch, NaN without one."""
         if not self.writes_uncertainty:
             return {}

@@ -63,16 +63,20 @@ def with_exported(config: DictConfig, file: str) -> DictConfig:
     Raises:
         UserError: for a file that cannot be used, or a policy whose guide is outside.
     """
+    from coil_rl.config.fits import check_guide_in_env
     from coil_rl.config.nodes import build
+    from coil_rl.config.parts import env_maker
+    from coil_rl.run.parts import SOME_ROWS, TEST
 
     target = {"_target_": "coil_rl.export.ExportedGuide", "file": str(file)}
-    build(target, "exported")
+    guide = build(target, "exported")
     alone = config.copy()
     with open_dict(alone):
         alone.guide["exported"] = target
         # Degraded advice is not a part of a policy that acts.
         alone.degrade, alone.action = {}, {}
         alone.method.name, alone.method.observes, alone.method.transforms = "guide", None, {}
+    check_guide_in_env(guide, env_maker(alone).bare(SOME_ROWS, TEST, None), "exported")
     return alone
 
 

@@ -24,10 +24,13 @@ KEYS = (
     "guide.exported.file",
     "proxy.folder",
 )
+KEPT = ("init", "guide.learned.run", "guide.exported.file")  # in the configuration of a run
 
 
 def spelled(argument: str) -> str:
     """Return an argument of a program as Hydra reads it: a folder has the quotes that it needs.
+
+    One that the configuration of a run keeps is absolute.
 
     Args:
         argument: as the shell passed it on; it may be anything.
@@ -37,7 +40,8 @@ def spelled(argument: str) -> str:
         return argument
     if not _exists(text) and _as_hydra(text) is not None:
         return argument
-    return f"{key}={quoted(str(_path(text)))}"
+    path = _path(text)
+    return f"{key}={quoted(str(path.absolute() if key.lstrip('+') in KEPT else path))}"
 
 
 def folder(text: str) -> Path:

@@ -26,6 +26,11 @@ def describe(folder: Path) -> dict[str, str]:
     return {"command": made} | (record.VERSIONS.read(folder) or {})
 
 
+def printable(text: str) -> str:
+    """Return a text of a file, which may be somebody else's, without what a terminal obeys."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
+
+
 def main() -> None:
     """Print one name and its value a line."""
     arguments = sys.argv[1:]
@@ -41,7 +46,7 @@ def main() -> None:
             raise UserError(f"{' '.join(arguments)}: coil-info takes nothing, or run=FOLDER")
         width = max(map(len, result))
         for name, value in result.items():
-            print(f"{name:{width}}  {value}")
+            print(f"{name:{width}}  {printable(value)}")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 SIGN_FLIP_SEEDS = 10  # five seeds have 32 sign patterns: no p below 0.06
+MOST_SIGN_FLIPS = 1_000  # seeds; more patterns take gigabytes, and the t test is as good
 RESAMPLES = 2**14  # sign patterns of up to 14 seeds are enumerated
 
 
@@ -94,7 +95,8 @@ def estimate(values: ArrayLike) -> Estimate:
     """Return the mean of one value per seed, with its interval and p-value.
 
     From ten seeds on, p is the share of sign patterns of the values with such a mean (two-sided,
-    exact up to 14 seeds); with fewer it is that of a t test. A single seed has no p-value.
+    exact up to 14 seeds); with fewer, or more than 1,000, it is that of a t test. A single seed has
+    no p-value.
 
     Args:
         values: one value per seed, [seeds].
@@ -104,7 +106,7 @@ def estimate(values: ArrayLike) -> Estimate:
     found, of_seeds = interval(values), np.asarray(values, dtype=np.float64)
     if math.isnan(found.low):
         return found
-    if len(of_seeds) >= SIGN_FLIP_SEEDS:
+    if SIGN_FLIP_SEEDS <= len(of_seeds) <= MOST_SIGN_FLIPS:
         p = stats.permutation_test(
             (of_seeds,),
             np.mean,

@@ -5,11 +5,13 @@ import io
 import pickle
 import zipfile
 from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from coil_rl.errors import UserError
 from coil_rl.files import folder_to_disk, read_file, whole_file
@@ -71,6 +73,15 @@ def put_weights(policy: TensorDictModuleBase, state: Any, path: Path) -> None:
     Raises:
         UserError: if they do not fit the policy, or are not finite.
     """
+    own = policy.state_dict()
+    for name, value in state.items() if isinstance(state, Mapping) else ():
+        known = own.get(name)
+        both = isinstance(value, Tensor) and isinstance(known, Tensor)
+        if both and value.dtype != known.dtype:  # torch would make another policy of them
+            raise UserError(
+                f"{path} holds {name} as {value.dtype}, not {known.dtype}, so that it is no policy "
+                "of this run; train again or use another"
+            )
     try:
         policy.load_state_dict(state)
     except UserError as error:

@@ -154,7 +154,7 @@ class Run:
     code: Callable[[], Mapping[str, str]] = dict
 
     def __post_init__(self) -> None:
-        self.folder = Path(self.folder)
+        self.folder = Path(self.folder).absolute()  # the working folder may change
         if not self.settings:
             self.settings = self._settings_of_parts()
         if not self.identity:

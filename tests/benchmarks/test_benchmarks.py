@@ -70,7 +70,7 @@ def test_other_learners_are_measured_without_yardsticks(tmp_path):
         "track.train.count=1",
         "learner=dqn",
         "learner.starts=300",
-        "learner.ratio=1",
+        "learner.updates_per_step=0.125",
         "learner.batch_size=8",
     ]
     main([*overrides, "--quick", "--parts", "training", "sb3", "--output", str(tmp_path / "run")])

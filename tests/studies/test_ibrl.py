@@ -7,6 +7,7 @@ import worlds
 from torchrl.envs import PendulumEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from coil_rl.learners.policy import Entries
 from coil_rl.run.policy_batch import policy_batch
 from coil_rl.run.rollout import Rollout
 from coil_studies import IBRL
@@ -22,27 +23,24 @@ def make(**options):
         "hidden": [16],
         "starts": 0,
         "batch_size": 16,
-        "ratio": 1,
+        "updates_per_step": 0.0625,
         "action_gain": 1.0,
     }
     ibrl = IBRL(env, **given | options)
     with torch.no_grad():  # critics and target networks must differ
-        for value in ibrl.loss.qvalue_network_params.values(True, True):
-            value.add_(torch.randn_like(value), alpha=0.5)
+        vector = ibrl.of_critics.vector
+        vector.add_(torch.randn_like(vector), alpha=0.5)
     return ibrl, Rollout(env, ibrl.policy, 64, ibrl.keys)
 
 
 def target_values(ibrl, states, action):
     """Smallest value of an action by the target networks, [N]."""
-    data, values = states.select("th", "thdot").set("action", action), []
-    for one in ibrl.loss.target_qvalue_network_params.unbind(0):
-        with one.to_module(ibrl.loss.qvalue_network):
-            values.append(ibrl.loss.qvalue_network(data.copy())["state_action_value"].squeeze(-1))
-    return torch.stack(values).amin(0)
+    entries = {"th": states["th"], "thdot": states["thdot"], "action": action}
+    return ibrl.target.values(Entries(entries)).amin(0)
 
 
 def own_action(ibrl, states):
-    return ibrl.loss.proposals.actor(states.select("th", "thdot"))["action"]
+    return ibrl.actor(Entries({key: states[key] for key in ("th", "thdot")}))["action"]
 
 
 def test_better_proposal_of_guide_and_policy_is_executed():
@@ -63,9 +61,9 @@ def test_better_proposal_of_guide_and_policy_is_executed():
 def test_critics_learn_the_value_of_the_choice_in_the_next_state(sharpness):
     """y = r + gamma * max of min Q', or mean over softmax(sharpness * min Q'), without entropy."""
     ibrl, rollout = make(gamma=0.9, sharpness=sharpness, temperature=5.0)
-    data = rollout.collect().select(*ibrl.keys)
-    data["next", "terminated"][::3] = True
-    after = data["next"]
+    steps = rollout.collect().select(*ibrl.keys)
+    steps["next", "terminated"][::3] = True
+    data, after = Entries(steps.items(True, True)), steps["next"]
     torch.manual_seed(1)
     with torch.no_grad(), set_exploration_type(RANDOM):
         own = own_action(ibrl, after)
@@ -76,8 +74,11 @@ def test_critics_learn_the_value_of_the_choice_in_the_next_state(sharpness):
         values.amax(0) if sharpness is None else ((sharpness * values).softmax(0) * values).sum(0)
     )
     expected = after["reward"] + 0.9 * ~after["terminated"] * value.unsqueeze(-1)
-    torch.manual_seed(1)
-    torch.testing.assert_close(ibrl.loss._compute_target_v2(data), expected.squeeze(-1))
+    with torch.no_grad():
+        values = ibrl.critics.values(data)
+        torch.manual_seed(1)
+        loss = ibrl.losses(data)["loss_qvalue"]
+    torch.testing.assert_close(loss, (values - expected.squeeze(-1)).square().sum(0).mean())
 
 
 def test_proposals_are_drawn_by_the_sharpness_of_the_choice_in_training_only():
@@ -98,31 +99,28 @@ def test_proposals_are_drawn_by_the_sharpness_of_the_choice_in_training_only():
 def test_edited_action_stays_near_the_guide_and_learns_to_have_a_larger_value():
     ibrl, rollout = make(edit=0.25, temperature=1e-3, learning_rate=3e-3, tau=0.0)
     batch = rollout.collect()
-    guide, proposals = batch["guide_action"][:, 0], ibrl.loss.proposals
+    guide, proposals = batch["guide_action"][:, 0], ibrl.proposals
 
     def edited():
         with torch.no_grad(), set_exploration_type(DETERMINISTIC):
             return proposals.rate(batch)[0][2]
 
-    assert ((edited() - guide).abs() <= 0.25 * 2 + 1e-6).all()  # the torque is within 2
-    before = [parameter.clone() for parameter in proposals.editor.parameters()]
-    fixed = ibrl.loss.qvalue_network_params.detach().clone()
-    optimiser = torch.optim.Adam(proposals.editor.parameters(), 1e-2)
-
     def gain():
-        ibrl.loss.target_qvalue_network_params.update_(fixed)
-        return (target_values(ibrl, batch, edited()) - target_values(ibrl, batch, guide)).mean()
+        actions = [
+            batch.select("th", "thdot").set("action", each).to_dict() for each in (edited(), guide)
+        ]
+        ours, theirs = (ibrl.critics.values(Entries(each)).amin(0) for each in actions)
+        return (ours - theirs).mean()
 
-    first = gain()
+    assert ((edited() - guide).abs() <= 0.25 * 2 + 1e-6).all()  # the torque is within 2
+    first, (weights,) = gain(), ibrl.of_editor
+    assert any(each is weights.vector for each in ibrl.gradient.parameters)
+    optimiser = torch.optim.Adam([weights.vector], 1e-2)
     for _ in range(60):
         optimiser.zero_grad()
-        ibrl.loss.actor_loss(batch.copy())[0].backward()
+        ibrl.losses(Entries(batch.items(True, True)))["loss_actor"].backward()
         optimiser.step()
     assert gain() > first + 0.01
-    assert any(
-        parameter in set(ibrl.gradient.parameters) for parameter in proposals.editor.parameters()
-    )
-    assert not all(map(torch.equal, before, proposals.editor.parameters()))
 
 
 @pytest.mark.parametrize(

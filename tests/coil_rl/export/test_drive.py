@@ -94,7 +94,8 @@ def test_number_that_the_dtype_does_not_hold_is_refused(dtype, wrong, tmp_path):
         contract["inputs"][0]["dtype"] = dtype
 
     shutil.copy(SOURCE, write(tmp_path, typed) / SOURCE.name)
-    driver, policy = copied(tmp_path).Policy(), ExportedPolicy(tmp_path)
+    driver, policy = copied(tmp_path).Policy(), ExportedPolicy(write(tmp_path / "float32"))
+    typed(policy.contract)
     with pytest.raises(ValueError, match=rf"observation must be \[2\] finite numbers of {dtype}"):
         driver.act({"observation": np.array([1, wrong]), "guide_action": [4.0]})
     with pytest.raises(ValueError, match=rf"observation holds .*(no number of {dtype}|complex)"):

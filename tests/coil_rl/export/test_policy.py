@@ -85,7 +85,8 @@ def matrix(guides):
     [(1, (1, 4)), (1, (4,)), (1, (2, 2)), (1, (1, 2, 2)), (2, (2, 4)), (2, (2, 2, 2))],
 )
 def test_advice_may_have_the_shape_of_the_contract_or_of_the_env(guides, shape, tmp_path):
-    policy = ExportedPolicy(write(tmp_path, matrix(guides)))
+    policy = ExportedPolicy(write(tmp_path))
+    matrix(guides)(policy.contract)
     numbers, given = np.arange(4.0 * guides), []
     policy.act_on = lambda inputs: given.append(inputs["guide_action"]) or np.zeros((1, 4))
     assert policy.act([1.0, 2.0], numbers.reshape(shape)).shape == (2, 2)
@@ -96,7 +97,8 @@ def test_advice_may_have_the_shape_of_the_contract_or_of_the_env(guides, shape, 
     ("guides", "shape"), [(1, (4, 1, 2)), (1, (2, 1)), (2, (2, 2)), (2, (4, 2))]
 )
 def test_advice_of_another_shape_is_refused(guides, shape, tmp_path):
-    policy = ExportedPolicy(write(tmp_path, matrix(guides)))
+    policy = ExportedPolicy(write(tmp_path))
+    matrix(guides)(policy.contract)
     with pytest.raises(ValueError, match=rf"but must have \[{guides}, 4\]"):
         policy.act([1.0, 2.0], np.zeros(shape))
 
@@ -145,6 +147,57 @@ def without_checksum(contract):
 def test_contract_that_cannot_be_used_is_refused(change, message, tmp_path):
     with pytest.raises(coil_rl.UserError, match=message):
         ExportedPolicy(write(tmp_path, change))
+
+
+def changed(place, value):
+    """Return a change of one part of the contract."""
+
+    def change(contract):
+        node = contract
+        for part in place[:-1]:
+            node = node[part]
+        node[place[-1]] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (("inputs", 0, "name"), "other", "it reads observation, which the contract has not"),
+        (("inputs", 0, "shape"), [3], r"it reads observation \['b', 2\], not any rows of \[3\]"),
+        (("inputs", 0, "shape"), [2, 1], r"it reads observation .* not any rows of \[2, 1\]"),
+        (("inputs", 0, "shape"), [10**6, 10**6], "is damaged.*inputs.0.shape: .* no shape of at"),
+        (("inputs", 0, "shape"), [-1], "is damaged.*inputs.0.shape"),
+        (("inputs", 0, "dtype"), "int64", "it reads observation as float32, not int64"),
+        (("inputs", 0, "dtype"), "O", "is damaged.*inputs.0.dtype.* O is no type of numbers"),
+        (("inputs", 0, "dtype"), "nothing", "is damaged"),
+        (("inputs", 0, "key"), [], "is damaged.*inputs.0.key"),
+        (("inputs",), {}, "is damaged.*inputs"),
+        (("state", 0, "output"), "action2", "it writes no action2"),
+        (("state", 0, "first"), "x", "is damaged.*state.0.first"),
+        (("state", 0, "shape"), [2], r"it reads state.sum .* not any rows of \[2\]"),
+        (("outputs", 0, "shape"), [2], r"it writes action .* not any rows of \[2\]"),
+        (("outputs", 0, "space"), None, "is damaged.*outputs.0.space"),
+        (("guide", "place"), "elsewhere", "is damaged.*guide.place"),
+        (("env",), "Sum", "is damaged.*env"),
+    ],
+)
+def test_file_must_be_what_its_contract_says(place, value, message, tmp_path):
+    with pytest.raises(coil_rl.UserError, match=message):
+        ExportedPolicy(write(tmp_path, changed(place, value)))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (model(batch=4), r"it reads observation \[4, 2\], not any rows of \[2\]"),
+        (model(seen="x"), "it reads x, which the contract has not"),
+    ],
+)
+def test_file_that_takes_something_else_is_refused(content, message, tmp_path):
+    with pytest.raises(coil_rl.UserError, match=message):
+        ExportedPolicy(write(tmp_path, content=content))
 
 
 @pytest.mark.parametrize("name", [ONNX, CONTRACT])
@@ -204,7 +257,7 @@ SPACES = {
 
 @pytest.mark.parametrize("name", SPACES)
 def test_exported_guide_acts_in_its_own_action_only(name, tmp_path):
-    guide = ExportedGuide(write(tmp_path, acts_in(**SPACES[name][2])))
+    guide = ExportedGuide(write(tmp_path, acts_in(**SPACES[name][2]), model(advised=False)))
     for other, (spec, first, _) in SPACES.items():
         space = ActionSpace(spec, 1, first)
         if other == name:

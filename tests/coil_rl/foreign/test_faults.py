@@ -452,6 +452,16 @@ def test_what_a_controller_does_with_its_observation_changes_nothing():
     assert (data["observation"] != 0).all()
 
 
+def test_old_name_of_a_time_limit_beside_a_termination_is_said():
+    old = {"TimeLimit.truncated": True}
+    with pytest.warns(UserWarning, match=r"TimeLimit.truncated at a step with terminated=True"):
+        ends = stepped(answer=lambda a: (a[0], a[1], True, False, old))["next", "terminated"]
+    assert ends[:, STEP - 1].all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        stepped(answer=lambda a: (a[0], a[1], False, True, old))
+
+
 class Drift(Plant):
     """Its state moves with its action, and a little at random."""
 

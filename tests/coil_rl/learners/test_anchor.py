@@ -153,7 +153,7 @@ def test_policy_with_a_memory_starts_at_the_guide_and_learns():
     assert (acted(ppo.policy, data) - before).abs().max() > 0
 
 
-REPLAY = {"starts": 16, "batch_size": 16, "ratio": 4.0}
+REPLAY = {"starts": 16, "batch_size": 16, "updates_per_step": 0.25}
 
 
 def test_sac_starts_at_the_guide_and_learns_its_own_part():
@@ -165,8 +165,8 @@ def test_sac_starts_at_the_guide_and_learns_its_own_part():
     torch.testing.assert_close(first, two_numbers(data["observation"]))
     batch = Rollout(env, sac.policy, 8, sac.keys).collect()
     assert sac.update(batch, 0.25)["minibatches"] > 0
-    assert torch.equal(sac.buffer[:][UNCLIPPED], batch[UNCLIPPED].reshape(-1, 2))
-    assert "action" not in sac.buffer[:], "critics rate the own part"
+    assert torch.equal(sac.buffer[:]["action"], batch["action"].reshape(-1, 2))
+    assert UNCLIPPED not in sac.buffer[:], "critics rate what is executed"
     assert (acted(sac.policy, data) - first).abs().max() > 0
 
 
@@ -199,12 +199,15 @@ def test_state_holds_the_weights():
     torch.testing.assert_close(acted(first, data), acted(second, data))
 
 
-def test_env_in_which_a_guide_acts_in_place_of_the_agent_is_refused_with_replay():
+def test_steps_in_which_the_guide_acts_are_learned_from():
     guide = TensorDictModule(two_numbers, in_keys=["observation"], out_keys=["action"])
     parts = Compose(GuideActions({"guide": guide}), Takeover(0.5))
     env = TransformedEnv(AnyEnv(action=Bounded(-1, 1, (2,))), parts)
-    with pytest.raises(ValueError, match="leave anchor out"):
-        SAC(env, KEYS, anchor=Anchor(), **REPLAY)
+    sac = SAC(env, KEYS, anchor=Anchor(), **REPLAY)
+    batch = Rollout(env, sac.policy, 8, sac.keys).collect()
+    assert sac.update(batch, 0.25)["minibatches"] > 0
+    executed = batch["next", "executed_action"].reshape(-1, 2)
+    torch.testing.assert_close(sac.buffer[:]["action"], executed)
 
 
 @pytest.mark.parametrize(

@@ -123,8 +123,8 @@ def test_deterministic_action_is_the_mode_after_ppo_has_learned_the_best_action(
 @pytest.mark.parametrize("name", ["bounded", "scalar", "matrix", "float64", "unbounded"])
 def test_sac_updates_with_any_continuous_action(name):
     env = env_with(name)
-    learner = SAC(env, starts=16, batch_size=16, ratio=0.25)
-    assert learner.loss.target_entropy == -max(ACTIONS[name].shape.numel(), 1)
+    learner = SAC(env, starts=16, batch_size=16, updates_per_step=0.015625)
+    assert learner.target_entropy == -max(ACTIONS[name].shape.numel(), 1)
     metrics = trained(learner, env)[-1]
     assert metrics["minibatches"] > 0
     assert torch.tensor(list(metrics.values())).isfinite().all()
@@ -133,7 +133,7 @@ def test_sac_updates_with_any_continuous_action(name):
 @pytest.mark.parametrize("name", ["categorical", "one_hot"])
 def test_dqn_updates_with_one_discrete_action(name):
     env = env_with(name)
-    metrics = trained(DQN(env, starts=16, batch_size=16, ratio=0.25), env)[-1]
+    metrics = trained(DQN(env, starts=16, batch_size=16, updates_per_step=0.015625), env)[-1]
     assert metrics["minibatches"] > 0
     assert torch.tensor(list(metrics.values())).isfinite().all()
 

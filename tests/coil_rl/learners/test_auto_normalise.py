@@ -1,25 +1,32 @@
 """Observations in physical units: decided on the first batch, said, and kept with the policy."""
 
+import warnings
 from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from gymnasium.spaces import Box
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 import coil_rl
 from coil_rl.errors import UserError
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
-from coil_rl.learners.normaliser import Moments
+from coil_rl.learners.normaliser import Moments, RawObservations, normaliser
 from coil_rl.run.training import training_of
 
 TINY = ["budget.num_envs=4", "budget.steps=16", "evaluation.cases=2", "logger=none"]
 TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
 TINY += ["checkpoint_every=1"]
 ON_POLICY = ["learner.minibatches=2"]
-REPLAY = ["learner=sac", "learner.starts=16", "learner.ratio=0.25", "learner.batch_size=16"]
+REPLAY = [
+    "learner=sac",
+    "learner.starts=16",
+    "learner.updates_per_step=0.015625",
+    "learner.batch_size=16",
+]
 
 
 class Reactor(gymnasium.Env):
@@ -121,6 +128,45 @@ def test_raw_observations_far_out_of_scale_are_named(tmp_path):
         r"mean 32\d.* deviation .*, \[1\] mean .*; use learner.normalise=auto or true",
     ):
         learned(PHYSICAL, tmp_path / "run", *ON_POLICY, "learner.normalise=false")
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (spaces.Box(0, 255, (4,), np.uint8), "leaves observation as it is: it holds bytes, which"),
+        (spaces.Box(0, 1, (8, 8, 3), np.float32), "leaves observation as it is: it is a picture"),
+        (spaces.Box(-1, 1, (4,)), ""),
+    ],
+)
+def test_what_cannot_be_normalised_is_said(space, message):
+    env = GymnasiumEnv(lambda: Pictures(space))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        normaliser(env, ["observation"], normalise=True)
+    assert [message in str(each.message) for each in caught] == [True] * bool(message)
+
+
+def test_floating_point_picture_of_bytes_is_named():
+    env = GymnasiumEnv(lambda: Pictures(spaces.Box(0, 255, (8, 8, 3), np.float32)), 2)
+    raw = RawObservations(env, ["observation"], None)
+    with pytest.warns(UserWarning, match="far out of scale.* needs a space of uint8, or a divis"):
+        raw.look(env.rollout(4))
+
+
+class Pictures(gymnasium.Env):
+    """Shows anything of a space."""
+
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def __init__(self, space):
+        self.observation_space = space
+
+    def reset(self, *, seed=None, options=None):
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
 
 
 class Drifting(Reactor):

@@ -47,7 +47,16 @@ def test_on_policy_learner_solves_cart_pole(learner, carts, steps, frames, optio
 def test_dqn_solves_cart_pole():
     torch.manual_seed(0)
     env = TransformedEnv(CartPoles(16), RewardSum())
-    dqn = DQN(env, epsilon=Linear(1.0, 0.04, until=0.16), batch_size=64, ratio=32, starts=1_000)
+    dqn = DQN(
+        env,
+        epsilon=Linear(1.0, 0.04, until=0.16),
+        batch_size=64,
+        updates_per_step=0.5,
+        starts=1_000,
+        tau=0.01,
+        learning_rate=Linear(1e-3, 0.0),
+        max_grad_norm=10.0,
+    )
     rollout = Rollout(env, dqn.policy, 16, dqn.keys)
     for update in range(195):  # 50,000 steps
         dqn.update(rollout.collect(update / 195), update / 195)

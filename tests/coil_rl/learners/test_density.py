@@ -55,7 +55,6 @@ def test_sample_and_log_prob_are_those_of_the_libraries(kind):
     )
     if kind != "squashed to bounds":
         assert torch.equal(sample, drawn)
-        assert torch.equal(log_prob, of_draw)
 
 
 @pytest.mark.parametrize("kind", PAIRS)

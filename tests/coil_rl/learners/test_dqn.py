@@ -9,6 +9,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_paper.tabular import garnet, toymaker, value_iteration
 from coil_rl.learners import DQN
+from coil_rl.learners.policy import Entries
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
 from coil_rl.transforms import GuideActions
@@ -21,7 +22,10 @@ def table(mdp, num_envs=32, **options):
 def make(env=None, **options):
     torch.manual_seed(0)
     env = env or table(garnet(5, 3, np.random.default_rng(0)))
-    dqn = DQN(env, **{"hidden": [16], "starts": 0, "batch_size": 32, "ratio": 1} | options)
+    dqn = DQN(
+        env,
+        **{"hidden": [16], "starts": 0, "batch_size": 32, "updates_per_step": 0.03125} | options,
+    )
     return dqn, Rollout(env, dqn.policy, 4, dqn.keys)
 
 
@@ -29,29 +33,30 @@ def make(env=None, **options):
 def test_loss_is_the_squared_distance_to_the_target(double):
     """y = r + gamma Q'(s', b), b the best action of Q (double) or Q'; y = r at the last step."""
     dqn, rollout = make(double=double, gamma=0.9, tau=0.0, learning_rate=0.1)
-    minibatch = rollout.collect().select(*dqn.keys).reshape(-1)
+    minibatch = Entries(rollout.collect().select(*dqn.keys).reshape(-1).items(True, True))
     minibatch["next", "terminated"][::3] = True
-    network, target_params = dqn.network.module[0].module, dqn.loss.target_value_network_params
+    network = dqn.values.module
     with torch.no_grad():
-        for parameter in network.parameters():  # network and target network must differ
-            parameter.add_(torch.randn_like(parameter), alpha=0.5)
-        before, after = minibatch["observation"], minibatch["next", "observation"]
-        with target_params.to_module(dqn.network):
-            next_values = network(after)
+        vector = dqn.of_values.vector  # network and target network must differ
+        vector.add_(torch.randn_like(vector), alpha=0.5)
+        after = minibatch["next", "observation"]
+        next_values = dqn.target.module(after)
         selecting = network(after) if double else next_values
         best = next_values.gather(-1, selecting.argmax(-1, keepdim=True))
         target = minibatch["next", "reward"] + 0.9 * ~minibatch["next", "terminated"] * best
-    value = network(before).gather(-1, minibatch["action"].unsqueeze(-1))
+    value = network(minibatch["observation"]).gather(-1, minibatch["action"].unsqueeze(-1))
     expected = F.mse_loss(value, target)
-    torch.testing.assert_close(dqn.loss(minibatch)["loss"], expected)
-    gradients = torch.autograd.grad(expected, list(network.parameters()))
-    dqn.loss(minibatch)["loss"].backward()
-    for parameter, gradient in zip(network.parameters(), gradients, strict=True):
-        torch.testing.assert_close(parameter.grad, gradient)
+    found = dqn.losses(minibatch)["loss"]
+    torch.testing.assert_close(found, expected)
+    written = torch.autograd.grad(expected, list(network.parameters()))
+    gradient = torch.autograd.grad(found, vector)[0]
+    torch.testing.assert_close(gradient, torch.cat([each.flatten() for each in written]))
 
 
 def test_epsilon_follows_its_schedule():
-    dqn, rollout = make(table(toymaker(), 2_000), epsilon=Linear(1.0, 0.2, until=0.5), ratio=0)
+    dqn, rollout = make(
+        table(toymaker(), 2_000), epsilon=Linear(1.0, 0.2, until=0.5), updates_per_step=0
+    )
     shares = []
     for progress in (0.0, 1.0, 1.0):
         batch = rollout.collect()
@@ -82,7 +87,7 @@ def test_dqn_finds_the_optimal_policy_of_a_table(mdp, key):
     env = TransformedEnv(table(mdp, max_steps=1_000), GuideActions({"optimal": guide}))
     options = {
         "gamma": mdp.gamma,
-        "ratio": 4,
+        "updates_per_step": 0.125,
         "batch_size": 64,
         "learning_rate": 1e-2,
         "tau": 0.1,
@@ -100,6 +105,6 @@ def test_dqn_finds_the_optimal_policy_of_a_table(mdp, key):
 
 def test_one_hot_actions():
     env = GymEnv("CartPole-v1")
-    dqn, rollout = make(env, ratio=8)
+    dqn, rollout = make(env, updates_per_step=0.25)
     assert dqn.update(rollout.collect())["minibatches"] == 1
     assert env.action_spec.is_in(dqn.policy(env.reset())["action"])

@@ -48,7 +48,11 @@ def test_activation_is_used_and_gain_scales_the_last_layer(activation):
 def test_learners_update_with_images_and_vectors(kind, shape):
     torch.manual_seed(0)
     env = images(*shape, action=Categorical(3, ()) if kind is DQN else None)
-    options = {"minibatches": 2} if kind is PPO else {"starts": 8, "batch_size": 8, "ratio": 0.25}
+    options = (
+        {"minibatches": 2}
+        if kind is PPO
+        else {"starts": 8, "batch_size": 8, "updates_per_step": 0.03125}
+    )
     learner = kind(env, ["image", "speed"], network=Cnn(**SMALL), **options)
     convolutions = [module for module in learner.policy.modules() if isinstance(module, nn.Conv2d)]
     assert [(layer.in_channels, layer.out_channels) for layer in convolutions] == [(3, 4), (4, 8)]

@@ -8,7 +8,7 @@ import worlds
 from tensordict.nn import TensorDictModule
 
 from coil_rl.errors import UserError
-from coil_rl.learners import A2C, DQN, PPO, SAC, DynamicCoil, gradient
+from coil_rl.learners import A2C, DQN, PPO, SAC, TQC, CrossQ, DynamicCoil, gradient
 from coil_rl.learners.gradient import GradientStep
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import DiscreteActions
@@ -48,6 +48,14 @@ CASES = [
         (),
         {"starts": 64, "batch_size": 32, "critics": 3, "target_critics": 2},
         id="redq",
+        marks=pytest.mark.slow,
+    ),
+    pytest.param(CrossQ, (), {"starts": 64, "batch_size": 32}, id="crossq", marks=pytest.mark.slow),
+    pytest.param(
+        TQC,
+        (),
+        {"starts": 64, "batch_size": 32, "quantiles": 5, "n_step": 3},
+        id="tqc",
         marks=pytest.mark.slow,
     ),
     pytest.param(

@@ -13,7 +13,7 @@ from coil_rl.testing import check_env
 from coil_rl.transforms import AdaptiveMixedAction, GradualResidual, GuideActions, Takeover
 from coil_studies import IBRL
 
-SMALL = {"starts": 8, "batch_size": 8, "ratio": 2, "hidden": [8]}
+SMALL = {"starts": 8, "batch_size": 8, "updates_per_step": 0.25, "hidden": [8]}
 WAYS = {
     "warm start": (
         [lambda: Takeover(1.0, 16)],

@@ -8,6 +8,7 @@ from torchrl.data import MultiCategorical
 
 from coil_rl.learners import PPO, SAC, FilteredKickstartLoss, KickstartLoss
 from coil_rl.learners.kickstart import EDGE
+from coil_rl.learners.policy import Entries
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
 
@@ -94,14 +95,14 @@ def replay(auxiliary, **options):
         critics=3,
         starts=0,
         batch_size=32,
-        ratio=1,
+        updates_per_step=0.0625,
         auxiliary=[auxiliary],
         action_gain=1.0,
         **options,
     )
     with torch.no_grad():
-        for value in sac.loss.qvalue_network_params.values(True, True):
-            value.add_(torch.randn_like(value), alpha=0.3)
+        vector = sac.of_critics.vector
+        vector.add_(torch.randn_like(vector), alpha=0.3)
     rollout = Rollout(env, sac.policy, 16, sac.keys)
     return sac, rollout, rollout.collect().reshape(-1)
 
@@ -130,7 +131,8 @@ def test_loss_is_added_to_that_of_the_policy_of_sac_by_its_schedule():
         weights = sac.loss_weights(progress)
         assert weights == dict.fromkeys(sac.minimised, 1.0) | {"loss_guide": coefficient}
         torch.testing.assert_close(
-            sac.losses(data.clone())["loss_guide"], KickstartLoss()(sac.actor, data)
+            sac.losses(Entries(data.items(True, True)))["loss_guide"],
+            KickstartLoss()(sac.actor, data),
         )
     assert sac.update(rollout.collect())["loss_guide"] != 0
 

@@ -20,7 +20,7 @@ KINDS = [PPO, A2C, Reinforce, TRPO, SAC, DQN]
 
 
 def learner_of(kind, env, **options):
-    replay = {"starts": 16, "batch_size": 16, "ratio": 0.25}
+    replay = {"starts": 16, "batch_size": 16, "updates_per_step": 0.015625}
     return kind(env, **({"minibatches": 2} if kind not in (SAC, DQN) else replay), **options)
 
 

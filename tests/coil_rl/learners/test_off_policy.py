@@ -11,8 +11,10 @@ from torchrl.envs import Compose, PendulumEnv, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import RandomGuide
-from coil_rl.learners import DQN, SAC
+from coil_rl.learners import DQN, SAC, TQC, CrossQ
+from coil_rl.learners.n_step import NStep, discount
 from coil_rl.learners.off_policy import OffPolicy
+from coil_rl.learners.policy import Entries
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import (
     DelayedAdvice,
@@ -28,8 +30,8 @@ from coil_rl.transforms import (
 def steps(first, count, **more):
     """Steps in which every entry is the number of the step."""
     number = torch.arange(first, first + count).float().unsqueeze(-1)
-    flag = torch.zeros_like(number, dtype=torch.bool)
-    after = {"th": number.squeeze(-1), "reward": number, "done": flag, "terminated": flag}
+    done, terminated = torch.zeros(2, count, 1, dtype=torch.bool)
+    after = {"th": number.squeeze(-1), "reward": number, "done": done, "terminated": terminated}
     return TensorDict({"th": number.squeeze(-1), "action": number, "next": after, **more}, [count])
 
 
@@ -39,7 +41,7 @@ def replay(env=None, **options):
         "in_keys": ["th"],
         "capacity": 10,
         "batch_size": 4,
-        "ratio": 1.0,
+        "updates_per_step": 0.25,
         "starts": 0,
         "tau": 0.1,
     } | options
@@ -57,8 +59,8 @@ def test_newest_steps_replace_the_oldest():
     assert stored(learner) == list(range(8, 18))
 
 
-def test_steps_are_sampled_as_often_as_the_ratio():
-    learner = replay(capacity=10_000, batch_size=50, ratio=2.5)
+def test_there_are_updates_for_each_step_once_learning_has_started():
+    learner = replay(capacity=10_000, batch_size=50, updates_per_step=0.05, starts=100)
     counts = torch.zeros(1_000)
     for first in range(0, 1_000, 30):
         learner.store(steps(first, min(30, 1_000 - first)))
@@ -66,7 +68,43 @@ def test_steps_are_sampled_as_often_as_the_ratio():
             assert minibatch["action"].flatten().max() < first + 30
             assert torch.equal(minibatch["next", "reward"], minibatch["action"])
             counts += torch.bincount(minibatch["action"].flatten().long(), minlength=1_000)
-    assert counts.sum() == 2.5 * 1_000
+    # 90 steps are stored before the batch with which there are 100.
+    assert counts.sum() == 50 * int(0.05 * (1_000 - 90))
+
+
+def test_rewards_of_several_steps_are_summed_within_an_episode():
+    """y needs r + gamma r' + gamma^2 r'', the state after them, and whether it terminated there."""
+    whole, gamma = steps(0, 12), 0.5
+    whole["next", "reward"] = torch.arange(12.0).square().unsqueeze(-1)
+    whole["next", "done"][[4, 8]] = True
+    whole["next", "terminated"][8] = True  # the step 4 ends a truncated episode
+    ends = (4, 8, 11)
+    for size in (1, 2, 5, 12):  # of a batch
+        sums = NStep(3, gamma)
+        parts = [sums.summed(part.unsqueeze(0)) for part in whole.split(size)]
+        found = torch.cat(parts)
+        places = found["action"].flatten().int().tolist()
+        # The last two steps wait for the next batch.
+        assert sorted(places) == list(range(10))
+        for place, step in zip(places, found, strict=True):
+            last = min(place + 2, *(end for end in ends if end >= place))
+            taken = range(place, last + 1)
+            expected = sum(gamma ** (each - place) * each**2 for each in taken)
+            assert float(step["next", "reward"]) == expected
+            assert int(step["next", "steps"]) == len(taken)
+            assert float(step["next", "th"]) == last
+            assert bool(step["next", "terminated"]) == (last == 8)
+            live = 0.0 if last == 8 else gamma ** len(taken)
+            entries = Entries(step.unsqueeze(0).items(True, True))
+            assert float(discount(entries, torch.tensor(gamma))) == live
+
+
+def test_waiting_steps_are_part_of_the_state():
+    whole = steps(0, 6).unsqueeze(0)
+    first, second = NStep(3, 0.9), NStep(3, 0.9)
+    first.summed(whole[:, :4])
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    assert (first.summed(whole[:, 4:]) == second.summed(whole[:, 4:])).all()
 
 
 def agent_acts(*flags):
@@ -137,7 +175,12 @@ def test_stored_steps_agree_with_the_env(name):
 
 def test_steps_of_the_guide_are_sampled_as_their_share():
     learner = replay(
-        worlds.pendulum(Takeover(0.5)), prior=0.25, batch_size=8, capacity=50, starts=30, ratio=8.0
+        worlds.pendulum(Takeover(0.5)),
+        prior=0.25,
+        batch_size=8,
+        capacity=50,
+        starts=30,
+        updates_per_step=1.0,
     )
     for first, acts in ((0, False), (20, False), (40, True), (60, True)):
         given = steps(first, 20, agent_acts=torch.full((20, 1), acts))
@@ -148,12 +191,18 @@ def test_steps_of_the_guide_are_sampled_as_their_share():
             assert not minibatches, "30 steps must be stored"
         for minibatch in minibatches:
             of_guide = (minibatch["action"] < 40).sum()
-            assert len(minibatch) == 8
+            assert len(minibatch["action"]) == 8
             assert of_guide == (2 if acts else 8)
     assert learner.kept == 80
 
 
-TINY = {"starts": 20, "batch_size": 16, "ratio": 2, "capacity": 90, "hidden": [8]}
+TINY = {
+    "starts": 20,
+    "batch_size": 16,
+    "updates_per_step": 0.125,
+    "capacity": 90,
+    "hidden": [8],
+}
 
 
 def make(kind, seed=0, **changes):
@@ -168,7 +217,7 @@ def make(kind, seed=0, **changes):
     return learner, Rollout(env, learner.policy, 4, learner.keys)
 
 
-@pytest.mark.parametrize("kind", [DQN, SAC])
+@pytest.mark.parametrize("kind", [DQN, SAC, CrossQ, TQC])
 @pytest.mark.parametrize("updates", [1, 4], ids=["buffer not full", "buffer full"])
 def test_state_contains_everything_the_next_update_depends_on(kind, updates):
     first, rollout = make(kind)
@@ -205,19 +254,7 @@ def test_learning_starts_after_some_steps_and_has_no_losses_before(kind):
     learner, rollout = make(kind, starts=40)
     first, second = (learner.update(rollout.collect()) for _ in range(2))
     assert first["minibatches"] == 0
-    assert second["minibatches"] == 8
+    assert second["minibatches"] == 4
     of_minibatches = ("loss", "value", "alpha", "entropy")
     assert all(math.isnan(first[name]) == name.startswith(of_minibatches) for name in first)
     assert all(map(math.isfinite, second.values()))
-
-
-@pytest.mark.parametrize(
-    ("kind", "name"), [(DQN, "value_network_params"), (SAC, "qvalue_network_params")]
-)
-def test_target_network_follows_by_tau(kind, name):
-    learner, rollout = make(kind, starts=0, ratio=0.5, tau=0.25)
-    params, target_params = getattr(learner.loss, name), getattr(learner.loss, f"target_{name}")
-    before = target_params.clone()
-    assert learner.update(rollout.collect())["minibatches"] == 1
-    for key, value in target_params.items(True, True):
-        torch.testing.assert_close(value, 0.75 * before[key] + 0.25 * params[key].detach())

@@ -18,7 +18,7 @@ SMALL = [
     "evaluation.gif=false",
     "logger=none",
 ]
-SAC = ["learner.ratio=64", "learner.batch_size=64"]
+SAC = ["learner.updates_per_step=1", "learner.batch_size=64"]
 REVERSED = ["degrade=[adversarial]", f"method.transforms.takeover.frames={FRAMES // 2}"]
 
 

@@ -28,7 +28,7 @@ COMMON = {
     "max_grad_norm": 0,
     "seed": -1,
 }
-REPLAY = {"tau": 2, "batch_size": 0, "capacity": 10, "ratio": -1, "starts": -1}
+REPLAY = {"tau": 2, "batch_size": 0, "capacity": 10, "updates_per_step": -1, "starts": -1}
 OUT_OF_RANGE = {
     PPO: COMMON
     | {

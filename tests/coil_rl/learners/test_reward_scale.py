@@ -33,7 +33,7 @@ def learner_in(kind, unit, **options):
     """Return a learner and the rollout in its env."""
     torch.manual_seed(0)
     env = InUnit(Categorical(3, ()) if kind is DQN else None, unit)
-    replay = {"starts": 16, "batch_size": 16, "ratio": 0.25}
+    replay = {"starts": 16, "batch_size": 16, "updates_per_step": 0.125}
     options |= {"minibatches": 2} if kind not in (SAC, DQN) else replay
     learner = kind(env, **options)
     return learner, Rollout(env, learner.policy, 8, learner.keys)

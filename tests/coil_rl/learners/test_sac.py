@@ -1,95 +1,170 @@
+"""The losses of SAC and its relatives, written out."""
+
 import math
 
 import pytest
 import torch
 import worlds
-from torchrl.envs import GymEnv
+from torch.nn import functional as F
+from torchrl.envs import GymEnv, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.learners import SAC
+from coil_rl.learners import SAC, TQC, CrossQ
+from coil_rl.learners.policy import Entries
 from coil_rl.run.policy_batch import policy_batch
 from coil_rl.run.rollout import Rollout
 
 
-def make(**options):
+def make(kind=SAC, **options):
     torch.manual_seed(0)
     env = options.pop("env", None) or worlds.pendulum()
-    sac = SAC(
+    sac = kind(
         env,
-        **{"in_keys": ["th", "thdot"], "hidden": [16], "starts": 0, "batch_size": 16, "ratio": 1}
+        **{
+            "in_keys": ["th", "thdot"],
+            "hidden": [16],
+            "starts": 0,
+            "batch_size": 16,
+            "updates_per_step": 0.0625,
+        }
         | options,
     )
     return sac, Rollout(env, sac.policy, 32, sac.keys)
 
 
 def minibatch_of(sac, rollout):
-    minibatch = rollout.collect().select(*sac.keys).reshape(-1)
-    minibatch["next", "terminated"][::3] = True
-    return minibatch
+    steps = rollout.collect().select(*sac.keys).reshape(-1)
+    steps["next", "terminated"][::3] = True
+    return Entries(steps.items(True, True))
 
 
-def action_values(sac, parameters, states, action):
-    """Values of both critics with these parameters, [2, N]."""
-    data = states.select("th", "thdot").set("action", action)
-    values = []
-    for one in parameters.unbind(0):
-        with one.to_module(sac.loss.qvalue_network):
-            values.append(sac.loss.qvalue_network(data.copy())["state_action_value"].squeeze(-1))
-    return torch.stack(values)
+def spread(sac):
+    """Make the critics and their target networks differ."""
+    with torch.no_grad():
+        for vector in (sac.of_critics.vector, sac.of_target.vector):
+            vector.add_(torch.randn_like(vector), alpha=0.5)
+
+
+def value_of(critics, number, states, action):
+    """The outputs of one critic, layer by layer, [N, n]."""
+    x = torch.cat([states["th"].unsqueeze(-1), states["thdot"].unsqueeze(-1), action], -1)
+    for place, layer in enumerate(critics.layers):
+        if place:
+            x = F.relu(F.layer_norm(x, x.shape[-1:]) if critics.layer_norm else x)
+        x = x @ layer.weight[number] + layer.bias[number, 0]
+    return x
+
+
+def values_of(critics, states, action):
+    """The outputs of all critics, [critics, N, n]."""
+    return torch.stack([value_of(critics, n, states, action) for n in range(critics.count)])
+
+
+def after(minibatch):
+    return {key[1]: value for key, value in minibatch.items() if key[0] == "next"}
 
 
 def sample(sac, states):
     """A random action of the policy, and its log-probability."""
-    distribution = sac.policy.get_dist(states.select("th", "thdot"))
-    action, _ = distribution.draw()
-    return action, distribution.log_prob(action)
+    density = sac.actor.density(Entries({key: states[key] for key in ("th", "thdot")}))
+    action, _ = density.draw()
+    return action, density.log_prob(action)
 
 
-def test_critics_learn_the_soft_value_of_the_next_state():
+def soft_target(sac, data, action, log_prob, value):
+    soft = value - float(sac.alpha) * log_prob
+    live = ~data["next", "terminated"].squeeze(-1)
+    return data["next", "reward"].squeeze(-1) + 0.9 * live * soft
+
+
+@pytest.mark.parametrize("norm", [True, False])
+def test_critics_learn_the_soft_value_of_the_next_state(norm):
     """y = r + gamma (min Q'(s', b) - alpha log pi(b | s')); y = r where an episode terminated."""
-    sac, rollout = make(gamma=0.9, temperature=0.5)
-    data, params = minibatch_of(sac, rollout), sac.loss.qvalue_network_params
-    assert not torch.equal(*params["module", "layers", "0", "weight"])
+    sac, rollout = make(gamma=0.9, temperature=0.5, critic_layer_norm=norm)
+    spread(sac)
+    data = minibatch_of(sac, rollout)
     with torch.no_grad():
-        for value in params.values(True, True):  # critics and target networks must differ
-            value.add_(torch.randn_like(value), alpha=0.5)
         torch.manual_seed(1)
-        action, log_prob = sample(sac, data["next"])
-        soft = (
-            action_values(sac, sac.loss.target_qvalue_network_params, data["next"], action)
-            .min(0)
-            .values
-            - 0.5 * log_prob
-        )
-        target = (
-            data["next", "reward"] + 0.9 * ~data["next", "terminated"] * soft.unsqueeze(-1)
-        ).squeeze(-1)
-        expected = (
-            (action_values(sac, params, data, data["action"]) - target).square().sum(0).mean()
-        )
+        action, log_prob = sample(sac, after(data))
+        value = values_of(sac.target, after(data), action).amin(0).squeeze(-1)
+        target = soft_target(sac, data, action, log_prob, value)
+        values = values_of(sac.critics, data, data["action"]).squeeze(-1)
+        expected = (values - target).square().sum(0).mean()
         torch.manual_seed(1)
-        torch.testing.assert_close(sac.loss(data)["loss_qvalue"], expected)
+    torch.testing.assert_close(sac.losses(data)["loss_qvalue"].detach(), expected)
 
 
 def test_policy_and_temperature_learn_from_actions_of_the_policy():
     """The loss is alpha log pi(a | s) - min Q(s, a), that by log alpha -(log pi + target)."""
     sac, rollout = make(temperature=0.5, target_entropy=-2.0)
+    spread(sac)
     data = minibatch_of(sac, rollout)
     torch.manual_seed(1)
-    sample(sac, data["next"])  # the target of the critics is sampled first
+    sample(sac, after(data))  # the target of the critics is sampled first
     action, log_prob = sample(sac, data)
-    params = sac.loss.qvalue_network_params
-    expected = (0.5 * log_prob - action_values(sac, params, data, action).min(0).values).mean()
+    value = values_of(sac.critics, data, action).amin(0).squeeze(-1)
     torch.manual_seed(1)
-    losses = sac.loss(data)
-    torch.testing.assert_close(losses["loss_actor"], expected)
-    torch.testing.assert_close(losses["loss_alpha"], -math.log(0.5) * (log_prob.mean() - 2.0))
-    (slope,) = torch.autograd.grad(losses["loss_alpha"], sac.loss.log_alpha)
-    torch.testing.assert_close(slope, 2.0 - log_prob.mean())
+    losses = sac.losses(data)
+    torch.testing.assert_close(losses["loss_actor"], (0.5 * log_prob - value).mean())
+    slope = torch.autograd.grad(losses["loss_alpha"], sac.temperature["log_alpha"])[0]
+    torch.testing.assert_close(slope, 2.0 - log_prob.detach().mean())
+
+
+def test_each_loss_has_gradients_for_its_own_networks_only():
+    sac, rollout = make()
+    data = minibatch_of(sac, rollout)
+    vectors = {"loss_actor": sac.of_actor.vector, "loss_qvalue": sac.of_critics.vector}
+    for name, own in vectors.items():
+        for vector in vectors.values():
+            gradient = torch.autograd.grad(sac.losses(data)[name], vector, allow_unused=True)[0]
+            assert (gradient is None) == (vector is not own)
+    assert sac.of_target.vector.grad is None
+
+
+def test_gradient_of_the_policy_is_that_of_a_written_out_step():
+    """The same minibatch and noise with functions of `torch.nn` alone."""
+    sac, rollout = make(critic_layer_norm=False)
+    data = minibatch_of(sac, rollout)
+    actor = [p.detach().clone().requires_grad_() for p in sac.actor.parameters()]
+    x = torch.stack([data["th"], data["thdot"]], -1)
+    for place in range(0, len(actor), 2):
+        x = F.linear(x.relu() if place else x, *actor[place : place + 2])
+    loc, scale = x.chunk(2, -1)
+    scale = F.softplus(scale + math.log(math.expm1(0.99))) + 0.01  # 1 where the network gives 0
+    torch.manual_seed(1)
+    sample(sac, after(data))
+    number = loc + torch.empty(32, 1).normal_() * scale
+    log_prob = torch.distributions.Normal(loc, scale).log_prob(number)
+    # The logarithm of the slope of 2 tanh.
+    slope = math.log(2) + 2 * (math.log(2) - number - F.softplus(-2 * number))
+    log_prob = (log_prob - slope).sum(-1)
+    value = values_of(sac.critics, data, 2 * number.tanh()).amin(0).squeeze(-1)
+    written = torch.autograd.grad((float(sac.alpha) * log_prob - value).mean(), actor)
+    torch.manual_seed(1)
+    found = torch.autograd.grad(sac.losses(data)["loss_actor"], sac.of_actor.vector)[0]
+    expected = torch.cat([each.flatten() for each in written])
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_target_networks_follow_by_tau():
+    sac, rollout = make(tau=0.25)
+    before = sac.of_target.vector.clone()
+    sac.update(rollout.collect())
+    learned = sac.of_critics.vector.detach()
+    assert not torch.equal(learned, before)
+    sac.of_target.vector.data.copy_(before)
+    sac.after_update()
+    torch.testing.assert_close(sac.of_target.vector, 0.75 * before + 0.25 * learned)
+    assert all(
+        torch.equal(view, parameter)
+        for view, parameter in zip(
+            sac.of_target._views(sac.of_target.vector), sac.target.parameters(), strict=True
+        )
+    )
 
 
 def test_standard_deviation_is_initially_the_scale_in_every_state():
-    sac, rollout = make(action_gain=0.0, action_scale=0.3, learning_rate=1e-2, ratio=8)
+    sac, rollout = make(action_gain=0.0, action_scale=0.3, learning_rate=1e-2, updates_per_step=0.5)
     batch = rollout.collect()
     before = sac.policy.get_dist(batch.select("th", "thdot"))
     torch.testing.assert_close(before.scale, torch.full((32, 1), 0.3))
@@ -98,59 +173,111 @@ def test_standard_deviation_is_initially_the_scale_in_every_state():
     assert sac.policy.get_dist(batch.select("th", "thdot")).scale.std() > 1e-4
 
 
+def test_first_actions_are_almost_uniform():
+    sac, _ = make()
+    states = {"th": torch.zeros(100_000), "thdot": torch.zeros(100_000)}
+    with torch.no_grad():
+        action = sample(sac, states)[0]
+    shares = torch.histc(action, 8, -2, 2) / len(action)
+    assert 0.09 < shares.min() < shares.max() < 0.17  # 0.125 each
+
+
 @pytest.mark.slow
-def test_swings_the_pendulum_up():
+@pytest.mark.parametrize("kind", [SAC, TQC])
+def test_swings_the_pendulum_up(kind):
     torch.manual_seed(0)
-    env = GymEnv("Pendulum-v1")
+    env = TransformedEnv(GymEnv("Pendulum-v1"))
     env.set_seed(0)
-    # With returns in the hundreds, a small norm of all gradients would scale the gradients of the
-    # policy to nearly 0.
-    sac = SAC(env, temperature=0.2, tau=0.02, ratio=128, starts=500, max_grad_norm=1e9)
-    rollout = Rollout(env, sac.policy, 8, sac.keys)
-    for _ in range(1_000):
+    sac = kind(env, scale_rewards=True)
+    rollout = Rollout(env, sac.policy, 32, sac.keys)
+    for _ in range(220):
         sac.update(rollout.collect())
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         returns = [float(env.rollout(200, sac.policy)["next", "reward"].sum()) for _ in range(20)]
-    # A random policy gets -1200, a good one -160. Single starts differ by 100, so the standard
+    # A random policy gets -1200, a good one -150. Single starts differ by 100, so the standard
     # error is 25.
-    assert sum(returns) / 20 > -230
-
-
-def spread(sac):
-    """Make the critics and their target networks differ."""
-    with torch.no_grad():
-        for value in sac.loss.qvalue_network_params.values(True, True):
-            value.add_(torch.randn_like(value), alpha=0.5)
+    assert sum(returns) / 20 > -250
 
 
 def test_some_of_many_critics_are_drawn_for_the_target_and_the_policy_maximises_their_mean():
     sac, rollout = make(critics=5, target_critics=2, gamma=0.9, temperature=0.5)
     spread(sac)
-    data, params = minibatch_of(sac, rollout), sac.loss.qvalue_network_params
+    data = minibatch_of(sac, rollout)
     torch.manual_seed(1)
-    drawn = torch.randperm(5)[:2].sort().values
-    both = torch.stack([data.select("th", "thdot"), data["next"].select("th", "thdot")])
-    action, log_prob = sample(sac, both)
     with torch.no_grad():
-        after = action_values(sac, sac.loss.target_qvalue_network_params, data["next"], action[1])[
-            drawn
-        ].amin(0)
-        soft = (after - 0.5 * log_prob[1]).unsqueeze(-1)
-        target = (data["next", "reward"] + 0.9 * ~data["next", "terminated"] * soft).squeeze(-1)
-        error = (action_values(sac, params, data, data["action"]) - target).square().mean()
-        mean = action_values(sac, params, data, action[0]).mean(0)
+        action, log_prob = sample(sac, after(data))
+        drawn = torch.randperm(5)[:2]
+        value = values_of(sac.target, after(data), action)[drawn].amin(0).squeeze(-1)
+        target = soft_target(sac, data, action, log_prob, value)
+        values = values_of(sac.critics, data, data["action"]).squeeze(-1)
+        error = (values - target).square().sum(0).mean()
+        action, log_prob = sample(sac, data)
+        mean = values_of(sac.critics, data, action).mean(0).squeeze(-1)
     torch.manual_seed(1)
-    losses = sac.loss(data)
-    torch.testing.assert_close(losses["loss_qvalue"], error)
-    torch.testing.assert_close(losses["loss_actor"], (0.5 * log_prob[0] - mean).mean())
+    losses = sac.losses(data)
+    torch.testing.assert_close(losses["loss_qvalue"].detach(), error)
+    torch.testing.assert_close(losses["loss_actor"].detach(), (0.5 * log_prob - mean).mean())
 
 
-def test_layers_of_the_critics_alone_are_normalised():
-    sac, _ = make(critic_layer_norm=True, hidden=[16, 8], critics=3)
-    weights = sac.loss.qvalue_network_params
-    assert weights["module", "layers", "1", "weight"].shape == (3, 16)
-    assert weights["module", "layers", "4", "weight"].shape == (3, 8)
-    assert not any(isinstance(module, torch.nn.LayerNorm) for module in sac.policy.modules())
+def test_crossq_normalises_both_states_together_and_has_no_target_networks():
+    sac, rollout = make(CrossQ, gamma=0.9, temperature=0.5)
+    data, norm = minibatch_of(sac, rollout), sac.critics.norms[0]
+    torch.manual_seed(1)
+    with torch.no_grad():
+        action, log_prob = sample(sac, after(data))
+        entries = {
+            key: torch.cat([data[key], {"action": action, **after(data)}[key]])
+            for key in ("th", "thdot", "action")
+        }
+        values, following = sac.critics.outputs(Entries(entries), train=True).chunk(2, 1)
+        value = following.amin(0).squeeze(-1)
+        target = soft_target(sac, data, action, log_prob, value)
+        expected = (values.squeeze(-1) - target).square().sum(0).mean()
+    torch.manual_seed(1)
+    torch.testing.assert_close(sac.losses(data)["loss_qvalue"].detach(), expected)
+    read = torch.stack([entries["th"], entries["thdot"], entries["action"][:, 0]], -1)
+    mean = read.mean(0)
+    torch.testing.assert_close(norm.mean[0, 0], mean * (1 - 0.99**2))  # of two equal batches
+    before = norm.mean.clone()
+    sac.critics.values(data)  # as in the loss of the policy
+    assert torch.equal(norm.mean, before)
+    assert not any(part is sac.of_target.vector for part in sac.gradient.parameters)
+
+
+def test_tqc_leaves_out_the_largest_quantiles_of_all_critics():
+    sac, rollout = make(TQC, quantiles=4, dropped=1, gamma=0.9, temperature=0.5)
+    spread(sac)
+    data = minibatch_of(sac, rollout)
+    torch.manual_seed(1)
+    with torch.no_grad():
+        action, log_prob = sample(sac, after(data))
+        every = values_of(sac.target, after(data), action)
+        kept = torch.cat([every[0], every[1]], -1).sort(-1).values[:, :6]
+        targets = torch.stack(
+            [soft_target(sac, data, action, log_prob, kept[:, n]) for n in range(6)], -1
+        )
+        expected, levels = 0.0, (0.125, 0.375, 0.625, 0.875)
+        for quantiles in values_of(sac.critics, data, data["action"]):
+            for level, quantile in zip(levels, quantiles.unbind(-1), strict=True):
+                error = targets - quantile.unsqueeze(-1)
+                huber = torch.where(error.abs() < 1, error.square() / 2, error.abs() - 0.5)
+                expected += ((level - (error < 0).float()).abs() * huber).mean() / 4
+        action, log_prob = sample(sac, data)
+        mean = values_of(sac.critics, data, action).mean((0, 2))
+    torch.manual_seed(1)
+    losses = sac.losses(data)
+    torch.testing.assert_close(losses["loss_qvalue"].detach(), expected)
+    torch.testing.assert_close(losses["loss_actor"].detach(), (0.5 * log_prob - mean).mean())
+
+
+def test_dropout_acts_in_learning_only():
+    sac, rollout = make(dropout=0.5)
+    data = minibatch_of(sac, rollout)
+    with torch.no_grad():
+        fixed = [sac.critics.outputs(data) for _ in range(2)]
+        drawn = [sac.critics.outputs(data, train=True) for _ in range(2)]
+    assert torch.equal(*fixed)
+    assert not torch.equal(*drawn)
 
 
 @pytest.mark.parametrize(
@@ -162,28 +289,34 @@ def test_uncertainty_is_the_standard_deviation_of_the_critics(many):
     assert sac.update(rollout.collect())["uncertainty"] > 0
     data = minibatch_of(sac, rollout)
     measured = sac.describe(data)["uncertainty"]
+    states = rollout.collect().select("th", "thdot")
     with torch.no_grad():
-        values = action_values(sac, sac.loss.qvalue_network_params, data, data["action"])
+        values = values_of(sac.critics, data, data["action"])
         assert measured == pytest.approx(float(values.std(0).mean()), rel=1e-4)
-        acted = sac.policy(data.select("th", "thdot"))
-        values = action_values(sac, sac.loss.qvalue_network_params, data, acted["action"])
-    torch.testing.assert_close(acted["next", "uncertainty"], values.std(0).unsqueeze(-1))
+        acted = sac.policy(states.copy())
+        values = values_of(sac.critics, states, acted["action"])
+    torch.testing.assert_close(acted["next", "uncertainty"], values.std(0))
     policies = policy_batch(sac.policy, [sac.policy.state_dict()])
-    assert policies(data.select("th", "thdot"))["next", "uncertainty"].shape == (32, 1)
+    assert policies(states)["next", "uncertainty"].shape == (32, 1)
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("kind", "options", "message"),
     [
-        ({"critics": 1}, "critics=1 must be"),
+        (SAC, {"critics": 1}, "critics=1 must be"),
         (
+            SAC,
             {"critics": 4, "target_critics": 4},
             "target_critics=4 must be at least 1 and less than critics=4",
         ),
-        ({"prior": 0.5}, r"prior=0\.5 needs steps in which a guide acts"),
-        ({"prior": 1.5}, r"prior=1\.5 must be"),
+        (SAC, {"prior": 0.5}, r"prior=0\.5 needs steps in which a guide acts"),
+        (SAC, {"prior": 1.5}, r"prior=1\.5 must be"),
+        (CrossQ, {"tau": 0.1}, "tau: CrossQ has no target networks"),
+        (CrossQ, {"critic_layer_norm": True}, "critic_layer_norm: CrossQ"),
+        (TQC, {"dropped": 25}, "dropped=25 must be less than quantiles=25"),
+        (TQC, {"target_critics": 1}, "all critics of TQC give the target"),
     ],
 )
-def test_invalid_options_are_refused(options, message):
+def test_invalid_options_are_refused(kind, options, message):
     with pytest.raises(ValueError, match=message):
-        make(**options)
+        make(kind, **options)

@@ -11,7 +11,7 @@ from coil_rl.schedules import Linear
 FRAMES = 6 * 64
 MAKERS = {
     "ppo": lambda env: PPO(env, hidden=[8], minibatches=4, learning_rate=Linear(1e-3, 0.0)),
-    "sac": lambda env: SAC(env, hidden=[8], starts=64, batch_size=16, ratio=0.25),
+    "sac": lambda env: SAC(env, hidden=[8], starts=64, batch_size=16, updates_per_step=0.015625),
 }
 
 

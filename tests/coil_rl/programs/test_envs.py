@@ -40,7 +40,7 @@ OWN = dict.fromkeys(TRACKED, SHORT)
 OWN |= {env: [*overrides, *SMALL_CASES] for env, overrides in OTHERS.items()}
 PPO = ["learner.epochs=2", "learner.minibatches=2"]
 REPLAY = shlex.split(
-    "learner.capacity=1000 learner.starts=64 learner.batch_size=32 learner.ratio=1"
+    "learner.capacity=1000 learner.starts=64 learner.batch_size=32 learner.updates_per_step=0.03125"
 )
 PROXY = shlex.split(
     "proxy.budget.frames=64 proxy.budget.num_envs=2 proxy.budget.steps=16 "

@@ -20,7 +20,12 @@ TINY = [
     "budget.num_envs=4",
     "budget.steps=8",
 ]
-OFF_POLICY = ["learner.starts=16", "learner.batch_size=8", "learner.ratio=1", "learner.hidden=[8]"]
+OFF_POLICY = [
+    "learner.starts=16",
+    "learner.batch_size=8",
+    "learner.updates_per_step=0.125",
+    "learner.hidden=[8]",
+]
 GIVEN = {
     "dqn": OFF_POLICY,
     "sac": OFF_POLICY,
@@ -113,11 +118,11 @@ def test_compatible_method_and_learner_train(method, learner, tmp_path):
         ),
         (
             "learner=dqn learner.capacity=10",
-            "learner: capacity=10 must be at least 1 and at least starts=5000",
+            "learner: capacity=10 must be at least 1 and at least starts=500",
         ),
         (
-            "learner=dqn budget.frames=5_000",
-            "budget.frames=5000 ends before learning starts, after learner.starts=5000 stored",
+            "learner=dqn budget.frames=500",
+            "budget.frames=500 ends before learning starts, after learner.starts=500 stored",
         ),
         (
             "method=rlpd learner=sac budget.frames=4_999",
@@ -143,8 +148,8 @@ def test_off_policy_learners_set_their_action_and_batch(tmp_path):
         dqn, sac, ppo = (compose("train", [f"learner={name}"]) for name in ("dqn", "sac", "ppo"))
     assert (dqn.action.choices, dict(sac.action), dict(ppo.action)) == (5, {}, {})
     assert [config.budget.num_envs * config.budget.steps for config in (dqn, sac, ppo)] == [
-        512,
-        512,
+        32,
+        32,
         6_144,
     ]
     assert len({config.budget.frames for config in (dqn, sac, ppo)}) == 1

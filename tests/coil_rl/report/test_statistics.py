@@ -110,3 +110,8 @@ def test_wins_compare_the_same_seed_and_track():
     x, y = [[3.0, 1.0], [0.0, 5.0]], [[2.0, 1.0], [4.0, 4.0]]
     np.testing.assert_array_equal(wins(x, y), [[1, 0.5], [0, 1]])
     np.testing.assert_array_equal(wins(x, [[2.0, 2.0]]), [[1, 0], [0, 1]], "shared by all seeds")
+
+
+def test_very_many_values_take_no_patterns_of_signs():
+    values = np.tile([1.0, -0.9], 100_000)
+    assert estimate(values).p == pytest.approx(stats.ttest_1samp(values, 0).pvalue)

@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from tensordict.nn import TensorDictModule
 
 from coil_rl.errors import UserError
 from coil_rl.files import remove_unfinished
@@ -219,3 +220,12 @@ def test_kill_at_any_step_of_a_save_leaves_a_checkpoint(tmp_path, monkeypatch):
             "checkpoint_previous.pt",
         }
     assert not died
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.float64])
+def test_weights_of_another_type_are_refused(dtype, tmp_path):
+    policy = TensorDictModule(torch.nn.Linear(2, 1), in_keys=["x"], out_keys=["y"])
+    checkpoint.put_weights(policy, policy.state_dict(), tmp_path)
+    state = {name: value.to(dtype) for name, value in policy.state_dict().items()}
+    with pytest.raises(UserError, match=rf"weight as {dtype}, not torch.float32"):
+        checkpoint.put_weights(policy, state, tmp_path)

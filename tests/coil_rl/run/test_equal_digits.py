@@ -21,7 +21,7 @@ FAST = ("coil", "residual")
 TINY = ["budget.num_envs=4", "budget.steps=16", "evaluation.cases=2", "logger=none"]
 TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
 ON_POLICY = ["learner.minibatches=2", "learner.epochs=3"]
-REPLAY = ["learner.starts=16", "learner.ratio=0.25", "learner.batch_size=16"]
+REPLAY = ["learner.starts=16", "learner.updates_per_step=0.015625", "learner.batch_size=16"]
 FOREST = ["learner.regressor.n_estimators=3"]
 OPTIONS = dict.fromkeys(("cheq", "ibrl", "policy_decorator", "rlpd", "wsrl", "q_filter"), REPLAY)
 OPTIONS |= {"dagger": FOREST, "oil": FOREST}

@@ -1,0 +1,74 @@
+"""CrossQ (Bhatt et al. 2024): SAC whose critics normalise batches and have no target networks.
+
+The critics compute the values of (s, a) and (s', b) in one batch, so that both are normalised by
+the same statistics:
+
+    y = r + gamma (min Q(s', b) - alpha log pi(b | s')),  b from pi(. | s')
+
+In the loss of the policy they are normalised by their running statistics. Two parts of the paper
+are left out: the policy is updated with each minibatch, not with each third, and its own layers are
+not normalised.
+"""
+
+from collections.abc import Sequence
+from typing import Unpack
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from coil_rl.learners.critics import Critics
+from coil_rl.learners.encoders import Mlp
+from coil_rl.learners.policy import Entries, next_of
+from coil_rl.learners.sac import NORMS, SAC, SACSettings
+from coil_rl.ranges import checked
+
+
+@checked
+class CrossQ(SAC):
+    """The CrossQ learner.
+
+    Args:
+        env: the env, with continuous actions.
+        in_keys: entries that policy and critics observe.
+        settings: of `SAC`; `tau` and `critic_layer_norm` have no effect, so they are a
+            `ValueError`.
+    """
+
+    betas = (0.5, 0.999)
+
+    def __init__(
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey] = ("observation",),
+        **settings: Unpack[SACSettings],
+    ) -> None:
+        for name in ("tau", "critic_layer_norm"):
+            if name in settings:
+                raise ValueError(f"{name}: CrossQ has no target networks and normalises batches")
+        super().__init__(env, in_keys, **settings)
+
+    def build_critics(
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey],
+        network: Mlp,
+        count: int,
+        norm: NORMS,
+        dropout: float,
+    ) -> Critics:
+        """Return critics that normalise batches."""
+        return super().build_critics(env, in_keys, network, count, "batch", dropout)
+
+    def after_update(self) -> None:
+        """Do nothing: there are no target networks."""
+
+    def critic_losses(self, minibatch: Entries) -> dict[str, Tensor]:
+        """Return the loss of all critics."""
+        with torch.no_grad():
+            after, log_prob = self.acted(next_of(minibatch))
+        both = {key: torch.cat([minibatch[key], after[key]]) for key in self.critics.in_keys}
+        values, next_values = self.critics.outputs(Entries(both), train=True).chunk(2, 1)
+        target = self.returns(minibatch, next_values.detach(), log_prob)
+        return self.distances(values, target)
