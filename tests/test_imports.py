@@ -41,7 +41,6 @@ PUBLIC = [
 
 # Public modules of theirs, with all that they hold.
 MODULES = [
-    "coil_rl.ranges",
     "coil_rl.envs.recordings.bearings",
     "coil_rl.envs.recordings.mcap_files",
     "coil_rl.envs.recordings.messages",
