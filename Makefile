@@ -41,10 +41,10 @@ docs: $(INSTALLED) ## build the documentation into build/docs, offline; a warnin
 	@echo "build/docs/index.html"
 
 test: $(INSTALLED) ## run the fast tests
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile $(ARGS)
 
 test-all: $(INSTALLED) ## run all tests, also the slow ones
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m '' $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile -m '' $(ARGS)
 
 # Stable-Baselines3 is needed for this comparison only; without it these tests are skipped.
 test-bench: $(INSTALLED) ## install Stable-Baselines3 and run the tests that compare with it

@@ -122,26 +122,9 @@ os.fsync = lambda descriptor: None  # no test cuts the power
 style.RESOLUTION //= 2  # most tests only look whether there is a picture
 
 
-# The files that take longest, one process each: begun last, one would keep the other waiting.
-LONGEST = [
-    "test_pins",
-    "test_mistakes",
-    "test_envs",
-    "test_odd_inputs",
-    "test_experiment",
-    "test_stopping",
-    "test_cases",
-    "test_learners",
-    "test_foreign_code",
-    "test_compiled",
-    "test_controller",
-    "test_replay",
-]
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark slow what is not among the fast cases of its table; begin with the longest files."""
+    """Mark slow what is not among the fast cases of its table."""
     tables = {}
     for item in items:
         if mark := item.get_closest_marker("fast"):
@@ -153,11 +136,6 @@ def pytest_collection_modifyitems(items):
         for case in cases:
             if case.callspec.id not in fast:
                 case.add_marker("slow")
-
-    def place(item):
-        return LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST)
-
-    items.sort(key=place)
 
 
 def pytest_collection_finish():

@@ -11,7 +11,6 @@ random actions to that best.
 
 import argparse
 import csv
-import json
 import math
 import subprocess
 import sys
@@ -74,7 +73,7 @@ def words(task: str, arm: str, folder: Path, frames: int) -> list[str]:
 def judged(rows: Sequence[Row], task: str, arm: str, folder: Path) -> dict[str, Any]:
     """Return the row of a comparison: what it said, and what that is worth."""
     values = ends(rows, task, arm)
-    said = json.loads((folder / FOUND).read_text())
+    said = FOUND.need(folder)
     use = said["train"] or GUIDE if said["use"] == NOTHING else said["use"]
     # The benchmark has no row for the opposite of a guide, nor for each method of coil-compare.
     value = values[use] if use in values else _measured(folder, use)
@@ -136,7 +135,7 @@ def run(place: Path, arguments: Sequence[str]) -> None:
     Raises:
         ChildProcessError: if it fails.
     """
-    if (place / FOUND).exists():
+    if (place / FOUND.name).exists():
         return
     place.parent.mkdir(parents=True, exist_ok=True)
     log = place.parent / "log.txt"

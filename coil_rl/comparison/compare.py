@@ -1,6 +1,5 @@
 """A comparison of a guide with what learns, with it and without it, in a few minutes."""
 
-import json
 import math
 import shlex
 import time
@@ -35,7 +34,7 @@ from coil_rl.comparison.entry import IDLE, Entry
 from coil_rl.comparison.jobs import job_name, run_jobs
 from coil_rl.comparison.outcome import Outcome, first_of, read_outcome
 from coil_rl.comparison.page import command_of, delayed_sentence, draw, page_of
-from coil_rl.comparison.same import identity_of, keep_plan, known_plan
+from coil_rl.comparison.same import PLAN, identity_of, keep_plan, known_plan
 from coil_rl.comparison.timing import Plan
 from coil_rl.comparison.verdict import NOTHING, Verdict, verdict
 from coil_rl.config.check import check
@@ -46,12 +45,13 @@ from coil_rl.config.unread import check_read
 from coil_rl.errors import UserError
 from coil_rl.files import FAILED_JOBS, write_text
 from coil_rl.output import decoration, quietly, say
+from coil_rl.record import json_file
 from coil_rl.report import write_csv
 from coil_rl.run.folder import locked
 from coil_rl.run.parts import TEST
 
-PLAN, TABLE, PAGE, PICTURE = "compare.json", "compare.csv", "compare.md", "compare.png"
-FOUND = "verdict.json"
+TABLE, PAGE, PICTURE = "compare.csv", "compare.md", "compare.png"
+FOUND = json_file("verdict.json", dict[str, Any], "compare again")
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class Comparison:
             try:
                 yield
             except BaseException:
-                if is_new and not (self.folder / PLAN).exists():
+                if is_new and not (self.folder / PLAN.name).exists():
                     lock.unlink(missing_ok=True)
                     for each in made:
                         with suppress(OSError):  # it is not empty
@@ -221,10 +221,9 @@ class Comparison:
 
     def _plan(self, config: DictConfig) -> Plan:
         """Return what is going to be done, and say it; a comparison that goes on has its plan."""
-        file = self.folder / PLAN
         identity = identity_of(self.given, config, self.minutes, self.seed)
-        if file.exists():
-            plan = known_plan(file, identity)
+        plan = known_plan(self.folder, identity)
+        if plan is not None:
             say(f"{self.folder} goes on. {plan.described(self.minutes)}", error=True)
             return plan
         if any(self.folder.rglob("config.yaml")):
@@ -237,7 +236,7 @@ class Comparison:
             env = env_maker(config).bare(1, TEST, None)
         arms = arms_for(env, pace.step, tunes=self.tunes)
         plan = timing.plan(config, pace, arms, self.minutes)
-        keep_plan(file, identity, plan)
+        keep_plan(self.folder, identity, plan)
         say(f"{pace.sentence}\n{plan.described(self.minutes)}", error=True)
         return plan
 
@@ -266,7 +265,7 @@ class Comparison:
         page = page_of(found, outcome, delayed, self._steps(outcome), command)
         write_csv(outcome.rows, self.folder / TABLE)
         write_text(self.folder / PAGE, f"{page}\n")
-        write_text(self.folder / FOUND, json.dumps(found.to_dict(command), indent=2))
+        FOUND.write(self.folder, found.to_dict(command))
         with decoration(f"the picture in {self.folder}"):
             cases = base.evaluation.curve.num_envs
             if outcome.runs:

@@ -3,7 +3,7 @@
 import copy
 import hashlib
 import json
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,28 @@ from coil_rl.config import source
 from coil_rl.config.folder import identity
 from coil_rl.config.given import kept
 from coil_rl.config.python import Named
-from coil_rl.errors import file_of_a_run
-from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
+from coil_rl.record import json_file
 from coil_rl.run.folder import check_same
 
-Identity = Mapping[str, Mapping[str, Any]]
+Identity = dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What the folder of a comparison holds of it.
+
+    Args:
+        identity: the arguments.
+        configuration: the values that they are composed to.
+        plan: what is done.
+    """
+
+    identity: dict[str, Any]
+    configuration: dict[str, Any]
+    plan: Plan
+
+
+PLAN = json_file("compare.json", Kept, "choose another folder")
 
 
 def identity_of(given: Named, config: DictConfig, minutes: float, seed: int) -> Identity:
@@ -51,27 +68,28 @@ def identity_of(given: Named, config: DictConfig, minutes: float, seed: int) -> 
                 OmegaConf.update(
                     described, key, source.identity_of(kept(node["name"])), merge=False
                 )
-    return {"identity": arguments, "configuration": identity(described)}
+    found = {"identity": arguments, "configuration": identity(described)}
+    return dict(json.loads(json.dumps(found, default=str)))
 
 
-def keep_plan(file: Path, identity: Identity, plan: Plan) -> None:
+def keep_plan(folder: Path, identity: Identity, plan: Plan) -> None:
     """Write the plan of a comparison."""
-    write_text(file, json.dumps({**identity, "plan": plan.to_dict()}, indent=2, default=str))
+    PLAN.write(folder, Kept(**identity, plan=plan))
 
 
-def known_plan(file: Path, identity: Identity) -> Plan:
-    """Return the plan in a file, which must be that of the same comparison.
+def known_plan(folder: Path, identity: Identity) -> Plan | None:
+    """Return the plan in a folder, which must be that of the same comparison; None without one.
 
     Raises:
         UserError: for another comparison, with what differs first, and for a damaged file.
     """
-    with file_of_a_run(file, "choose another folder"):
-        saved = json.loads(read_file(file, LARGEST_NUMBERS))
-        for part, values in json.loads(json.dumps(identity, default=str)).items():
-            check_same(
-                saved[part],
-                values,
-                f"{file.parent} holds a comparison",
-                "give the same arguments to go on, or choose another folder",
-            )
-        return Plan(**saved["plan"])
+    saved = PLAN.read(folder)
+    if saved is None:
+        return None
+    for values, ours in (
+        (saved.identity, identity["identity"]),
+        (saved.configuration, identity["configuration"]),
+    ):
+        remedy = "give the same arguments to go on, or choose another folder"
+        check_same(values, ours, f"{folder} holds a comparison", remedy)
+    return saved.plan

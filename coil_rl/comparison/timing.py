@@ -3,8 +3,7 @@
 import itertools
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from omegaconf import DictConfig
@@ -93,10 +92,6 @@ class Plan:
             "random actions and the first network, and takes about "
             f"{_duration(self.seconds)}{more}."
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return asdict(self)
 
 
 def _duration(seconds: float) -> str:

@@ -10,14 +10,16 @@ class of such an env says so by `reacts = False`, and has
 """
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hydra.utils
 from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.errors import UserError
 from coil_rl.output import say
-from coil_rl.run.parts import TRAIN, EnvMaker
+
+if TYPE_CHECKING:
+    from coil_rl.run.parts import EnvMaker
 
 
 def passive(config: DictConfig) -> Any:
@@ -29,13 +31,15 @@ def passive(config: DictConfig) -> Any:
     return None if getattr(kind, "reacts", True) else kind
 
 
-def check_passive(config: DictConfig, make_env: EnvMaker) -> None:
+def check_passive(config: DictConfig, make_env: "EnvMaker") -> None:
     """Check a training in an env that does not react, and print what there is to learn from.
 
     Raises:
         UserError: for a method that needs the effect of its actions, for a budget that does not
             reach all steps, and if nothing can be learned.
     """
+    from coil_rl.run.parts import TRAIN  # imports torch
+
     kind = passive(config)
     if kind is None:
         return

@@ -16,6 +16,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from pydantic import ConfigDict, Field, GetPydanticSchema
 from pydantic_core import core_schema
 
+from coil_rl.config.passive import whole_pass
+
 LARGEST = 2**63 - 1
 GRU = "coil_rl.learners.Gru"
 # Keys in which two runs with the same numbers may differ.
@@ -286,18 +288,6 @@ def agent_label(config: DictConfig) -> str:
     if learner in ("", "ppo", name):  # the method's own may have its name
         return name
     return learner if name == "ppo" else f"{name}_{learner}"
-
-
-def whole_pass(what: str, otherwise: int, *, _root_: DictConfig) -> int:
-    """Return what `coil_rl.config.passive.whole_pass` does, which imports torch.
-
-    Args:
-        what: "num_envs", "steps" or "frames".
-        otherwise: the value in an env that reacts.
-    """
-    from coil_rl.config import passive
-
-    return passive.whole_pass(what, otherwise, _root_=_root_)
 
 
 def minibatches(count: int, *, _root_: DictConfig) -> int:

@@ -13,6 +13,7 @@ from omegaconf import DictConfig, ListConfig
 from coil_rl.config.folder import PREFIX
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.programs import app
+from coil_rl.programs.sweeps import is_sweep
 
 if TYPE_CHECKING:
     from coil_rl.report.comparison import Comparison
@@ -137,14 +138,11 @@ def _folders(config: DictConfig) -> list[Path]:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration."""
-    from hydra.core.hydra_config import HydraConfig
-    from hydra.types import RunMode
-
     from coil_rl.config.values import check_values
 
     check_values(config)
     app.check_folder("folder")
-    if HydraConfig.get().mode == RunMode.MULTIRUN:
+    if is_sweep():
         raise app.NoSweepError(
             "a report covers several folders at once; leave out -m and write folder=[ONE,OTHER]"
         )

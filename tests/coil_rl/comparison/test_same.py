@@ -33,15 +33,15 @@ def identity(folder, *words, guide="swing_up", env="pendulum"):
 
 
 def test_same_object_goes_on_in_a_folder_that_was_moved(tmp_path):
-    keep_plan(tmp_path / "plan.json", identity(tmp_path / "one", guide=Local(1.0)), PLAN)
-    assert known_plan(tmp_path / "plan.json", identity(tmp_path / "two", guide=Local(1.0))) == PLAN
+    keep_plan(tmp_path, identity(tmp_path / "one", guide=Local(1.0)), PLAN)
+    assert known_plan(tmp_path, identity(tmp_path / "two", guide=Local(1.0))) == PLAN
 
 
 def test_other_object_is_refused(tmp_path):
-    keep_plan(tmp_path / "plan.json", identity(tmp_path, guide=Local(1.0)), PLAN)
+    keep_plan(tmp_path, identity(tmp_path, guide=Local(1.0)), PLAN)
     other = identity(tmp_path, guide=Local(-1.0))
     with pytest.raises(UserError, match=r"a comparison with guide\.controller\.of=.*Local \(state"):
-        known_plan(tmp_path / "plan.json", other)
+        known_plan(tmp_path, other)
 
 
 @pytest.mark.slow
@@ -50,18 +50,18 @@ def test_changed_file_of_the_user_is_refused_by_the_value_that_differs(tmp_path)
     file.parent.mkdir(parents=True)
     words = [f"hydra.searchpath=['file://{tmp_path / 'conf'}']", "+experiment=mine"]
     file.write_text("# @package _global_\nlearner: {gamma: 0.9}\nenv: {workers: 1}\n")
-    keep_plan(tmp_path / "plan.json", identity(tmp_path, *words), PLAN)
+    keep_plan(tmp_path, identity(tmp_path, *words), PLAN)
     file.write_text("# @package _global_\nlearner: {gamma: 0.9}\nenv: {workers: 2}\n")
-    assert known_plan(tmp_path / "plan.json", identity(tmp_path, *words)) == PLAN
+    assert known_plan(tmp_path, identity(tmp_path, *words)) == PLAN
     file.write_text("# @package _global_\nlearner: {gamma: 0.8}\nenv: {workers: 2}\n")
     with pytest.raises(UserError, match=r"learner\.gamma=0\.9, not 0\.8; give the same arguments"):
-        known_plan(tmp_path / "plan.json", identity(tmp_path, *words))
+        known_plan(tmp_path, identity(tmp_path, *words))
 
 
 def test_changed_code_of_a_controller_that_is_named_is_refused(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     text = "class Rule:\n    def act(self, observation):\n        return {} * observation[:1]\n"
-    plan = tmp_path / "plan.json"
+    plan = tmp_path
 
     def written(gain):
         sys.modules.pop("rule_of_mine", None)
@@ -79,9 +79,10 @@ def test_changed_code_of_a_controller_that_is_named_is_refused(tmp_path, monkeyp
 
 def test_plan_without_a_configuration_is_said_to_be_damaged(tmp_path):
     known = identity(tmp_path)
-    keep_plan(tmp_path / "plan.json", known, PLAN)
-    saved = json.loads((tmp_path / "plan.json").read_text())
+    keep_plan(tmp_path, known, PLAN)
+    file = tmp_path / "compare.json"
+    saved = json.loads(file.read_text())
     del saved["configuration"]
-    (tmp_path / "plan.json").write_text(json.dumps(saved))
-    with pytest.raises(UserError, match="it lacks configuration"):
-        known_plan(tmp_path / "plan.json", known)
+    file.write_text(json.dumps(saved))
+    with pytest.raises(UserError, match="configuration: Field required"):
+        known_plan(tmp_path, known)

@@ -1,13 +1,7 @@
-"""The shipped envs of Gymnasium: each is evaluated with its public controller.
-
-Some of them also train, are killed and resume.
-"""
+"""The shipped envs of Gymnasium: each is evaluated with its public controller."""
 
 import csv
-import signal
-import time
 
-import kill_and_resume
 import pytest
 from programs import called
 
@@ -62,22 +56,3 @@ def test_lunar_lander_trains_with_discrete_actions_and_without_a_guide(options, 
     short = [*SMALL, "budget.frames=128", "env.max_steps=60", *options]
     called("train", "env=lunar_lander", *short, "hydra.run.dir=run", cwd=tmp_path)
     assert (tmp_path / "run" / "evaluation.csv").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("env", ["lunar_lander", "cart_pole"])
-def test_killed_run_ends_like_an_uninterrupted_one(env, tmp_path, monkeypatch):
-    pytest.importorskip(PACKAGES[env])
-    monkeypatch.setattr(kill_and_resume, "SMALL", [])
-    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
-    called("train", f"env={env}", *SMALL, f"hydra.run.dir={whole}", cwd=tmp_path)
-    process, began = kill_and_resume.start(resumed, [f"env={env}", *SMALL]), time.monotonic()
-    while not (resumed / "checkpoint.pt").exists() or kill_and_resume.marks(resumed) < 4:
-        assert process.poll() is None
-        assert time.monotonic() < began + kill_and_resume.TIMEOUT
-        time.sleep(0.002)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
-    called("train", f"resume={resumed}", cwd=tmp_path)
-    for name in kill_and_resume.LOGS:
-        assert (resumed / name).read_bytes() == (whole / name).read_bytes(), name
