@@ -32,6 +32,7 @@ from benchmarks.driving import (
 from benchmarks.gymnasium_speed import measure_gymnasium
 from benchmarks.one_car import measure_one_car
 from benchmarks.process import measure_processes
+from benchmarks.replay_speed import measure_replay
 from benchmarks.slow_plant import measure_workers
 from benchmarks.timing import Row
 from benchmarks.training import (
@@ -63,6 +64,7 @@ PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {
         "PPO on Gymnasium envs beside Stable-Baselines3, equal settings, CPU time",
         measure_gymnasium,
     ),
+    "replay": ("Updates of learners with replay, CPU time, beside others", measure_replay),
     "workers": ("A Gymnasium env of 2 ms a step, in one process and one a core", measure_workers),
     "operators": ("Operators of 20 batched steps with advice", profile_operators),
     "command": ("coil-train with its defaults, from the command to its pictures", measure_command),
@@ -85,6 +87,14 @@ GOALS = [
     ("one_car", "{cars} cars with the guide / one car in NumPy", "ratio", ">=", 500),
     ("sb3", "PPO / Stable-Baselines3 with {envs} envs", "ratio", ">=", 10),
     ("gymnasium", "PPO / Stable-Baselines3, {env}, {envs} envs", "ratio", ">=", 1.05),
+    ("replay", "{learner} / Stable-Baselines3, batch {batch}, {hidden}", "ours / sb3", ">=", 1.2),
+    (
+        "replay",
+        "{learner} compiled / Stable-Baselines3, batch {batch}, {hidden}",
+        "ours, compiled / sb3",
+        ">=",
+        4,
+    ),
     ("workers", "{subject}, {processes} processes / one, a core", "ratio / cores", ">=", 0.9),
     ("robot", "{subject} (scans/s)", "scans/s", ">=", 1000),
     ("processes", "state per car (B), {cars} cars", "state per car (B)", "<", 2000),
@@ -104,6 +114,8 @@ FULL = {
     "sb3_frames": 512,
     "gymnasium_envs": [4, 8, 16],
     "gymnasium_steps": 256,
+    "replay_sizes": 3,
+    "replay_updates": 256,
     "seconds": 2.0,
     "repeats": 5,
     "compile_updates": True,
@@ -117,6 +129,8 @@ QUICK = {
     "sb3_frames": 64,
     "gymnasium_envs": [4],
     "gymnasium_steps": 32,
+    "replay_sizes": 1,
+    "replay_updates": 4,
     "seconds": 0.1,
     "repeats": 2,
     "compile_updates": False,

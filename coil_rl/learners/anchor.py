@@ -63,6 +63,7 @@ class Anchor:
             at first. In DQN the share of the range of the values that the advised action gains.
         share: of the frames of the run that the start test may take, and 1.6 times this share while
             something is ahead in every case, or for lower gains. Its first cases may take more.
+            None: 0.05, or 0.15 of a learner with replay, which learns from these steps too.
         advice_key: entry with the advice, [*batch, n_guides, A].
 
     Raises:
@@ -72,7 +73,7 @@ class Anchor:
     reach: Positive = 1.0
     gains: Sequence[Annotated[float, Interval(gt=0, le=1)]] = (0.75, 0.5)
     choice_weight: Positive = 0.5
-    share: Share = 0.05
+    share: Share | None = None
     advice_key: NestedKey = "guide_action"
 
 
@@ -266,14 +267,20 @@ def hold_of(policy: nn.Module) -> Hold | None:
     return None
 
 
-def start_tests(anchor: Anchor | None, policy: nn.Module, cases: Cases) -> list[Callback]:
+def start_tests(
+    anchor: Anchor | None, policy: nn.Module, cases: Cases, share: float = 0.05
+) -> list[Callback]:
     """Return the start test of an anchored policy; nothing for another policy.
 
     Args:
         anchor: the settings; None: the policy is not anchored.
+        share: of the frames that the test may take, unless the settings have another one.
     """
     hold = hold_of(policy)
-    return [] if anchor is None or hold is None else [StartTest(anchor, policy, hold, cases)]
+    if anchor is None or hold is None:
+        return []
+    share = share if anchor.share is None else anchor.share
+    return [StartTest(anchor, share, policy, hold, cases)]
 
 
 class StartTest:
@@ -294,6 +301,7 @@ class StartTest:
 
     Args:
         anchor: the settings.
+        share: of the frames that the test may take, see `Anchor.share`.
         policy: of the learner.
         hold: its weights.
         cases: in which policies are tested.
@@ -307,8 +315,11 @@ class StartTest:
         "start/weight",
     )
 
-    def __init__(self, anchor: Anchor, policy: nn.Module, hold: Hold, cases: Cases) -> None:
-        self.anchor, self.policy, self.hold, self.cases = anchor, policy, hold, cases
+    def __init__(
+        self, anchor: Anchor, share: float, policy: nn.Module, hold: Hold, cases: Cases
+    ) -> None:
+        self.anchor, self.share = anchor, share
+        self.policy, self.hold, self.cases = policy, hold, cases
         self.returns: dict[tuple[float, ...], Tensor] = {}  # by the weights
         self.steps: dict[tuple[float, ...], int] = {}  # of the episodes with these weights
 
@@ -386,7 +397,7 @@ class StartTest:
         Args:
             shares: of the frames that the test may take, see `Anchor.share`.
         """
-        return self.cases.steps + steps <= shares * self.anchor.share * self.cases.frames
+        return self.cases.steps + steps <= shares * self.share * self.cases.frames
 
     def _act(self, each: Sequence[tuple[float, ...]]) -> None:
         """Add the returns of the policy with each of some weights in the present cases."""

@@ -1,7 +1,7 @@
 """What every learner has: the base class `Learner`, and what a run calls between its updates."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
@@ -110,6 +110,15 @@ class Cases(Protocol):
     frames: int
     steps: int
     taken: list[int]
+
+    def teach(self, keys: Sequence[NestedKey], learn: Callable[[TensorDictBase], Any]) -> None:
+        """Let something learn from the steps of compared policies.
+
+        Args:
+            keys: entries that it needs.
+            learn: is called with the steps of each comparison, [rows, T]: the first episode of each
+                row, and what followed it.
+        """
 
     def begin(self) -> None:
         """Begin a comparison, which does not depend on those before."""

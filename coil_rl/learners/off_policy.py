@@ -29,6 +29,7 @@ from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
 from coil_rl.transforms.guide_transform import GuideTransform
 
 UpdatesPerStep = Annotated[float, Interval(ge=0, le=1_000)]
+TEST_SHARE = 0.15  # of the frames, for the start test of an anchored policy
 AT_ONCE = 100  # minibatches that are sampled by one call, which takes as long as a step
 
 
@@ -125,7 +126,7 @@ class OffPolicy(Stateful, Learner):
         *,
         normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         scale_rewards: bool = False,
-        tau: Share = 0.005,
+        tau: Share = 0.02,
         updates_per_step: UpdatesPerStep,
         n_step: Annotated[int, Interval(ge=1, le=1_000)] = 1,
         learning_rate: NonNegative | Schedule = 1e-3,
@@ -337,8 +338,21 @@ class OffPolicy(Stateful, Learner):
         return self.extensions.weights(dict.fromkeys(self.minimised, 1.0), progress)
 
     def callbacks(self, cases: Cases) -> Sequence[Callback]:
-        """Return the start test of an anchored policy."""
-        return start_tests(self.anchor, self.policy, cases)
+        """Return the start test of an anchored policy, from whose steps is learned too."""
+        tests = start_tests(self.anchor, self.policy, cases, share=TEST_SHARE)
+        if tests and not self.guide_may_act:
+            cases.teach(self.stored_keys, self.store_episodes)
+        return tests
+
+    def store_episodes(self, episodes: TensorDictBase) -> None:
+        """Store the steps of the first episode of each row, [rows, T]."""
+        done = episodes["next", "done"].reshape(episodes.shape)
+        within = done.cumsum(-1) - done.int() == 0
+        for row, live in zip(episodes, within, strict=True):
+            steps = row[live].unsqueeze(0)
+            if self.reward_scale is not None:
+                self.reward_scale.learn_episode(steps)
+            self._store(NStep(self.sums.count, self.sums.gamma).summed(steps), self.buffer)
 
     def describe(self, minibatch: Entries | None) -> dict[str, float]:
         """Return further metrics of the last minibatch, which is None if there is none."""

@@ -55,6 +55,12 @@ class RewardScale(Extension):
         self.running = running
         self.moments.add(returns)
 
+    def learn_episode(self, episode: TensorDictBase) -> None:
+        """Add the rewards of an episode [1, T] of another row to the statistics."""
+        running, self.running = self.running, None
+        self.learn(episode)
+        self.running = running
+
     def scaled(self, rewards: Tensor) -> Tensor:
         """Return rewards of any shape, divided by the scale."""
         return rewards / self.scale

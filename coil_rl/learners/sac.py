@@ -108,7 +108,7 @@ class SAC(OffPolicy):
         target_entropy: float | None = None,
         critics: Annotated[int, Interval(ge=2, le=1_000)] = 2,
         target_critics: int | None = None,
-        critic_layer_norm: bool = True,
+        critic_layer_norm: bool = False,
         dropout: Share = 0.0,
         uncertainty: bool = False,
         auxiliary: Sequence[Extension] = (),

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from tensordict import unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
@@ -45,6 +45,7 @@ class TrainingCases:
         episodes: number of all episodes so far.
         longest: number of steps of the longest episode so far, of this process.
         calls: number of actions that guides were asked for.
+        taught: what learns from the steps of compared policies, and the entries that it needs.
     """
 
     build: Callable[[int], EnvBase]
@@ -54,6 +55,9 @@ class TrainingCases:
     steps: int = field(default=0, init=False)
     episodes: int = field(default=0, init=False)
     calls: int = field(default=0, init=False)
+    taught: tuple[Sequence[NestedKey], Callable[[TensorDictBase], Any]] | None = field(
+        default=None, init=False
+    )
 
     def __post_init__(self) -> None:
         self.generator = torch.Generator().manual_seed(self.seed)
@@ -61,6 +65,10 @@ class TrainingCases:
         self.env_seed, self.count, self.copies = 0, 0, 1
         self.taken: list[int] = []
         self.longest = 0
+
+    def teach(self, keys: Sequence[NestedKey], learn: Callable[[TensorDictBase], Any]) -> None:
+        """Let something learn from the steps of compared policies."""
+        self.taught = keys, learn
 
     def begin(self) -> None:
         """Begin a comparison: forget the env of the one before, of which nothing may be left."""
@@ -120,13 +128,14 @@ class TrainingCases:
                 Acting(self._exploring(env, traced(policy), samples, len(policies)), samples)
                 for policy, samples in zip(policies, sampled, strict=True)
             ]
-            totals = self._acted(env, OnRows(beside), sampled=False)
+            totals = self._acted(env, OnRows(beside), sampled=False, teaches=True)
             self.taken = [int(part.sum()) for part in totals.steps.split(self.count)]
             return list(totals.results()["return"].split(self.count))
         env = self._copy(1)
         self.taken, returns = [], []
         for policy, samples in zip(policies, sampled, strict=True):
-            totals = self._acted(env, self._exploring(env, policy, samples), sampled=samples)
+            exploring = self._exploring(env, policy, samples)
+            totals = self._acted(env, exploring, sampled=samples, teaches=True)
             self.taken.append(int(totals.steps.sum()))
             returns.append(totals.results()["return"])
         return returns
@@ -157,8 +166,21 @@ class TrainingCases:
         env = self._copy(self.copies)
         return self._acted(env, policy, sampled=False).results()["return"]
 
-    def _acted(self, env: EnvBase, policy: TensorDictModuleBase, *, sampled: bool) -> Totals:
+    def _acted(
+        self,
+        env: EnvBase,
+        policy: TensorDictModuleBase,
+        *,
+        sampled: bool,
+        teaches: bool = False,
+    ) -> Totals:
         """Return the totals of a policy in the rows of the present cases, and count its steps."""
+        keys, learn = self.taught if self.taught is not None and teaches else ((), None)
+        steps: list[TensorDictBase] = []
+
+        def seen(before: TensorDictBase, after: TensorDictBase) -> None:
+            steps.append(before.exclude("next").set("next", after).select(*keys).clone())
+
         measured = {"return": Measure(unravel_key(env.reward_key), "sum")}
         before = guide_calls(env)
         with (
@@ -171,7 +193,11 @@ class TrainingCases:
                     part.generator.manual_seed(self.env_seed + number)
             torch.manual_seed(self.env_seed)
             options = {"sampled": sampled, "cases": self.count, "tick": bar.update}
+            if learn is not None:
+                options["seen"] = seen
             totals = totals_of(env, policy, measured, **options)
+        if learn is not None:
+            learn(torch.stack(steps, -1))
         self.steps += int(totals.steps.sum())
         self.episodes += totals.steps.numel()
         self.longest = max(self.longest, int(totals.steps.max()))

@@ -234,6 +234,7 @@ def episodes(
     sampled: bool = False,
     cases: int | None = None,
     tick: Callable[[], Any] | None = None,
+    seen: Callable[[TensorDictBase, TensorDictBase], Any] | None = None,
 ) -> Iterator[tuple[TensorDictBase, Tensor]]:
     """Yield the entries after each step of one episode on every row.
 
@@ -246,6 +247,7 @@ def episodes(
         cases: number of different cases; row i has the random numbers of row `i % cases`. None: as
             many as rows.
         tick: as above.
+        seen: is called with the entries before and after each step.
     """
     with _drawn_by_case(env, cases):
         carrier = env.eval().reset()
@@ -260,6 +262,8 @@ def episodes(
             else:
                 after = lean.step(acted["action"], acted)
                 carrier = acted.exclude(*after.keys()).update(after)
+            if seen is not None:
+                seen(acted, after)
             yield after, running
             running = running & ~after["done"]
             # The test waits for the device.

@@ -9,7 +9,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Anchor, Gru, Reinforce
-from coil_rl.learners.anchor import BARS, PROMISING, Hold, StartTest, hold_of
+from coil_rl.learners.anchor import BARS, PROMISING, Hold, hold_of, start_tests
 from coil_rl.learners.policy import UNCLIPPED
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions, Takeover
@@ -257,7 +257,8 @@ def decided(of, guides=1, action=None, cases=None, **options):
     space = ActionSpace((action or Bounded(-1, 1, (8, 2))), 1)
     hold = Hold(guides, space)
     cases = cases or Returns(of)
-    numbers = StartTest(Anchor(**options), hold, hold, cases).after_update(0)
+    (test,) = start_tests(Anchor(**options), hold, cases)
+    numbers = test.after_update(0)
     return hold.weight.tolist(), numbers, cases
 
 

@@ -265,3 +265,19 @@ def test_test_at_the_end_grows_with_what_its_episodes_take():
     assert further_cases(4, taken=2000, frames=1000) < 0
     assert further_cases(16, taken=16, frames=1000) == 16
     assert further_cases(32, taken=32, frames=1000) == 0
+
+
+def test_learner_with_replay_learns_from_the_steps_of_the_start_test():
+    cases, learner = built(*SHORT, "learner=sac", "learner.starts=50", "learner.n_step=2")
+    (test,) = learner.callbacks(cases)
+    cases.renew(3)
+    test.after_update(0)
+    stored = learner.buffer[:]
+    # All steps of all compared policies, of which the last one of each episode is alone.
+    assert cases.steps > 3 * 48
+    assert len(stored) == cases.steps
+    assert (stored["next", "steps"] == 1).sum() == cases.episodes
+    assert learner.pending_updates > 0
+    assert stored["next", "done"].sum() == 2 * cases.episodes
+    shown = stored["action"].abs().amax()
+    assert 0 < shown <= 1
