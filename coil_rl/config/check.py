@@ -137,21 +137,16 @@ def _check_delivery(config: DictConfig, *, has_agent: bool) -> None:
     So it is for values that need a policy, where none is trained.
     """
     trains_policy = has_agent and not config.method.run
-    if config.evaluation.beside and not trains_policy:
-        raise UserError(
-            f"beside={','.join(config.evaluation.beside)} has no effect: "
-            f"method={config.method.name} trains no policy; leave it out"
-        )
-    if config.init and not trains_policy:
-        raise UserError(
-            f"init={config.init} has no effect: method={config.method.name} trains no policy; "
-            "leave it out"
-        )
-    if config.delivery == "tested" and not has_agent:
-        raise UserError(
-            f"delivery=tested has no effect: method={config.method.name} trains no policy; leave "
-            "it out"
-        )
+    beside = config.evaluation.beside
+    for word, without_policy in (
+        (f"beside={','.join(beside)}", beside and not trains_policy),
+        (f"init={config.init}", config.init and not trains_policy),
+        ("delivery=tested", config.delivery == "tested" and not has_agent),
+    ):
+        if without_policy:
+            raise UserError(
+                f"{word} has no effect: method={config.method.name} trains no policy; leave it out"
+            )
     if has_agent and config.evaluation.policy != HANDED_OVER:
         raise UserError(
             f"evaluation.policy={config.evaluation.policy}: a training evaluates what it hands "

@@ -1,6 +1,5 @@
 """The figures of `coil-report`: as PNG files, and for its HTML page."""
 
-import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -54,14 +53,10 @@ def draw_report(
     return [*figures, *films(runs)]
 
 
-def _draw(draw: Any, path: Path, title: str, caption: str) -> Figure:
+def _draw(draw: Draw, path: Path, title: str, caption: str) -> Figure:
     """Draw a figure into its file and for the page."""
     draw(path)
-
-    def into(buffer: io.BytesIO) -> None:
-        draw(buffer)
-
-    return Figure(title, svg(into), caption)
+    return Figure(title, svg(draw), caption)
 
 
 def _draw_scores(
@@ -80,7 +75,7 @@ def _draw_scores(
     return _draw(draw, path, "Evaluation", f"{measure}, in the cases of the evaluation.")
 
 
-def _learning_curves(runs: Sequence[Run], strokes: Mapping[str, style.Stroke]) -> Any:
+def _learning_curves(runs: Sequence[Run], strokes: Mapping[str, style.Stroke]) -> Draw:
     """Return the function that draws the learning curves in the order of the table."""
     curves: dict[str, list[Any]] = {}
     guides: dict[str, float] = {}
