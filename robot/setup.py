@@ -118,6 +118,6 @@ def setup_of(plant: object) -> Setup:
         car = Car(plant.speed, plant.car_length, math.degrees(plant.max_steering))
         own, memory = plant.perception, plant.memory
         seen = own if isinstance(own, Perception) else shipped_perception()
-        known = plant.rate if isinstance(plant, SimulatedRobotEnv) else None
+        known = None if math.isnan(plant.rate) else plant.rate
         return Setup(car, seen, memory.spline, memory.smoothing, known)
     return Setup()

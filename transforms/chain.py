@@ -16,6 +16,7 @@ from torchrl.envs import Compose, InitTracker, RewardSum, TensorDictPrimer, Tran
 from torchrl.envs import TransformedEnv as Env
 
 from coil_rl.transforms.disturbance import Disturbance
+from coil_rl.transforms.guide_actions import GuideActions
 from coil_rl.transforms.link import Link, State, write
 
 Past: TypeAlias = list[State]  # of the links, in their order
@@ -90,13 +91,30 @@ class Chain(nn.Module):
 def links_of(transform: Transform, *, tensors: bool = False) -> Iterator[Link]:
     """Yield the transforms that have an effect on what a policy sees or does.
 
+    Guides that demonstrate, and what reads their advice, have none: they were there to be imitated.
+
     Args:
         tensors: whether states must be tensors, so that a transform of somebody else cannot have
             one.
     """
+    unwritten = set[NestedKey]()
+    for link in _links_in(transform, tensors):
+        if _demonstrates(link):
+            unwritten.update(link.out_keys)
+        elif not unwritten.intersection(link.in_keys):
+            yield link
+
+
+def _demonstrates(link: Link) -> bool:
+    guides = link.guides.guides.values() if isinstance(link, GuideActions) else ()
+    return bool(guides) and all(getattr(guide, "demonstrates", False) for guide in guides)
+
+
+def _links_in(transform: Transform, tensors: bool) -> Iterator[Link]:
+    """Yield the transforms that are no disturbances."""
     if isinstance(transform, Compose):
         for each in transform.transforms:
-            yield from links_of(each, tensors=tensors)
+            yield from _links_in(each, tensors)
     elif isinstance(transform, Link):
         if not isinstance(transform, Disturbance):
             yield transform

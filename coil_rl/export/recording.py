@@ -20,7 +20,6 @@ from coil_rl.export.step import ADVICE
 from coil_rl.run.controller import Controller
 from coil_rl.run.parts import TRAIN, transformed
 from coil_rl.run.run import Run
-from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import ActionSpace, random_action
 
 LONGEST = 250  # steps of an episode
@@ -116,8 +115,7 @@ class Heard:
     """
 
     def __init__(self, controller: Controller) -> None:
-        parts = controller.env.transform.modules()
-        self.guides = next((part for part in parts if isinstance(part, GuideActions)), None)
+        self.guides = controller.guides
         self.actions: dict[str, Tensor] = {}
         self.hooks: list[Any] = []
         if self.guides is None:

@@ -28,7 +28,6 @@ from coil_rl.ranges import Interval, checked
 from coil_rl.run.controller import Controller
 from coil_rl.run.folder import HANDED_OVER
 from coil_rl.run.run import Run
-from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 
@@ -145,7 +144,7 @@ def _written(
 
 def _cause(controller: Controller) -> str | None:
     """Return why the guides of a controller can only be outside; None if they may be inside."""
-    guides = _guides(controller)
+    guides = controller.guides
     if guides is None:
         return None
     for name, guide in guides.guides.guides.items():
@@ -161,16 +160,9 @@ def _cause(controller: Controller) -> str | None:
     return None
 
 
-def _guides(controller: Controller) -> GuideActions | None:
-    for part in controller.env.transform.modules():
-        if isinstance(part, GuideActions):
-            return part
-    return None
-
-
 def _check_possible(run: Run, controller: Controller, reason: str) -> None:
     """Raise a `UserError` if nothing is left without the guide."""
-    if _guides(controller) is None or run.make_learner is None:
+    if controller.guides is None or run.make_learner is None:
         raise UserError(_impossible(run, reason))
 
 

@@ -58,8 +58,10 @@ class Controller:
         self.env, self.policy = env.eval(), policy
         self.plant, self.folder, self.which = env.base_env, folder, which
         self.chain = Chain(self.env, policy)
-        guides = [part for part in self.chain.links if isinstance(part, GuideActions)]
-        self.read = {unravel_key(key) for part in (policy, *guides) for key in part.in_keys}
+        # Those that demonstrated are left out.
+        parts = [part for part in self.chain.links if isinstance(part, GuideActions)]
+        self.guides = parts[0] if parts else None
+        self.read = {unravel_key(key) for part in (policy, *parts) for key in part.in_keys}
         self._check_read()
         self.reset()
 

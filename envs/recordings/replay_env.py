@@ -100,6 +100,12 @@ class McapReplayEnv(EnvBase):
         topic = str(arguments.get("scan", "/scan"))
         return max(1, len(paths)), max([_scans(str(path), topic) for path in paths], default=1)
 
+    @property
+    def rate(self) -> float:
+        """Scans per second: the median of all recordings; NaN where there are single scans only."""
+        turns = [each.turn for each in self.recordings if each.turn]
+        return 1 / float(np.median(turns)) if turns else math.nan
+
     def demonstrations(self) -> Iterator[str]:
         """Yield lines on what there is to learn; a `ValueError` if there is nothing."""
         return about_demonstrations(self)

@@ -8,15 +8,19 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from programs import called
+from torchrl.envs import TransformedEnv
 
 import coil_rl
+from coil_rl.config.learned_guide import LearnedGuide
 from coil_rl.config.parts import env_maker
 from coil_rl.envs import McapReplayEnv, Perception, SimulatedRobotEnv, record_drives
 from coil_rl.envs import simulated_cone_classifier as classifier
 from coil_rl.envs.splines import least_squares_parabola
+from coil_rl.export import export_policy
 from coil_rl.guides import SplineGuide
 from coil_rl.run import checkpoint
 from coil_rl.run.parts import TEST
+from coil_rl.transforms import GuideActions
 
 SCANS = 33
 # A second of one robot is enough to see that it drives.
@@ -118,6 +122,37 @@ def test_run_is_evaluated_and_replayed_like_any_other(folder):
     assert table(folder / "evaluated" / "evaluation.csv")[0]["driver"] == "oil"
     arguments = ["recording=a.mcap", "runs=[again]", "hydra.run.dir=replayed"]
     assert "| oil " in called("replay", *arguments, cwd=folder).stdout
+
+
+@pytest.mark.slow
+def test_forest_that_imitates_is_a_controller_and_no_export(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    words = [*SHORT[2:], "learner=forest", "recording=[a.mcap,b.mcap]"]
+    run = coil_rl.train("mcap_replay", method="oil", overrides=words, folder="of_forest")
+    assert abs(run.controller().act({"observation": torch.zeros(20).numpy()})[0]) <= 1
+    with pytest.raises(coil_rl.UserError, match="it is a forest, not a network"):
+        export_policy(run, "forest_file", observations=9)
+
+
+@pytest.mark.parametrize("learner", ["linear", pytest.param("network", marks=pytest.mark.slow)])
+def test_imitated_policy_is_a_controller_a_guide_an_export_and_drives(learner, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    words = [*SHORT[2:], f"learner={learner}", "recording=[a.mcap,b.mcap]"]
+    run = coil_rl.train("mcap_replay", method="oil", overrides=words, folder=f"of_{learner}")
+    seen = {"observation": torch.linspace(-1, 1, 20).numpy()}
+    action = float(run.controller().act(seen)[0])
+    assert float(export_policy(run, f"{learner}_file", observations=9).act(seen)[0]) == (
+        pytest.approx(action, abs=1e-5)
+    )
+    env = TransformedEnv(
+        SimulatedRobotEnv(num_envs=2), GuideActions({"imitation": LearnedGuide(str(run.folder))})
+    )
+    data = env.reset()
+    first = run.controller().act({"observation": data["observation"][0].numpy()})
+    assert float(data["guide_action"][0, 0, 0]) == pytest.approx(float(first[0]), abs=1e-6)
+    if learner == "linear":
+        done = called("drive", f"run={run.folder}", "simulation.seconds=2", cwd=folder)
+        assert "driving" in done.stdout
 
 
 @pytest.mark.slow

@@ -73,13 +73,15 @@ def test_a_car_of_the_cone_world_is_the_papers_robot_in_its_scale():
     assert longer.rate == pytest.approx(9.0)
 
 
-def test_setup_of_a_replay_is_that_of_its_robot_without_a_rate(tmp_path):
+def test_setup_of_a_replay_is_that_of_its_robot_at_the_rate_of_its_scans(tmp_path):
     perception = Perception(simulated_cone_classifier(), laser_yaw=180.0)
     options = {"speed": 0.3, "car_length": 0.6, "max_steering": 40.0, "smoothing": 0.3}
-    setup = setup_of(McapReplayEnv(drive(tmp_path / "a.mcap", 3), perception, **options))
+    env = McapReplayEnv(drive(tmp_path / "a.mcap", 3), perception, **options)
+    setup = setup_of(env)
     car = setup.car
     assert (car.speed, car.car_length, car.max_steering) == (0.3, 0.6, pytest.approx(40))
-    assert (setup.perception, setup.smoothing, setup.rate) == (perception, 0.3, None)
+    assert (setup.perception, setup.smoothing) == (perception, 0.3)
+    assert setup.rate == pytest.approx(1 / env.recordings[0].turn)
 
 
 def test_differences_are_named_and_rounding_is_none():
