@@ -104,7 +104,7 @@ class SAC(OffPolicy):
         network: Mlp | None = None,
         action_scale: Positive = 1.0,
         action_gain: NonNegative = 0.01,
-        temperature: Positive = 0.01,
+        temperature: Positive = 0.1,
         target_entropy: float | None = None,
         critics: Annotated[int, Interval(ge=2, le=1_000)] = 2,
         target_critics: int | None = None,
