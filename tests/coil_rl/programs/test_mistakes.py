@@ -324,7 +324,7 @@ def run(tmp_path_factory):
     [
         ({}, None),
         ({"evaluation.policy": "best"}, None),  # replaced by the requested evaluation
-        (b"a: [1,\n  b: }", "config.yaml is not the configuration of a run (while parsing"),
+        (b"a: [1,\n  b: }", "line 2: it is no YAML: "),
         (b"- 1\n", "config.yaml is not the configuration of a run, but a list"),
         (b"", "is not the configuration of a run ("),
         ({"seed": "abc"}, "Value 'abc' of type 'str' could not be converted to Integer"),
