@@ -20,6 +20,7 @@ from omegaconf.errors import (
     InterpolationKeyError,
     OmegaConfBaseException,
 )
+from yaml.error import MarkedYAMLError
 
 from coil_rl import conf
 from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean, is_outside
@@ -95,6 +96,10 @@ def _message(error: BaseException) -> str:
     """Return the message of an error, which may have several lines."""
     if isinstance(error, UserError):
         return str(error)
+    if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
+        mark = error.problem_mark
+        place = "" if mark.name.startswith("<") else f"{mark.name}, "  # of a text that was read
+        return f"{place}line {mark.line + 1}: it is no YAML: {error.problem}; correct it there"
     if isinstance(error, MissingConfigException):  # an OSError, too
         return _unknown_file(error)
     if isinstance(error, OSError):

@@ -24,6 +24,7 @@ REFERRED = (
     "training.imitation_env",
     "budget.minibatches",
 )
+NEEDS_GUIDE = "method.needs_guide"  # a fact about the method, not a choice
 OF_A_LEARNER = (
     *("learner", "network", "checkpoint_every", "evaluation.repeats"),
     *("budget.num_envs", "budget.steps", "training.normalise", "training.scale_rewards"),
@@ -50,6 +51,11 @@ def unread(config: DictConfig, task: Iterable[str]) -> Iterator[str]:
     references = set(_references(config, closed))
     for text in task:
         key = key_of(text)
+        if key == NEEDS_GUIDE:
+            yield (
+                f"{text} has no effect: the file of method={config.method.name} says whether its "
+                "policy needs a guide; leave it out"
+            )
         noise = key == "training.noise_correlation" and not _adds_noise(config)
         if (noise or is_part(key, (*closed, *REFERRED))) and not any(
             covers(key, other) for other in references

@@ -427,7 +427,7 @@ def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatc
     def remembered(config, folder):
         resumed.append(config)
         run = assemble(config, folder)
-        run.finish_begun = lambda: 0.0
+        run.finish_begun = lambda changed: 0.0
         return run
 
     monkeypatch.setattr(assembling, "assemble", remembered)

@@ -27,6 +27,7 @@ GUIDE = "(method=guide); leave it out"
         ("training.imitation_env.assignment=random", "reads training.imitation_env.assignment"),
         ("training.tests.starts=5", "reads training.tests.starts (method=coil)"),
         ("recording=drive.mcap", "nothing in this run reads recording (method=coil); leave it out"),
+        ("method.needs_guide=false", "the file of method=coil says whether its policy needs a"),
         ("method=guide learner.gamma=0.9", GUIDE),
         ("method=guide learner=sac", GUIDE),
         ("method=guide training.noise_correlation=0.5", GUIDE),

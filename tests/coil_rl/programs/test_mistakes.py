@@ -153,7 +153,7 @@ def refusal(name, *arguments):
             "evaluation.curve.cases has evaluation; give evaluation and selection",
         ),
         ("label=guide", "label=guide cannot be used"),
-        ("guide=constant guide.constant.value=[1,2]", "has the shape [1, 2], but must have [1, 1]"),
+        ("guide=constant guide.constant.value=[1,2]", "has the shape [2, 2], but must have [2, 1]"),
         # targets
         (
             "guide.spline._target_=coil_rl.guides.Nope",
@@ -217,7 +217,7 @@ def refusal(name, *arguments):
         ),
         (
             "guide=learned guide.learned.run=nowhere",
-            "guide.learned: run=nowhere is not the folder of a run",
+            "nowhere is not the folder of a run",
         ),
         (
             "method=rfc +method.transforms.coupling.guide=1",
@@ -324,7 +324,7 @@ def run(tmp_path_factory):
     [
         ({}, None),
         ({"evaluation.policy": "best"}, None),  # replaced by the requested evaluation
-        (b"a: [1,\n  b: }", "config.yaml is not the configuration of a run (while parsing"),
+        (b"a: [1,\n  b: }", "line 2: it is no YAML: "),
         (b"- 1\n", "config.yaml is not the configuration of a run, but a list"),
         (b"", "is not the configuration of a run ("),
         ({"seed": "abc"}, "Value 'abc' of type 'str' could not be converted to Integer"),
