@@ -25,7 +25,7 @@ from coil_rl.learners.n_step import discount
 from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerStep
 from coil_rl.learners.policy import Entries, next_of
 from coil_rl.learners.weights import Weights
-from coil_rl.ranges import NonNegative, Share, checked
+from coil_rl.ranges import NonNegative, Positive, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.action_space import nested_key
 
@@ -75,14 +75,25 @@ class DQN(OffPolicy):
         action_gain: NonNegative = 1.0,
         epsilon: Share | Schedule = Linear(1.0, 0.05, until=0.3),
         double: bool = True,
+        tau: Share = 0.01,
         updates_per_step: UpdatesPerStep = 0.25,
+        learning_rate: NonNegative | Schedule = Linear(1e-3, 0.0),
+        max_grad_norm: Positive | None = 10.0,
         **settings: Unpack[ReplaySettings],
     ) -> None:
         self.epsilon = schedule(epsilon)
         check_actions(env)
         in_keys = [nested_key(key) for key in in_keys]
         network = without_memory(network or Mlp(hidden, "relu"), "DQN")
-        super().__init__(env, in_keys, updates_per_step=updates_per_step, **settings)
+        super().__init__(
+            env,
+            in_keys,
+            tau=tau,
+            updates_per_step=updates_per_step,
+            learning_rate=learning_rate,
+            max_grad_norm=max_grad_norm,
+            **settings,
+        )
         self.one_hot = isinstance(env.action_spec, OneHot)
         single = env.action_spec_unbatched  # the network is evaluated on batches of any size
         numbers = ObservationNetwork(

@@ -38,11 +38,8 @@ class ReplaySettings(TypedDict, total=False):
 
     normalise: bool | Literal["auto"] | Sequence[NestedKey]
     scale_rewards: bool
-    tau: Share
     n_step: Annotated[int, Interval(ge=1, le=1_000)]
-    learning_rate: NonNegative | Schedule
     gamma: Share
-    max_grad_norm: Positive | None
     capacity: int
     batch_size: Count
     starts: Index
@@ -126,12 +123,12 @@ class OffPolicy(Stateful, Learner):
         *,
         normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         scale_rewards: bool = False,
-        tau: Share = 0.02,
+        tau: Share,
         updates_per_step: UpdatesPerStep,
         n_step: Annotated[int, Interval(ge=1, le=1_000)] = 1,
-        learning_rate: NonNegative | Schedule = 1e-3,
+        learning_rate: NonNegative | Schedule,
         gamma: Share = 0.99,
-        max_grad_norm: Positive | None = None,
+        max_grad_norm: Positive | None,
         capacity: int = 1_000_000,
         batch_size: Count = 256,
         starts: Index = 500,

@@ -36,6 +36,7 @@ from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerSte
 from coil_rl.learners.policy import ByKey, Entries, Policy, next_of
 from coil_rl.learners.weights import Weights
 from coil_rl.ranges import Interval, NonNegative, Positive, Share, checked
+from coil_rl.schedules import Schedule
 from coil_rl.transforms.action_space import ChoicesError, nested_key
 
 NORMS = Literal["none", "layer", "batch"]
@@ -55,7 +56,10 @@ class SACSettings(ReplaySettings, total=False):
     critic_layer_norm: bool
     dropout: Share
     uncertainty: bool
+    tau: Share
     updates_per_step: UpdatesPerStep
+    learning_rate: NonNegative | Schedule
+    max_grad_norm: Positive | None
     auxiliary: Sequence[Extension]
 
 
@@ -112,7 +116,10 @@ class SAC(OffPolicy):
         dropout: Share = 0.0,
         uncertainty: bool = False,
         auxiliary: Sequence[Extension] = (),
+        tau: Share = 0.02,
         updates_per_step: UpdatesPerStep = 1.0,
+        learning_rate: NonNegative | Schedule = 1e-3,
+        max_grad_norm: Positive | None = None,
         **settings: Unpack[ReplaySettings],
     ) -> None:
         if target_critics is not None and not 1 <= target_critics < critics:
@@ -127,7 +134,15 @@ class SAC(OffPolicy):
             )
         in_keys = [nested_key(key) for key in in_keys]
         network = without_memory(network or Mlp(hidden, "relu"), type(self).__name__)
-        super().__init__(env, in_keys, updates_per_step=updates_per_step, **settings)
+        super().__init__(
+            env,
+            in_keys,
+            tau=tau,
+            updates_per_step=updates_per_step,
+            learning_rate=learning_rate,
+            max_grad_norm=max_grad_norm,
+            **settings,
+        )
         self.action_scale, self.action_gain = action_scale, action_gain
         self.actor = self.build_actor(env, in_keys, network)
         self.critics = self.build_critics(

@@ -53,9 +53,6 @@ def test_dqn_solves_cart_pole():
         batch_size=64,
         updates_per_step=0.5,
         starts=1_000,
-        tau=0.01,
-        learning_rate=Linear(1e-3, 0.0),
-        max_grad_norm=10.0,
     )
     rollout = Rollout(env, dqn.policy, 16, dqn.keys)
     for update in range(195):  # 50,000 steps

@@ -44,6 +44,8 @@ def replay(env=None, **options):
         "updates_per_step": 0.25,
         "starts": 0,
         "tau": 0.1,
+        "learning_rate": 1e-3,
+        "max_grad_norm": None,
     } | options
     return OffPolicy(env or PendulumEnv(), **options)
 
