@@ -122,25 +122,26 @@ def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
     """
     measures, known = {}, [each.name for each in fields(Measure)]
     for name, node in nodes.items():
-        key = f"evaluation.measures.{name}"
         if name in TAKEN:
             raise UserError(
-                f"{key}: {name} is already a column of the tables; give the measure another name"
+                f"evaluation.measures.{name}: {name} is already a column of the tables; give the "
+                "measure another name"
             )
         if not isinstance(node, Mapping) or ("entry" not in node and node.keys() <= set(known)):
             raise UserError(
-                f"{key}={node} is no measure; write {key}.entry=ENTRY and, where it is not the "
-                "mean over the steps, its reduction"
+                f"evaluation.measures.{name}={node} is no measure; write "
+                f"evaluation.measures.{name}.entry=ENTRY and, where it is not the mean over the "
+                "steps, its reduction"
             )
         for unknown in node.keys() - set(known):
             raise UserError(
-                f"there is no key {unknown}; {key} has {', '.join(known)}"
+                f"there is no key {unknown}; evaluation.measures.{name} has {', '.join(known)}"
                 f"{did_you_mean(str(unknown), known)}"
             )
         try:
             measures[name] = Measure.of(**node)
         except (TypeError, ValueError) as error:
-            raise UserError(f"{key}: {error}") from error
+            raise UserError(f"evaluation.measures.{name}: {error}") from error
     return measures
 
 

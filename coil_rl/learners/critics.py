@@ -109,12 +109,8 @@ class Critics(TensorDictModuleBase):
         super().__init__()
         self.count, self.dropout = count, dropout
         self.concat = ConcatObservations(env, keys, {action_key: action_shape(env)}, network)
-        each = [
-            Mlp(network.hidden, network.activation).layers(
-                self.concat.width, outputs, 1.0, env.device
-            )
-            for _ in range(count)
-        ]
+        architecture, width = Mlp(network.hidden, network.activation), self.concat.width
+        each = [architecture.layers(width, outputs, 1.0, env.device) for _ in range(count)]
         linear = [[layer for layer in mlp if isinstance(layer, nn.Linear)] for mlp in each]
         *hidden, last = zip(*linear, strict=True)
         biased = norm != "batch"

@@ -23,12 +23,10 @@ class Weights:
     """
 
     def __init__(self, module: nn.Module) -> None:
-        self.places: list[tuple[dict[str, Any], str]] = [
-            (part._parameters, name)
-            for part in module.modules()
-            for name, parameter in part._parameters.items()
-            if parameter is not None
-        ]
+        self.places: list[tuple[dict[str, Any], str]] = []
+        for part in module.modules():
+            own = part._parameters
+            self.places += [(own, name) for name, each in own.items() if each is not None]
         parameters: list[nn.Parameter] = [table[name] for table, name in self.places]
         self.shapes = [parameter.shape for parameter in parameters]
         self.sizes = [parameter.numel() for parameter in parameters]
