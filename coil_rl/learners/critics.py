@@ -85,7 +85,6 @@ class Critics(TensorDictModuleBase):
             leaves out the biases that it would cancel.
         dropout: share of the numbers of a hidden layer that are left out in learning.
         inputs: has written what they read in place of some of `in_keys` already.
-        action_key: entry with the action.
     """
 
     by_key = True
@@ -101,14 +100,13 @@ class Critics(TensorDictModuleBase):
         norm: Literal["none", "layer", "batch"] = "none",
         dropout: float = 0.0,
         inputs: Inputs | None = None,
-        action_key: NestedKey = "action",
     ) -> None:
-        keys: list[NestedKey] = [*in_keys, action_key]
+        keys: list[NestedKey] = [*in_keys, "action"]
         self.in_keys = keys if inputs is None else inputs.reads(keys)
         self.out_keys: list[NestedKey] = [("next", "uncertainty")]
         super().__init__()
         self.count, self.dropout = count, dropout
-        self.concat = ConcatObservations(env, keys, {action_key: action_shape(env)}, network)
+        self.concat = ConcatObservations(env, keys, {"action": action_shape(env)}, network)
         architecture, width = Mlp(network.hidden, network.activation), self.concat.width
         each = [architecture.layers(width, outputs, 1.0, env.device) for _ in range(count)]
         linear = [[layer for layer in mlp if isinstance(layer, nn.Linear)] for mlp in each]

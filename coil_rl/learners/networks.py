@@ -388,30 +388,3 @@ def critic(
     if inputs is None:
         return FastTensorDictModule(values, in_keys, ["state_value"])
     return ByKey(inputs, FastTensorDictModule(values, inputs.reads(in_keys), ["state_value"]))
-
-
-def action_critic(
-    env: EnvBase,
-    in_keys: Sequence[NestedKey],
-    network: Mlp = DEFAULT,
-    inputs: Inputs | None = None,
-    action_key: NestedKey = "action",
-) -> FastTensorDictModule:
-    """Return an action-value network for numbers; it writes `state_action_value` [*batch, 1].
-
-    Args:
-        in_keys: entries that it observes, besides the action.
-        inputs: has written what the network reads in place of some of `in_keys` already.
-    """
-    keys: list[NestedKey] = [*in_keys, action_key]
-    values = ObservationNetwork(
-        env,
-        keys,
-        network,
-        1,
-        1.0,
-        {action_key: action_shape(env)},
-        env.full_reward_spec[env.reward_key].dtype,
-    )
-    read = keys if inputs is None else inputs.reads(keys)
-    return FastTensorDictModule(values, read, ["state_action_value"])
