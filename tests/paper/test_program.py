@@ -172,7 +172,7 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
         ("figure=3", "figure=3 is a diagram, which is not reproduced; there are table=1"),
         ("claim=tabular_coal", "did you mean claim=tabular_coil?"),
         ("tabel=1", "there is no key tabel"),
-        ("table=1 results.table_1.tolerance=0", "results.table_1: tolerance=0 must be more than 0"),
+        ("table=1 results.table_1.tolerance=0", "results.table_1.tolerance=0 must be more than 0"),
         ("table=1 results.table_1._target_=builtins.dict", "builtins.dict makes dict, not Result"),
         ("table=1 budget=small", "budget=small must be one of smoke, paper, full"),
         (

@@ -80,7 +80,7 @@ def test_files_and_printed_table(done):
     assert program.stdout.startswith(text)
     assert "Warning" not in text
     assert "replay: drive.mcap" not in program.stderr
-    assert "coil_seed1 is coil_1 (policy handed_over)." in text
+    assert f"coil_seed1 is {folder.parent / 'coil_1'} (policy handed_over)." in text
     assert f"\ndrive.mcap: {SCANS} scans in 2.5 s, 5.5 a second; " in program.stdout
 
 
