@@ -52,20 +52,15 @@ class Layer(nn.Module):
 
     Args:
         each: the layer of each network.
-        biased: whether there is a bias.
     """
 
-    def __init__(self, each: Sequence[nn.Linear], *, biased: bool = True) -> None:
+    def __init__(self, each: Sequence[nn.Linear]) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.stack([layer.weight.detach().T for layer in each]))
-        self.bias: nn.Parameter | None = None
-        if biased:
-            self.bias = nn.Parameter(torch.stack([layer.bias.detach()[None] for layer in each]))
+        self.bias = nn.Parameter(torch.stack([layer.bias.detach()[None] for layer in each]))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [critics, N, inputs] to [critics, N, outputs]."""
-        if self.bias is None:
-            return torch.bmm(x, self.weight)
         return torch.baddbmm(self.bias, x, self.weight)
 
 
@@ -81,8 +76,7 @@ class Critics(TensorDictModuleBase):
         network: architecture of each; convolutions are shared.
         count: how many they are.
         outputs: numbers that each gives for an action.
-        norm: of the hidden layers, before their activation; "batch" normalises the inputs too, and
-            leaves out the biases that it would cancel.
+        norm: of the hidden layers, before their activation; "batch" normalises the inputs too.
         dropout: share of the numbers of a hidden layer that are left out in learning.
         inputs: has written what they read in place of some of `in_keys` already.
     """
@@ -110,9 +104,7 @@ class Critics(TensorDictModuleBase):
         architecture, width = Mlp(network.hidden, network.activation), self.concat.width
         each = [architecture.layers(width, outputs, 1.0, env.device) for _ in range(count)]
         linear = [[layer for layer in mlp if isinstance(layer, nn.Linear)] for mlp in each]
-        *hidden, last = zip(*linear, strict=True)
-        biased = norm != "batch"
-        self.layers = nn.ModuleList([*(Layer(same, biased=biased) for same in hidden), Layer(last)])
+        self.layers = nn.ModuleList(Layer(same) for same in zip(*linear, strict=True))
         self.activation = ACTIVATIONS[network.activation]()
         self.layer_norm = norm == "layer" or network.layer_norm
         widths = [self.concat.width, *network.hidden] if norm == "batch" else []

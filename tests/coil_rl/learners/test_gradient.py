@@ -50,7 +50,14 @@ CASES = [
         id="redq",
         marks=pytest.mark.slow,
     ),
-    pytest.param(CrossQ, (), {"starts": 64, "batch_size": 32}, id="crossq", marks=pytest.mark.slow),
+    # Biases before a normalisation have gradients of rounding alone, which Adam makes steps of.
+    pytest.param(
+        CrossQ,
+        (),
+        {"starts": 64, "batch_size": 32, "learning_rate": 1e-6},
+        id="crossq",
+        marks=pytest.mark.slow,
+    ),
     pytest.param(
         TQC,
         (),

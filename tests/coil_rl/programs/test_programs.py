@@ -130,7 +130,7 @@ def test_run_stopped_during_its_evaluation_resumes_to_the_same_numbers(run, tmp_
             "train",
             ["-m", "resume=run,other"],
             "resume=run,other takes no argument but trust=[PACKAGE], budget.frames=NUMBER, "
-            "the run has its own config.yaml; leave out -m",
+            "env.workers=NUMBER and changed=accept: the run has its own config.yaml; leave out -m",
         ),
     ],
 )
