@@ -56,6 +56,8 @@ LEARNERS = {
     "dqn": ["method=coil", "learner=dqn", *REPLAY],
     "sac": ["method=coil", "learner=sac", *REPLAY],
     "sac_alone": ["method=ppo", "learner=sac", *REPLAY],
+    "crossq": ["method=residual", "learner=crossq", *REPLAY],
+    "tqc": ["method=coil_anchored", "learner=tqc", "learner.n_step=3", *REPLAY],
 }
 
 
