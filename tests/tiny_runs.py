@@ -36,7 +36,7 @@ SMALL_PROXY = [
 SMALL = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
 REPLAY = [
     "learner.batch_size=8",
-    "learner.ratio=1",
+    "learner.updates_per_step=0.125",
     "learner.starts=16",
     "learner.hidden=[8]",
     "learner.critics=3",
