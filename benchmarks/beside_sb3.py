@@ -110,9 +110,7 @@ def ours(
         The deterministic policy, and the gradient steps per CPU second of the updates.
     """
     torch.manual_seed(seed)
-    env: EnvBase = GymnasiumEnv(env_id, values["envs"], seed=seed)
-    if first := normalising(env):
-        env = TransformedEnv(env, Compose(*first))
+    env = normalised_env(env_id, values["envs"], seed)
     units = given_units(env)
     learner = our_learner(algorithm, env, values, seed)
     rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
@@ -129,6 +127,13 @@ def ours(
         return action if units is None else units.denormalise(action)
 
     return act, per_second(steps, stopwatch)
+
+
+def normalised_env(env_id: str, envs: int, seed: int = 0) -> EnvBase:
+    """Return an env of Gymnasium, whose actions are between -1 and 1 where they are numbers."""
+    env = GymnasiumEnv(env_id, envs, seed=seed)
+    first = normalising(env)
+    return TransformedEnv(env, Compose(*first)) if first else env
 
 
 def our_learner(

@@ -9,14 +9,11 @@ from importlib.util import find_spec
 from typing import Any
 
 import torch
-from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from benchmarks.beside_sb3 import VALUES, our_learner, their_learner
+from benchmarks.beside_sb3 import VALUES, normalised_env, our_learner, their_learner
 from benchmarks.timing import Row, Stopwatch, median_ratio, medians
 from benchmarks.training import without_lean_forms
-from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.run.rollout import Rollout
-from coil_rl.transforms.normalised_action import normalising
 
 ENVS = ("Pendulum-v1", "CartPole-v1", "LunarLanderContinuous-v3")
 Work = tuple[Callable[[], Any], Stopwatch]  # a batch and its updates, and the time of the latter
@@ -72,9 +69,7 @@ def compared(args: Namespace, env_id: str, values: dict[str, Any]) -> Row:
 def ours(env_id: str, values: dict[str, Any], *, lean: bool = True) -> Work:
     """Return a batch and its updates of our learner, in its lean forms or without them."""
     torch.manual_seed(0)
-    env: EnvBase = GymnasiumEnv(env_id, values["envs"])
-    if first := normalising(env):
-        env = TransformedEnv(env, Compose(*first))
+    env = normalised_env(env_id, values["envs"])
     learner = our_learner("ppo", env, values, seed=0)
     rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
     if not lean:

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import time
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.util import find_spec
 
 import torch
-from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from benchmarks.timing import Row, median_ratio, medians
-from coil_rl.foreign.gymnasium_env import GymnasiumEnv
+from benchmarks.beside_sb3 import normalised_env
+from benchmarks.timing import Row, Work, measure, median_ratio, medians
 from coil_rl.learners import DQN, SAC, TQC, CrossQ, Mlp
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.run.rollout import Rollout
-from coil_rl.transforms.normalised_action import normalising
 
-Work = Callable[[int], object]  # takes that many updates
 LEARNERS: dict[str, type[OffPolicy]] = {"SAC": SAC, "CrossQ": CrossQ, "TQC": TQC, "DQN": DQN}
 SIZES = ((64, (64, 64)), (256, (64, 64)), (256, (256, 256)))  # batch and hidden layers
 STORED = 1_000  # steps, of which minibatches are drawn
+UPDATES = 32  # of a call
 
 
 def measure_replay(args: Namespace) -> list[Row]:
@@ -39,25 +37,13 @@ def measure_replay(args: Namespace) -> list[Row]:
             for package, label in (("stable_baselines3", "sb3"), ("sbx", "sbx")):
                 if find_spec(package) and hasattr(import_module(package), name):
                     subjects[label] = theirs(package, name, batch, hidden)
-            sizes = {"learner": name, "batch": batch, "hidden": "-".join(map(str, hidden))}
-            rows.append({**sizes, **compared(args, subjects)})
+            rates = measure(args, subjects, time.process_time)
+            row: Row = {"learner": name, "batch": batch, "hidden": "-".join(map(str, hidden))}
+            row |= {f"{each} (updates/s)": rate for each, rate in medians(rates).items()}
+            for each in rates.keys() - {"sb3"} if "sb3" in rates else ():
+                row[f"{each} / sb3"] = median_ratio(rates[each], rates["sb3"])
+            rows.append({**row, "rounds": rates})
     return rows
-
-
-def compared(args: Namespace, subjects: dict[str, Work]) -> Row:
-    """Return the speeds of all subjects, and the ratios to Stable-Baselines3."""
-    rates: dict[str, list[float]] = {name: [] for name in subjects}
-    for work in subjects.values():
-        work(args.replay_updates)
-    for _ in range(args.repeats):
-        for name, work in subjects.items():
-            start = time.process_time()
-            work(args.replay_updates)
-            rates[name].append(args.replay_updates / (time.process_time() - start))
-    row: Row = {f"{name} (updates/s)": rate for name, rate in medians(rates).items()}
-    for name in rates.keys() - {"sb3"} if "sb3" in rates else ():
-        row[f"{name} / sb3"] = median_ratio(rates[name], rates["sb3"])
-    return {**row, "rounds": rates}
 
 
 def env_of(name: str) -> str:
@@ -68,9 +54,7 @@ def env_of(name: str) -> str:
 def ours(name: str, batch: int, hidden: Sequence[int], *, compiled: bool) -> Work:
     """Return updates of our learner."""
     torch.manual_seed(0)
-    env: EnvBase = GymnasiumEnv(env_of(name), 4)
-    if first := normalising(env):
-        env = TransformedEnv(env, Compose(*first))
+    env = normalised_env(env_of(name), 4)
     learner = LEARNERS[name](  # type: ignore[call-arg]
         env, network=Mlp(hidden, "relu"), batch_size=batch, starts=STORED, compile=compiled
     )
@@ -79,25 +63,30 @@ def ours(name: str, batch: int, hidden: Sequence[int], *, compiled: bool) -> Wor
     weights = learner.loss_weights(0.0)
     learner.gradient.begin(0.0)
 
-    def work(updates: int) -> None:
-        learner.pending_updates = updates
+    def work() -> int:
+        learner.pending_updates = UPDATES
         for minibatch in learner.samples():
             learner.gradient(minibatch, weights)
+        return UPDATES
 
     return work
 
 
 def theirs(package: str, name: str, batch: int, hidden: Sequence[int]) -> Work:
     """Return updates of the learner of a package."""
-    options: dict[str, object] = {"policy_kwargs": {"net_arch": list(hidden)}}
     model = getattr(import_module(package), name)(
         "MlpPolicy",
         env_of(name),
         batch_size=batch,
         learning_starts=STORED,
+        policy_kwargs={"net_arch": list(hidden)},
         device="cpu",
         seed=0,
-        **options,
     )
     model.learn(STORED)
-    return lambda updates: model.train(updates, batch)
+
+    def work() -> int:
+        model.train(UPDATES, batch)
+        return UPDATES
+
+    return work
