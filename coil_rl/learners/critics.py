@@ -13,11 +13,13 @@ from torchrl.envs import EnvBase
 from coil_rl.learners.encoders import ACTIVATIONS, ConcatObservations, Mlp
 from coil_rl.learners.networks import Inputs, action_shape
 
+Norm = Literal["none", "layer", "batch"]
+
 
 class BatchNorm(nn.Module):
     """Normalisation of the numbers of several networks over a batch, [critics, N, width].
 
-    Unless it learns, it normalises by the running statistics of the batches that it has learned.
+    Outside of the learning it normalises by running statistics of the batches that it has learned.
 
     Args:
         critics: number of networks.
@@ -91,7 +93,7 @@ class Critics(TensorDictModuleBase):
         count: int,
         *,
         outputs: int = 1,
-        norm: Literal["none", "layer", "batch"] = "none",
+        norm: Norm = "none",
         dropout: float = 0.0,
         inputs: Inputs | None = None,
     ) -> None:
@@ -107,8 +109,8 @@ class Critics(TensorDictModuleBase):
         self.layers = nn.ModuleList(Layer(same) for same in zip(*linear, strict=True))
         self.activation = ACTIVATIONS[network.activation]()
         self.layer_norm = norm == "layer" or network.layer_norm
-        widths = [self.concat.width, *network.hidden] if norm == "batch" else []
-        self.norms = nn.ModuleList(BatchNorm(count, width, env.device) for width in widths)
+        widths = [width, *network.hidden] if norm == "batch" else []
+        self.norms = nn.ModuleList(BatchNorm(count, each, env.device) for each in widths)
 
     def outputs(self, entries: Any, *, train: bool = False) -> Tensor:
         """Return the numbers of each critic for the action of entries, [critics, *B, outputs].

@@ -18,10 +18,8 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.learners.critics import Critics
-from coil_rl.learners.encoders import Mlp
 from coil_rl.learners.policy import Entries, next_of
-from coil_rl.learners.sac import NORMS, SAC, SACSettings
+from coil_rl.learners.sac import SAC, SACSettings
 from coil_rl.ranges import checked
 
 
@@ -37,6 +35,7 @@ class CrossQ(SAC):
     """
 
     betas = (0.5, 0.999)
+    norm = "batch"
 
     def __init__(
         self,
@@ -48,18 +47,6 @@ class CrossQ(SAC):
             if name in settings:
                 raise ValueError(f"{name}: CrossQ has no target networks and normalises batches")
         super().__init__(env, in_keys, **settings)
-
-    def build_critics(
-        self,
-        env: EnvBase,
-        in_keys: Sequence[NestedKey],
-        network: Mlp,
-        count: int,
-        norm: NORMS,
-        dropout: float,
-    ) -> Critics:
-        """Return critics that normalise batches."""
-        return super().build_critics(env, in_keys, network, count, "batch", dropout)
 
     def after_update(self) -> None:
         """Do nothing: there are no target networks."""

@@ -17,7 +17,7 @@ with a share of prior steps in each minibatch (Ball et al. 2023).
 import copy
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal, Unpack
+from typing import Annotated, ClassVar, Unpack
 
 import torch
 from tensordict import TensorDict
@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from coil_rl.learners import networks
-from coil_rl.learners.critics import Critics
+from coil_rl.learners.critics import Critics, Norm
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.kickstart import KickstartLoss
@@ -38,8 +38,6 @@ from coil_rl.learners.weights import Weights
 from coil_rl.ranges import Interval, NonNegative, Positive, Share, checked
 from coil_rl.schedules import Schedule
 from coil_rl.transforms.action_space import ChoicesError, nested_key
-
-NORMS = Literal["none", "layer", "batch"]
 
 
 class SACSettings(ReplaySettings, total=False):
@@ -98,6 +96,7 @@ class SAC(OffPolicy):
     reported: tuple[str, ...] = (*minimised, "alpha", "entropy", "value")
     betas = (0.9, 0.999)  # of Adam
     values_of_a_critic = 1
+    norm: ClassVar[Norm] = "none"  # of the critics, without `critic_layer_norm`
 
     def __init__(
         self,
@@ -145,8 +144,15 @@ class SAC(OffPolicy):
         )
         self.action_scale, self.action_gain = action_scale, action_gain
         self.actor = self.build_actor(env, in_keys, network)
-        self.critics = self.build_critics(
-            env, in_keys, network, critics, "layer" if critic_layer_norm else "none", dropout
+        self.critics = Critics(
+            env,
+            in_keys,
+            network,
+            critics,
+            outputs=self.values_of_a_critic,
+            norm="layer" if critic_layer_norm else self.norm,
+            dropout=dropout,
+            inputs=self.inputs,
         )
         self.target = copy.deepcopy(self.critics).requires_grad_(False)
         log_alpha = torch.tensor(math.log(temperature), device=self.device)
@@ -176,27 +182,6 @@ class SAC(OffPolicy):
             anchor=self.anchor,
         )
         return policy if self.inputs is None else Policy(*policy.module[1:])
-
-    def build_critics(
-        self,
-        env: EnvBase,
-        in_keys: Sequence[NestedKey],
-        network: Mlp,
-        count: int,
-        norm: NORMS,
-        dropout: float,
-    ) -> Critics:
-        """Return the critics, which read entries that have been normalised already."""
-        return Critics(
-            env,
-            in_keys,
-            network,
-            count,
-            outputs=self.values_of_a_critic,
-            norm=norm,
-            dropout=dropout,
-            inputs=self.inputs,
-        )
 
     def build_policy(self) -> TensorDictModuleBase:
         """Return the policy that collects the batches."""
