@@ -269,7 +269,7 @@ def trains_guides(config: DictConfig) -> bool:
 
 
 def of_guides(config: DictConfig, attribute: str) -> dict[str, Any]:
-    """Return an attribute of the classes of guides by name, of those that set it.
+    """Return the value of an attribute of each guide whose class sets it, by the guide's name.
 
     Args:
         attribute: `sees`, what a guide may know more than an agent; or `demonstrates`, for one

@@ -137,7 +137,7 @@ class _Env(BaseModel):
 
 
 class _Contract(BaseModel):
-    """What is used of a contract; it may say more."""
+    """The part of a contract that is read; further keys are ignored."""
 
     inputs: list[_Input]
     state: list[_State]

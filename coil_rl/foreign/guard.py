@@ -1,4 +1,4 @@
-"""What belongs to the process, kept from the code of other people.
+"""Guard of the settings and global random numbers of the process against foreign code.
 
 An env that seeds torch would make the exploration noise of all its episodes equal, one that changes
 the folder would break the paths of the run. So foreign code has its own: what it sets holds when it
@@ -177,7 +177,7 @@ class Numbers:
         random.setstate(self.before[2])
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a checkpoint can hold; empty if they are not used."""
+        """Return the state of the generators as plain values; empty if they are not used."""
         if not self.used:
             return {}
         numpy = self.bits.state["state"]

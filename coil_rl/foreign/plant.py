@@ -67,7 +67,7 @@ class Plant(ABC):
             self._begin()
 
     def step(self, action: Any) -> None:
-        """Take a step; one whose episode is over stays as it is, with reward 0.
+        """Take a step; after the end of an episode nothing changes, and the reward is 0.
 
         Errors are those of `begin`.
         """

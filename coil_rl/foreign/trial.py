@@ -416,7 +416,7 @@ class _Shared:
         return " and ".join(name for name, *_ in self._changed())
 
     def restore(self) -> None:
-        """Give everything the content that it had."""
+        """Restore the values that have changed."""
         for name, value, put in list(self._changed()):
             old = pickle.loads(self.before[name])
             for now, then in zip(value, old, strict=True) if put is None else [(value, old)]:
