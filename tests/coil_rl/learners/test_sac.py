@@ -311,7 +311,7 @@ def test_uncertainty_is_the_standard_deviation_of_the_critics(many):
         ),
         (SAC, {"prior": 0.5}, r"prior=0\.5 needs steps in which a guide acts"),
         (SAC, {"prior": 1.5}, r"prior=1\.5 must be"),
-        (CrossQ, {"tau": 0.1}, "tau: CrossQ has no target networks"),
+        (CrossQ, {"tau": 0.1}, "tau=0.1 must be None"),
         (CrossQ, {"critic_layer_norm": True}, "critic_layer_norm: CrossQ"),
         (TQC, {"dropped": 25}, "dropped=25 must be less than quantiles=25"),
         (TQC, {"target_critics": 1}, "all critics of TQC give the target"),
