@@ -47,6 +47,11 @@ class CrossQ(SAC):
         tau: None = None,
         **settings: Unpack[CrossQSettings],
     ) -> None:
+        if critic_layer_norm is not None or tau is not None:
+            raise ValueError(
+                f"critic_layer_norm={critic_layer_norm} and tau={tau} must be None: CrossQ "
+                "normalises batches and has no target networks"
+            )
         super().__init__(env, in_keys, **settings)
 
     def after_update(self) -> None:
