@@ -116,7 +116,7 @@ def code_of_run(config: DictConfig) -> dict[str, str]:
 
 def _files_of(parts: DictConfig) -> dict[str, str]:
     """Return the SHA-256 of each `file` that a configuration names, by its name."""
-    named = entries(OmegaConf.to_container(parts, resolve=True), lists=True)
+    named = entries(OmegaConf.to_container(parts), lists=True)
     paths = {Path(value) for _, key, value in named if key == "file" and isinstance(value, str)}
     found = {}
     for path in paths:
