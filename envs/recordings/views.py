@@ -12,7 +12,7 @@ from coil_rl.envs.robot.perception import Perception
 
 CHECKED_SCANS = 512  # of a recording at most, evenly spread
 MOST = 0.5  # share of the clusters, and of the scans
-# Of the scans with both boundaries 0.97 and more with 30 % of the cones missing, see docs/robot_measured.md.
+# Of the scans with both boundaries 0.97 and more with 30 % of the cones missing, see docs/robot.md.
 IN_ORDER = 0.5
 
 
