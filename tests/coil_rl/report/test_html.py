@@ -43,11 +43,11 @@ class Reader(HTMLParser):
 def report(folder):
     runs = read_runs([folder])
     compared = {"deterministic": compare(runs)}
-    figures = draw_report(runs, compared, folder)
+    strokes = style.strong_strokes({run.label for run in runs})
+    figures = draw_report(runs, compared, folder, strokes)
     blocks = page.section(compared["deterministic"], compared["deterministic"].table(None), None)
-    return html_page(
-        f"Report of {folder.name}", [Section("Deterministic actions", blocks)], figures
-    )
+    section = Section("Deterministic actions", blocks, figures)
+    return html_page(f"Report of {folder.name}", [section])
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_cells_carry_the_numbers_that_rows_are_sorted_by():
     ]
     columns = {"name": ("name", ""), "score": ("score", ".1f"), "interval": ("interval", "")}
     table = Table(rows, columns)
-    text = html_page("title", [Section("", [table, "a paragraph"])], [])
+    text = html_page("title", [Section("", [table, "a paragraph"])])
     assert re.findall(r'data-number="([^"]*)"', text) == ["1.5", "1031.2"]
     assert table.numeric == [False, True, False]
     assert "<p>a paragraph</p>" in text
@@ -133,7 +133,7 @@ def test_method_has_one_colour_in_all_pictures():
 
 
 def test_variants_of_a_method_have_its_colour_and_other_dashes():
-    labels = ["ppo (1: a=1)", "ppo (2: a=2)", "coil_anchored", "coil", "mine", "jump_start"]
+    labels = ["ppo 1", "ppo 2", "coil_anchored", "coil", "mine", "jump_start"]
     strokes = style.strong_strokes(labels)
     assert len(set(map(str, strokes.values()))) == len(labels)
     assert {strokes[label].colour for label in labels[:2]} == {style.OWN["ppo"].colour}
