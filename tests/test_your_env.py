@@ -60,7 +60,8 @@ def plant(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_path_is_measure_tune_train_export(plant):
-    first, measure, *commands = map(shlex.split, PATH.splitlines())
+    lines = [shlex.split(line, comments=True) for line in PATH.splitlines()]
+    first, measure, *commands = filter(None, lines)
     assert first == ["export", "PYTHONPATH=."]
     assert measure[0] == "coil-compare", "tests/coil_rl/comparison runs it"
     assert commands[0][2:6] == measure[1:5], "the same env and controller"
