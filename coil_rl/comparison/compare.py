@@ -79,7 +79,7 @@ def compare(
     env: Any,
     *,
     guide: Any,
-    tune: Mapping[str, Any] | None = None,
+    tune: Mapping[str, Any] | str | None = None,
     minutes: float = 2.0,
     frames: int | None = None,
     seed: int = 0,
@@ -92,7 +92,7 @@ def compare(
         env: as for `train`.
         guide: as for `train`.
         tune: bounds of numbers of the guide by name, which are tuned too: [low, high] or [low,
-            high, "log"].
+            high, "log"]; "auto" for those that the guide knows.
         minutes: that it may take, about; it takes longer where an env or a guide is too slow.
         frames: of a whole training, of which each job here gets a tenth at most; by default those
             of the env's file.
@@ -115,7 +115,7 @@ def compare(
     if frames is not None:
         words.append(f"budget.frames={frames}")
     if tune is not None:
-        given.nodes["tune"] = dict(tune)
+        given.nodes["tune"] = tune if isinstance(tune, str) else dict(tune)
     return Comparison(Named(words, given.nodes), place, minutes=minutes, seed=seed).run()
 
 
