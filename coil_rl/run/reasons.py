@@ -105,7 +105,8 @@ def next_step(
         trust: packages that these commands must trust.
     """
     longer = f"{resume_command(folder, trust)} budget.frames={2 * frames}"
-    report = f"coil-report folder={shlex.quote(str(folder.parent))}"
+    swept = (folder.parent / "multirun.yaml").exists()
+    report = f"coil-report folder={shlex.quote(str(folder.parent if swept else folder))}"
     if still_rising(rows):
         return f"Still rising at the end: {longer}"
     return f"Next: {command_of('coil-evaluate', 'run', folder, trust)} | {report} | {longer}"
