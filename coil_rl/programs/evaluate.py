@@ -15,10 +15,10 @@ from coil_rl.errors import UserError
 from coil_rl.programs import app
 
 # Keys that have an effect on the evaluation of a run, and on that of guides alone.
-OF_A_RUN = ("run", "exported", "track", "disturb", "degrade", "beside", "evaluation", "env")
-OF_GUIDES = ("preset", "guide", *(key for key in OF_A_RUN if key != "beside"))
-# Keys of the env of a run that may be given: no training depends on them.
-OF_NO_TRAINING = ("env.info", "env.workers")
+OF_BOTH = ("run", "exported", "track", "disturb", "degrade", "evaluation")
+OF_NO_TRAINING = ("env.info", "env.workers")  # no number of a training depends on them
+OF_A_RUN = (*OF_BOTH, "beside", *OF_NO_TRAINING)
+OF_GUIDES = ("preset", "env", "guide", *OF_BOTH)
 # Keys of `evaluation` of the command, not of the run.
 OWN = ("repeats", "policy", "gif", "advice", "beside")
 OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
@@ -182,12 +182,6 @@ def check(config: DictConfig) -> None:
         else "a guide is evaluated without an agent"
     )
     app.check_used(OF_A_RUN if given else OF_GUIDES, reason)
-    for key, text in app.overrides():
-        if given and re.match(r"env\b", key) and key not in OF_NO_TRAINING:
-            raise UserError(
-                f"{text} has no effect: run={config.run} was trained in its own env; what no "
-                f"training depends on can be given, {' and '.join(OF_NO_TRAINING)}"
-            )
     app.check_unused("evaluation", OF_TRAINING, "only a training reads it")
     app.check_unused("evaluation", ("sections",), "only coil-listen reads it")
     if config.exported is not None:

@@ -39,7 +39,7 @@ TUNED = record.json_file("tuned.json", dict[str, float], PUT_BACK)  # numbers of
 NAMES = {OWN: "guide", MEAN: "tuned", BEST: "best_candidate"}  # in delivery.json
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class TunedRun(Run):
     """A run that tunes its guide.
 
