@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import time
+from functools import partial
 
 import pytest
 from programs import TINY, called, command, environment, program
@@ -27,7 +28,7 @@ def _heed(number):
 @pytest.mark.parametrize(
     "number",
     [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP],
-    ids=lambda number: number.name
+    ids=lambda number: number.name,
 )
 def test_signal_saves_the_present_update_and_says_how_to_go_on(tmp_path, number):
     folder = tmp_path / "a run"
