@@ -153,7 +153,7 @@ def _panels(traces: Mapping[str, Trace]) -> dict[str, list[tuple[str, Array, boo
             title, dotted = kind or "action", not kind
             if dotted and trace.advice == trace.sent:  # a guide that acts alone
                 continue
-            columns = np.array(steps, dtype=np.float64).T if steps else []
+            columns = np.array(steps, dtype=np.float64).T if steps else np.empty((0, 0))
             for number, column in enumerate(columns):
                 titled = title if len(columns) == 1 else f"{title} {number}"
                 panels.setdefault(titled, []).append((name, column, dotted))
