@@ -16,6 +16,7 @@ LINKED = {
     "envs": "coil_rl.envs",
     "transforms": "coil_rl.transforms",
     "conf": "coil_rl.conf",
+    "fmu": "coil_fmu",
     "paper": "coil_paper",
     "studies": "coil_studies",
     "robot": "coil_robot",
@@ -24,6 +25,7 @@ TENSOR_LIBRARIES = {"torch", "tensordict", "torchrl"}
 
 # Packages whose `__init__.py` says what is public: `from coil_rl.envs import Track as Track`.
 PUBLIC = [
+    "coil_fmu",
     "coil_rl.cones",
     "coil_rl.envs",
     "coil_rl.envs.recordings",
@@ -132,7 +134,7 @@ def public_names():
     return names
 
 
-@pytest.mark.parametrize("guest", ["paper", "robot"])
+@pytest.mark.parametrize("guest", ["fmu", "paper", "robot"])
 def test_guest_imports_only_what_is_public(guest: str) -> None:
     public = public_names()
     own = (LINKED[guest], *MODULES)
@@ -146,7 +148,7 @@ def test_guest_imports_only_what_is_public(guest: str) -> None:
     assert not wrong, "a guest is written as a stranger's package; use, or make, public names"
 
 
-@pytest.mark.parametrize("guest", ["coil_paper", "coil_robot", "coil_studies"])
+@pytest.mark.parametrize("guest", ["coil_fmu", "coil_paper", "coil_robot", "coil_studies"])
 def test_library_does_not_name_its_guests(guest: str) -> None:
     folders = ["coil_rl", "envs", "transforms", "conf"]
     files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
