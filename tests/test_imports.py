@@ -74,17 +74,18 @@ def package_of(path: Path) -> list[str]:
 
 
 @functools.cache
-def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
+def imported_modules(path: Path) -> list[str]:
+    """Return the absolute names of all imported modules of a file."""
+    return list(modules_of(ast.parse(path.read_text(encoding="utf-8")), path))
 
 
-def imported_modules(path: Path, tree: ast.Module | None = None) -> Iterator[str]:
-    """Yield the absolute names of all imported modules of a file, or of a part of it.
+def modules_of(tree: ast.Module, path: Path) -> Iterator[str]:
+    """Yield the absolute names of the imported modules of a tree.
 
     `from a import b` gives `a.b`, because b may be a module.
     """
     package = package_of(path)
-    for node in ast.walk(tree or tree_of(path)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -159,7 +160,7 @@ def test_library_does_not_name_its_guests(guest: str) -> None:
 
 
 def test_only_modules_of_that_name_import_gymnasium() -> None:
-    found = {path.stem: list(imported_modules(path)) for path in source_files("envs")}
+    found = {path.stem: imported_modules(path) for path in source_files("envs")}
     users = [
         stem for stem, names in found.items() if any(is_inside(name, "gymnasium") for name in names)
     ]
@@ -226,7 +227,7 @@ def test_no_files_import_each_other() -> None:
     graph, known = {}, {*modules.values()}
     for path, module in modules.items():
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        found = imported_modules(path, WithoutTypes().visit(tree))
+        found = modules_of(WithoutTypes().visit(tree), path)
         names = {name if name in known else name.rpartition(".")[0] for name in found}
         graph[module] = names - {module}
     graphlib.TopologicalSorter(graph).prepare()  # a circle is a CycleError
