@@ -49,6 +49,24 @@ class BatchNorm(nn.Module):
         return (x - mean) * (variance + 1e-3).rsqrt() * self.gain + self.shift
 
 
+class LayerNorm(nn.Module):
+    """Normalisation of the numbers of each row of several networks, [critics, N, width].
+
+    Args:
+        critics: number of networks.
+        width: numbers of each.
+    """
+
+    def __init__(self, critics: int, width: int, device: torch.device | None) -> None:
+        super().__init__()
+        self.gain = nn.Parameter(torch.ones((critics, 1, width), device=device))
+        self.shift = nn.Parameter(torch.zeros((critics, 1, width), device=device))
+
+    def forward(self, x: Tensor, train: bool) -> Tensor:
+        """Normalise numbers, with or without `train`."""
+        return torch.addcmul(self.shift, F.layer_norm(x, x.shape[-1:]), self.gain)
+
+
 class Layer(nn.Module):
     """The same layer of several networks, computed at once.
 
@@ -108,9 +126,11 @@ class Critics(TensorDictModuleBase):
         linear = [[layer for layer in mlp if isinstance(layer, nn.Linear)] for mlp in each]
         self.layers = nn.ModuleList(Layer(same) for same in zip(*linear, strict=True))
         self.activation = ACTIVATIONS[network.activation]()
-        self.layer_norm = norm == "layer" or network.layer_norm
-        widths = [width, *network.hidden] if norm == "batch" else []
-        self.norms = nn.ModuleList(BatchNorm(count, each, env.device) for each in widths)
+        norm = "layer" if network.layer_norm else norm
+        # Batches also at the input.
+        widths = {"none": [], "layer": network.hidden, "batch": [width, *network.hidden]}[norm]
+        kind = BatchNorm if norm == "batch" else LayerNorm
+        self.norms = nn.ModuleList(kind(count, each, env.device) for each in widths)
 
     def outputs(self, entries: Any, *, train: bool = False) -> Tensor:
         """Return the numbers of each critic for the action of entries, [critics, *B, outputs].
@@ -121,13 +141,12 @@ class Critics(TensorDictModuleBase):
         """
         read = self.concat(*(entries[key] for key in self.in_keys))
         x = read.reshape(-1, read.shape[-1]).expand(self.count, -1, -1)
+        first = len(self.layers) - len(self.norms)  # place of the first norm
         for place, layer in enumerate(self.layers):
             if place and self.dropout and train:
                 x = F.dropout(x, self.dropout)
-            if place and self.layer_norm:
-                x = F.layer_norm(x, x.shape[-1:])
-            if self.norms:
-                x = self.norms[place](x, train)
+            if place >= first:
+                x = self.norms[place - first](x, train)
             if place:
                 x = self.activation(x)
             x = layer(x)

@@ -49,8 +49,11 @@ def value_of(critics, number, states, action):
     """The outputs of one critic, layer by layer, [N, n]."""
     x = torch.cat([states["th"].unsqueeze(-1), states["thdot"].unsqueeze(-1), action], -1)
     for place, layer in enumerate(critics.layers):
+        if place and critics.norms:
+            norm = critics.norms[place - 1]
+            x = F.layer_norm(x, x.shape[-1:], norm.gain[number, 0], norm.shift[number, 0])
         if place:
-            x = F.relu(F.layer_norm(x, x.shape[-1:]) if critics.layer_norm else x)
+            x = F.relu(x)
         x = x @ layer.weight[number] + layer.bias[number, 0]
     return x
 
