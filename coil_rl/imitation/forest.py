@@ -118,13 +118,18 @@ class ForestRegressor(Regressor):
     def _predicted(self, rows: Tensor) -> Tensor:
         """Return the prediction [N, outputs] for rows [N, inputs]."""
         features, thresholds = self.arrays["features"], self.arrays["thresholds"]
-        children, nodes = self.arrays["children"].reshape(-1), self.arrays["roots"]
-        nodes = nodes.expand(rows.shape[0], -1)  # [N, trees], which end in leaves
+        children, roots = self.arrays["children"].reshape(-1), self.arrays["roots"]
+        count, trees, numbers = rows.shape[0], len(roots), rows.reshape(-1)
+        # For each row and tree, which take half of the time in one dimension.
+        first = (torch.arange(count) * self.inputs)[:, None].expand(-1, trees).reshape(-1)
+        nodes = roots.repeat(count)
         for _ in range(self.depth):
-            right = rows.gather(1, features[nodes]).double() > thresholds[nodes]
-            nodes = children[2 * nodes + right]
+            chosen = numbers.index_select(0, first + features.index_select(0, nodes))
+            right = chosen.double() > thresholds.index_select(0, nodes)
+            nodes = children.index_select(0, 2 * nodes + right)
+        leaves = self.arrays["values"].index_select(0, nodes).reshape(count, trees, -1)
         # One tree after the other, as scikit-learn adds them, so that the sums are the same.
-        return self.arrays["values"][nodes].cumsum(1)[:, -1] / nodes.shape[1]
+        return leaves.cumsum(1)[:, -1] / trees
 
     def get_extra_state(self) -> dict[str, Tensor]:
         """Return the arrays of the fitted forest; none before the first fit."""
