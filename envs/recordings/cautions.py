@@ -78,7 +78,7 @@ OUT_OF_ORDER = (
 )
 
 
-def in_order(cones: NDArray[np.float32], count: NDArray[np.int64]) -> NDArray[np.bool_]:
+def in_order(cones: NDArray[np.floating], count: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return whether the left cones lie left, for each scan with cones of both sides.
 
     Compared are the means of the coordinate to the left.
