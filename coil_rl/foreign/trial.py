@@ -161,9 +161,9 @@ class Trial:
         self.find(
             "seed",
             f"the same seed gives other values of {written_key(key)}: the env does not obey its "
-            "seed, or lives by the clock, so the cases of an evaluation are not the same for each policy; draw random "
-            "numbers from self.np_random or another seeded generator, count time by steps, and "
-            "begin each episode anew (env.fresh=true makes a new env for each)",
+            "seed, or lives by the clock, so the cases of an evaluation are not the same for each "
+            "policy; draw random numbers from self.np_random or another seeded generator, count "
+            "time by steps, and begin each episode anew (env.fresh=true makes a new env for each)",
         )
 
     def _look_at_bounds(self, rollout: TensorDictBase) -> None:
