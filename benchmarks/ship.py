@@ -118,7 +118,7 @@ def card(run: Path, name: str, settings: Mapping[str, Any]) -> str:
 
 def _command(run: Path) -> str:
     """Return the command that made a run, without what says where it was written."""
-    words = shlex.split(COMMAND.need(run))
+    words = COMMAND.need(run)
     kept = [word for word in words if not word.startswith(("hydra.run.dir=", "logger="))]
     return shlex.join(kept)
 

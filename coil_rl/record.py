@@ -205,9 +205,14 @@ def _text(content: bytes) -> str:
     return content.decode("utf-8-sig").strip()
 
 
+def _words(content: bytes) -> list[str]:
+    """Return the words of a command, as a shell reads them."""
+    return shlex.split(_text(content))
+
+
 PUT_BACK = "put the file back that coil-train wrote, or leave this run out"
 AGAIN = "remove the file and write it again by coil-train resume={folder}"
-COMMAND = File("command.txt", _text, "remove it")
+COMMAND = File("command.txt", _words, "remove it", text_of=shlex.join)
 VERSIONS = json_file("versions.json", dict[str, str], "remove it")
 METRICS = File("metrics.csv", curve, PUT_BACK, LARGEST_TABLE)
 EPISODES = File("episodes.csv", table, AGAIN, LARGEST_TABLE, csv_text)

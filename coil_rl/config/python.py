@@ -40,7 +40,7 @@ def train(
     frames: int | None = None,
     seed: int = 0,
     folder: str | Path | None = None,
-    tune: Mapping[str, Any] | None = None,
+    tune: Mapping[str, Any] | str | None = None,
     overrides: Sequence[str] = (),
 ) -> Run:
     """Train a policy, evaluate it beside its guide, and return the run.
@@ -59,7 +59,7 @@ def train(
         seed: of everything.
         folder: for everything that the run writes; by default a new one in outputs/train.
         tune: of method="tune": bounds of numbers of the guide by name, [low, high] or [low, high,
-            "log"].
+            "log"]; "auto" for those that the guide knows.
         overrides: further words of the command line, such as "learner.gamma=0.98".
 
     Raises:
@@ -111,7 +111,7 @@ def prepare(
     frames: int | None = None,
     seed: int = 0,
     folder: str | Path,
-    tune: Mapping[str, Any] | None = None,
+    tune: Mapping[str, Any] | str | None = None,
     overrides: Sequence[str] = (),
 ) -> Run:
     """Return a run that is checked and ready to train.
@@ -136,7 +136,7 @@ def prepare(
     if frames is not None:
         words.append(f"budget.frames={frames}")
     if tune is not None:
-        given.nodes["tune"] = dict(tune)
+        given.nodes["tune"] = tune if isinstance(tune, str) else dict(tune)
     words += [f"seed={seed}", *overrides]
     return prepared(Named(words, given.nodes), folder)
 

@@ -469,7 +469,7 @@ class _Shared:
                     yield f"{kind.__name__}.{name}", value, partial(setattr, kind, name)
             module = sys.modules.get(kind.__module__)
             for name, value in vars(module).items() if module else ():
-                if _is_data(value) and not name.startswith("__"):
+                if isinstance(value, DATA) and not name.startswith("__"):
                     yield f"{kind.__module__}.{name}", value, partial(setattr, module, name)
 
 

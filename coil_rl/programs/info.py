@@ -1,5 +1,6 @@
 """`coil-info`: print the versions that a bug report needs, or the command that made a run."""
 
+import shlex
 import sys
 from pathlib import Path
 
@@ -22,8 +23,11 @@ def describe(folder: Path) -> dict[str, str]:
     """
     if not is_begun(folder):
         raise UserError(f"run={folder} is not the folder of a run: it has no config.yaml")
-    made = record.COMMAND.read(folder) or "not known: the run was not made on a command line"
-    return {"command": made} | (record.VERSIONS.read(folder) or {})
+    words = record.COMMAND.read(folder)
+    unknown = "not known: the run was not made on a command line"
+    return {"command": shlex.join(words) if words else unknown} | (
+        record.VERSIONS.read(folder) or {}
+    )
 
 
 def printable(text: str) -> str:

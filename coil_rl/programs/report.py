@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,32 +20,89 @@ from coil_rl.programs.sweeps import is_sweep
 if TYPE_CHECKING:
     from coil_rl.report.comparison import Comparison
     from coil_rl.report.html import Section
+    from coil_rl.report.runs import Run
+    from coil_rl.report.style import Stroke
 
 ACTIONS = {
     "deterministic": ("deterministic",),
     "sampled": ("sampled",),
     "both": ("deterministic", "sampled"),
 }
-DEFAULT_AGAINST = "ppo"
+DEFAULT_AGAINST = "ppo"  # without a guide
+GUIDE = "guide"  # of each agent
+
+
+@dataclass(frozen=True)
+class EnvPart:
+    """What a report has of the runs in one env.
+
+    Args:
+        env: name, for headings and files; empty where there is only one env.
+        runs: finished, with the labels that are shown.
+        differing: what differs between runs whose label got a number.
+        compared: the policies, by kind of actions.
+        against: what they are compared with.
+    """
+
+    env: str
+    runs: Sequence[Run]
+    differing: Sequence[Mapping[str, str]]
+    compared: Mapping[str, Comparison]
+    against: str | None
+
+    def tables(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the rows of the table of policies, by kind of actions."""
+        return {kind: each.table(self.against) for kind, each in self.compared.items()}
+
+    def sections(self, folder: Path, strokes: Mapping[str, Stroke]) -> list[Section]:
+        """Return the sections, the figures in the first one; the figures are written, too.
+
+        Args:
+            folder: for the figures.
+            strokes: by label.
+        """
+        from coil_rl.report import page
+        from coil_rl.report.figures import draw_report
+        from coil_rl.report.html import Section
+
+        suffix = re.sub(r"[^\w.-]+", "_", f"_{self.env}") if self.env else ""
+        figures = draw_report(self.runs, self.compared, folder, strokes, suffix)
+        sections: list[Section] = []
+        for kind, rows in self.tables().items():
+            heading = ", ".join(filter(None, (self.env, f"{kind} actions")))
+            blocks = page.section(self.compared[kind], rows, self.against)
+            if not sections:
+                blocks += page.what_differs(self.differing, "policy")
+            named = f"{heading[0].upper()}{heading[1:]}"
+            sections.append(Section(named, blocks, [] if sections else figures))
+        training = [*page.training(self.runs), *page.guide_training(self.runs)]
+        return [*sections, Section("", [*training, *self._notes()])]
+
+    def _notes(self) -> list[str]:
+        """Return the sentences on these runs."""
+        from coil_rl.report import page
+        from coil_rl.report.configurations import of_several_conditions, of_several_definitions
+        from coil_rl.report.guides import of_changed_guides, of_guides_of_labels
+
+        return [
+            *page.unpaired(self.against, self.compared),
+            *page.handed_over(self.runs),
+            *page.begun(self.runs),
+            *of_several_conditions(self.runs),
+            *of_several_definitions(self.runs),
+            *of_changed_guides(self.runs),
+            *of_guides_of_labels(self.runs),
+        ]
 
 
 def report(config: DictConfig) -> None:
     """Compare the finished runs, and print the page.
 
-    The page, as Markdown and as HTML with the figures, all numbers and the figures are written to
-    the first folder.
+    Runs are compared within an env and its test. The page, as Markdown and as HTML with the
+    figures, all numbers and the figures are written to the first folder.
     """
     from coil_rl.files import write_text
-    from coil_rl.report import page, write_csv
-    from coil_rl.report.comparison import compare
-    from coil_rl.report.configurations import (
-        distinguish,
-        of_several_conditions,
-        of_several_definitions,
-        of_several_envs,
-    )
-    from coil_rl.report.figures import draw_report
-    from coil_rl.report.guides import of_changed_guides, of_guides_of_labels
+    from coil_rl.report import page, style, write_csv
     from coil_rl.report.html import Section, html_page
     from coil_rl.report.runs import failed_jobs, read_runs
     from coil_rl.run.stopping import resume_command
@@ -57,40 +116,58 @@ def report(config: DictConfig) -> None:
             f"continue one with {resume_command(runs[0].folder)}, "
             "or repeat the command that started them"
         )
-    finished, differences = distinguish(finished)
-    compared = {actions: compare(finished, actions) for actions in ACTIONS[config.actions]}
-    against = _against(config.against, compared)
-    tables = {kind: compared[kind].table(against) for kind in compared}
-    sections = [
-        Section(f"{kind.capitalize()} actions", page.section(compared[kind], rows, against))
-        for kind, rows in tables.items()
-    ]
-    notes = [
-        *page.notes(against, compared),
-        *page.unpaired(against, compared),
-        *page.handed_over(finished),
-        *page.begun(finished),
-        *of_several_envs(finished),
-        *of_several_conditions(finished),
-        *of_several_definitions(finished),
-        *differences,
-        *of_changed_guides(finished),
-        *of_guides_of_labels(finished),
-        *page.progress(len(finished), len(runs), failed_jobs(folders)),
-    ]
-    training = [*page.training(finished), *page.guide_training(finished)]
-    sections.append(Section("", [*training, *notes]))
-    text = "\n\n".join(map(_markdown, sections))
-
+    parts, envs = _parts(finished, ACTIONS[config.actions], config.against)
+    against = parts[0].against
+    compared = [comparison for part in parts for comparison in part.compared.values()]
+    drawn = [group for comparison in compared for group in comparison.agents or comparison.guides]
+    strokes = style.strong_strokes(dict.fromkeys(group.name for group in drawn))
     folder = folders[0]
+    first = {part.env: next(iter(part.tables().values())) for part in parts}
+    overview = [*page.summary(first, against), *page.what_differs(envs, "env")]
+    sections = [Section("", overview)] if overview else []
+    for part in parts:
+        sections += part.sections(folder, strokes)
+    sections.append(
+        Section(
+            "",
+            [
+                *page.notes(against, sampled="sampled" in ACTIONS[config.actions]),
+                *page.progress(len(finished), len(runs), failed_jobs(folders)),
+            ],
+        )
+    )
+    text = "\n\n".join(filter(None, map(_markdown, sections)))
     write_text(folder / "report.md", text)
-    write_csv(_rows(tables), folder / "report.csv")
-    cases = {kind: comparison.case_table() for kind, comparison in compared.items()}
-    write_csv(_rows(cases), folder / "report_cases.csv")
-    figures = draw_report(finished, compared, folder)
-    html = html_page(f"Report of {folder.resolve().name}", sections, figures)
+    write_csv(_rows(parts, EnvPart.tables), folder / "report.csv")
+    write_csv(_rows(parts, _cases), folder / "report_cases.csv")
+    html = html_page(f"Report of {folder.resolve().name}", sections)
     write_text(folder / "report.html", html)
     print(f"{text}\nreport: see {folder}")
+
+
+def _parts(
+    finished: Sequence[Run], kinds: Sequence[str], given: str | None
+) -> tuple[list[EnvPart], list[dict[str, str]]]:
+    """Return a part for each env and test, and what differs between those of one env.
+
+    Args:
+        kinds: of actions.
+        given: what policies are to be compared with; None for the default.
+    """
+    from coil_rl.report.comparison import compare
+    from coil_rl.report.configurations import by_test, distinguish
+
+    of_envs, differ = by_test(finished)
+    named = {env: distinguish(runs) for env, runs in of_envs.items()}
+    compared = {
+        env: {kind: compare(runs, kind) for kind in kinds} for env, (runs, _) in named.items()
+    }
+    against = _against(given, [each for of in compared.values() for each in of.values()])
+    parts = [
+        EnvPart(env if len(named) > 1 else "", runs, differing, compared[env], against)
+        for env, (runs, differing) in named.items()
+    ]
+    return parts, differ
 
 
 def _markdown(section: Section) -> str:
@@ -98,20 +175,31 @@ def _markdown(section: Section) -> str:
     return "\n\n".join([*heading, *map(str, section.blocks)])
 
 
-def _rows(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the rows of the tables for each kind of actions as one table."""
+def _cases(part: EnvPart) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of each policy and case, by kind of actions."""
+    return {kind: comparison.case_table() for kind, comparison in part.compared.items()}
+
+
+def _rows(
+    parts: Sequence[EnvPart], tables: Callable[[EnvPart], dict[str, list[dict[str, Any]]]]
+) -> list[dict[str, Any]]:
+    """Return the rows of the tables of all envs and kinds of actions as one table."""
     rows = []
-    for actions, table in tables.items():
-        rows += [{"actions": actions, **row} for row in table]
+    for part in parts:
+        for kind, table in tables(part).items():
+            rows += [{"env": part.env, "actions": kind, **row} for row in table]
     return rows
 
 
-def _against(given: str | None, compared: Mapping[str, Comparison]) -> str | None:
-    """Return the label for the column `better than`; None for no such column."""
-    labels = sorted({group.name for comparison in compared.values() for group in comparison.agents})
+def _against(given: str | None, compared: Sequence[Comparison]) -> str | None:
+    """Return what the policies are compared with; None for nothing."""
+    agents = [group for comparison in compared for group in comparison.agents]
+    labels = sorted({group.name for group in agents})
+    if given is None and any(group.guide for group in agents):
+        return GUIDE
     if given is None:
         return DEFAULT_AGAINST if DEFAULT_AGAINST in labels else None
-    choices = [*labels, "guide"]
+    choices = [*labels, GUIDE]
     if given not in choices:
         raise UserError(
             f"against={given} is no label of a finished run; "

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from coil_rl.report.comparison import Group as Group
     from coil_rl.report.comparison import compare as compare
     from coil_rl.report.comparison import paired as paired
-    from coil_rl.report.configurations import distinguish as distinguish
+    from coil_rl.report.configurations import differing as differing
     from coil_rl.report.curves import draw_curve_grid as draw_curve_grid
     from coil_rl.report.curves import draw_learning_curves as draw_learning_curves
     from coil_rl.report.curves import draw_phases as draw_phases
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from coil_rl.report.runs import TERM as TERM
     from coil_rl.report.runs import Run as Run
     from coil_rl.report.runs import read_runs as read_runs
+    from coil_rl.report.sentences import listed as listed
     from coil_rl.report.statistics import SIGN_FLIP_SEEDS as SIGN_FLIP_SEEDS
     from coil_rl.report.statistics import Estimate as Estimate
     from coil_rl.report.statistics import count_of_seeds as count_of_seeds

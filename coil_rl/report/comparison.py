@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,6 @@ from coil_rl.report.table import return_format
 if TYPE_CHECKING:
     import pandas as pd
 
-NEXT_TO_NOTHING = 0.01  # for a guide in a case, of its mean over the others
 EPISODES = "_episodes"  # suffix of the columns of `with_denominators`
 
 
@@ -45,7 +44,6 @@ class Group:
         measures: definitions of the measures in the table by name.
         label: of the runs of an agent; empty for a guide.
         of_runs: for a guide the number of its evaluation in the table, by label and seed of a run.
-        reference: [cases], rewards that scores are divided by; None if scores are rewards.
     """
 
     name: str
@@ -57,7 +55,6 @@ class Group:
     measures: Mapping[str, Measure] = field(default_factory=dict, repr=False)
     label: str = ""
     of_runs: Mapping[tuple[str, int], int] = field(default_factory=dict, repr=False)
-    reference: Array | None = None
 
     @property
     def title(self) -> str:
@@ -76,22 +73,20 @@ class Group:
         return None if self.is_guide and count == 1 else count
 
     @property
-    def scores(self) -> Array:
-        """Rewards divided by those of the reference in the same case, [seeds, cases]."""
-        return self.by_seed("score").to_numpy()
+    def returns(self) -> Array:
+        """Rewards, [seeds, cases]."""
+        return self.by_seed("reward").to_numpy()
 
     def by_seed(self, measure: str) -> pd.DataFrame:
         """Return a measure with seeds as rows and cases as columns.
 
         Args:
-            measure: name of the measure, "reward", or "score".
+            measure: name of the measure, or "reward".
         """
         import pandas as pd
 
-        index, score = self.table.index.unique("seed"), measure == "score"
-        values = self.table["reward" if score else measure].to_numpy().reshape(len(index), -1)
-        if score and self.reference is not None:
-            values = values / self.reference
+        index = self.table.index.unique("seed")
+        values = self.table[measure].to_numpy().reshape(len(index), -1)
         return pd.DataFrame(values, index, self.cases)
 
     def beside(self, other: Group) -> tuple[list[int], list[int]]:
@@ -114,14 +109,14 @@ class Group:
         return common, [theirs[seed] for seed in common]
 
     @cached_property
-    def score(self) -> Estimate:
-        """Mean score."""
-        return estimate(self.scores.mean(axis=1))
+    def reward(self) -> Estimate:
+        """Mean reward, with its interval over the seeds."""
+        return estimate(self.returns.mean(axis=1))
 
     @cached_property
-    def score_of_cases(self) -> Estimate:
-        """Mean score, with the interval over the cases: of the means over seeds in each case."""
-        return estimate(self.scores.mean(axis=0))
+    def reward_of_cases(self) -> Estimate:
+        """Mean reward, with the interval over the cases: of the means over seeds in each case."""
+        return estimate(self.returns.mean(axis=0))
 
     def counts(self, case: int | None = None) -> dict[str, int]:
         """Return the number of `episodes`, and by measure in how many of them it is known.
@@ -141,12 +136,12 @@ class Group:
 
     @property
     def rank(self) -> tuple[bool, float, float]:
-        """Sort key: the completed share, then the mean score, the best first.
+        """Sort key: the completed share, then the mean reward, the best first.
 
-        A policy without a score, because a return is no number, is the last one.
+        A policy without such a mean, because a return is no number, is the last one.
         """
         completed = self.table["completed"].mean() if "completed" in self.table else 0.0
-        mean = self.score.mean
+        mean = self.reward.mean
         return math.isnan(mean), -float(np.nan_to_num(completed)), -float(np.nan_to_num(mean))
 
     @property
@@ -220,12 +215,10 @@ class Comparison:
     Attributes:
         guides: the guides, best first.
         agents: the agents, best first, each followed by its variants with altered advice.
-        plain_because: why scores are rewards, not fractions of a guide's; empty if they are.
     """
 
     guides: tuple[Group, ...]
     agents: tuple[Group, ...]
-    plain_because: str = ""
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -233,21 +226,14 @@ class Comparison:
         return (*self.guides, *self.agents)
 
     @property
-    def normalised(self) -> bool:
-        """Whether scores are fractions of a guide's reward; otherwise they are rewards."""
-        return any(group.reference is not None for group in self.groups)
-
-    @property
-    def score(self) -> tuple[str, str]:
-        """Name and number format of the scores."""
-        if self.normalised:
-            return "reward / guide's", ".3f"
-        return "reward", return_format(group.score.mean for group in self.groups)
+    def spec(self) -> str:
+        """Number format of the rewards."""
+        return return_format(group.reward.mean for group in self.groups)
 
     def table(self, against: str | None = None) -> list[dict[str, Any]]:
         """Return one row per policy, guides first.
 
-        `difference` is the score of an agent minus that of another policy with the same seed, the
+        `difference` is the reward of an agent minus that of another policy with the same seed, the
         mean over the `difference_seeds` that both have; `p` is corrected for all rows.
 
         Args:
@@ -267,11 +253,11 @@ class Comparison:
                     "cases": len(group.cases),
                     "completed": means.pop("completed", None),
                     "crashes": group.crashes,
-                    "score": group.score.mean,
-                    "low": group.score.low,
-                    "high": group.score.high,
-                    "low_of_cases": group.score_of_cases.low,
-                    "high_of_cases": group.score_of_cases.high,
+                    "reward": means.pop("reward"),
+                    "low": group.reward.low,
+                    "high": group.reward.high,
+                    "low_of_cases": group.reward_of_cases.low,
+                    "high_of_cases": group.reward_of_cases.high,
                     **means,
                     **self._partial(group),
                     "difference": difference.mean,
@@ -361,20 +347,18 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     measures = _definitions(finished)
     guides = _group_guides(labels, measures)
     unique = dict.fromkeys(chain.from_iterable(guides.values()))
-    references, plain_because = _references(list(unique), finished)
-    normalised = {group: replace(group, reference=references.get(group.cases)) for group in unique}
     needs_guide = {run.label: run.needs_guide for run in reversed(finished)}
     agents: list[Group] = []
     for label, frame in labels.items():
         rows = frame[~is_guide(frame) & (frame["actions"] == actions)]
-        best_guide = normalised[guides[label][0]] if label in guides else None
-        variants = _variants(label, rows, references, measures, best_guide, needs_guide[label])
+        best_guide = guides[label][0] if label in guides else None
+        variants = _variants(label, rows, measures, best_guide, needs_guide[label])
         agents += sorted(variants, key=lambda group: (group.advice != "", group.rank))
     # The first group of a name is the one with unaltered advice.
     best = {group.name: group.rank for group in reversed(agents)}
     agents.sort(key=lambda group: (best[group.name], group.name))
-    ranked = tuple(sorted(normalised.values(), key=lambda group: group.rank))
-    return Comparison(ranked, tuple(agents), plain_because)
+    ranked = tuple(sorted(unique, key=lambda group: group.rank))
+    return Comparison(ranked, tuple(agents))
 
 
 def _definitions(runs: Sequence[Run]) -> dict[str, Measure]:
@@ -388,7 +372,6 @@ def _definitions(runs: Sequence[Run]) -> dict[str, Measure]:
 def _variants(
     label: str,
     rows: pd.DataFrame,
-    references: Mapping[tuple[str, ...], Array],
     measures: Mapping[str, Measure],
     guide: Group | None,
     needs_guide: bool | None,
@@ -396,7 +379,6 @@ def _variants(
     """Return the agent of a label, with each alteration of its advice, and with a fallback.
 
     Args:
-        references: the rewards that scores are divided by, by cases.
         measures: definitions by name.
         needs_guide: whether it needs the guide during evaluation.
     """
@@ -411,70 +393,8 @@ def _variants(
             measures=measures,
             label=label,
         )
-        variants.append(replace(variant, reference=references.get(variant.cases)))
+        variants.append(variant)
     return variants
-
-
-def _references(
-    guides: Sequence[Group], runs: Sequence[Run]
-) -> tuple[dict[tuple[str, ...], Array], str]:
-    """Return by cases the rewards of the best guide in each case that has such, see `_reference`.
-
-    There are none if a run was evaluated in cases for which no guide has them: scores of all runs
-    are to be alike. The text says why, and is empty otherwise.
-    """
-    references: dict[tuple[str, ...], Array] = {}
-    reasons: dict[tuple[str, ...], str] = {}
-    for guide in sorted(guides, key=lambda group: group.rank):
-        reference = _reference(guide)
-        if isinstance(reference, str):
-            reasons.setdefault(guide.cases, reference)
-        else:
-            references.setdefault(guide.cases, reference)
-    for run in runs:
-        cases = tuple(run.evaluation["case"].unique())
-        if cases not in references:
-            no_guide = f"no guide was evaluated in the cases of {run.label}"
-            return {}, reasons.get(cases, no_guide)
-    return references, ""
-
-
-def _reference(guide: Group) -> Array | str:
-    """Return the rewards of a guide in each case that others are divided by, or why not.
-
-    In a case where it crashes or earns nothing, or next to nothing, its mean over the other cases
-    is taken: a ratio to such a reward would be all of a mean. There is none for a guide that earns
-    nothing in any case, or loses too much in one for a ratio.
-    """
-    rewards = guide.by_seed("reward").mean()
-    earned, crashed = rewards[rewards > 0], rewards.iloc[:0]
-    if guide.has("crashed"):
-        crashed = rewards[(guide.by_seed("crashed") > 0).any()]
-        earned = earned.drop(crashed.index, errors="ignore")
-    if len(earned) > 1:
-        others = (earned.sum() - earned) / (len(earned) - 1)
-        earned = earned[earned >= NEXT_TO_NOTHING * others]
-    if not len(earned):
-        return f"the {guide.name} earns nothing in any case"
-    if _loses(rewards, crashed, earned.mean()):
-        lost = f"{rewards.min():{return_format([rewards.min()])}} in {rewards.idxmin()}"
-        return f"the {guide.name} loses too much for a ratio, {lost}"
-    filled: Array = rewards.where(rewards.index.isin(earned.index), earned.mean()).to_numpy()
-    return filled
-
-
-def _loses(rewards: pd.Series, crashed: pd.Series, earned: float) -> bool:
-    """Return whether a guide loses so much in a case that its rewards have no zero to divide by.
-
-    That is more than next to nothing of what it earns, and in a crash, which may be punished, more
-    than all of it.
-
-    Args:
-        crashed: those of the cases in which it crashes.
-        earned: its mean over the cases in which it earns something.
-    """
-    driven = rewards.drop(crashed.index)
-    return bool((driven < -NEXT_TO_NOTHING * earned).any() or (crashed < -earned).any())
 
 
 def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:
@@ -542,18 +462,18 @@ class Paired:
     better: float
 
 
-def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
+def paired(group: Group, other: Group, measure: str = "reward") -> Paired | None:
     """Compare two policies seed by seed.
 
     A case counts for a seed if both have a number there, as lap times where both completed one. Of
-    rewards and scores every one has to be a number: a policy that diverged in a case is not judged
-    by the others.
+    rewards every one has to be a number: a policy that diverged in a case is not judged by the
+    others.
 
     Args:
         group: the first policy.
         other: the second policy; a guide with a single evaluation has one value for all seeds, and
             one with several that of the same run.
-        measure: name of the measure to compare, "reward", or "score".
+        measure: name of the measure to compare, or "reward".
 
     Returns:
         None without common cases and seeds, if a seed has no such case, or a reward is no number.
@@ -568,7 +488,7 @@ def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
     counts = np.isfinite(x) & np.isfinite(y)
     if not x.size or not counts.any(axis=1).all():
         return None
-    if measure in ("reward", "score") and not counts.all():
+    if measure == "reward" and not counts.all():
         return None
     differences = np.where(counts, x - y, 0).sum(axis=1) / counts.sum(axis=1)
     return Paired(estimate(differences), float(wins(x, y)[counts].mean()))

@@ -1,9 +1,14 @@
-"""Configurations of runs with one label: what differs between them besides the seed."""
+"""Configurations of runs: which share their test, which are one method, and what differs.
+
+Cases belong to the env in which they are, so that only runs with one test are compared. Runs of one
+label whose configurations differ get names with numbers, and what differs is said in a table.
+"""
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,7 +35,7 @@ IRRELEVANT = (
     "evaluation.gif",
     "evaluation.pictures",
 )
-# Keys, or parents of keys, of the test that a run ends with.
+# Keys, or parents of keys, of the test that a run ends with: others make other cases.
 TEST = (
     "env",
     "track",
@@ -40,81 +45,172 @@ TEST = (
     "evaluation.disturb",
     "evaluation.first_seed",
 )
-# Those that runs have to share to be compared: task, test, what is observed, and frames.
-CONDITIONS = (*TEST, "evaluation.repeats", "observes", "budget.frames")
-BATCH = ("num_envs", "workers", "device")  # last parts of keys of an env that are no condition
+# Those that runs have to share to be compared: episodes of a case, what is observed, and frames.
+CONDITIONS = ("evaluation.repeats", "observes", "budget.frames")
+BATCH = ("num_envs", "workers", "device")  # last parts of keys of an env that change no case
 # Keys, or parents of keys, whose random numbers the drives of a guide depend on.
+ADVICE = ("guide", "degrade")
 OF_GUIDES = ("guide", "degrade", "disturb", "env", "evaluation")
 CASE_SEEDS = ("evaluation.env.first_seed", "evaluation.env.seed")  # instead of that of the env
 LEARNED_GUIDES = "guides"  # in method.learner, of a method whose guides learn
-LONGEST_VALUE = 40  # characters of a value in a label
-MOST_KEYS = 3  # in a label
+LONGEST_NAME = 30  # characters
+LONGEST_VALUE = 40  # characters
+MOST_KEYS = 3  # that nobody typed
 
 
-def distinguish(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
-    """Give runs of one label different labels where their configurations differ.
+Differing = list[dict[str, str]]  # rows of a table: the new name, and what differs
+# By name: the keys that differ in its runs, and the indices of the runs of each configuration.
+Configurations = dict[str, tuple[list[str], list[list[int]]]]
+
+
+def distinguish(runs: Sequence[Run]) -> tuple[list[Run], Differing]:
+    """Give runs short labels, with numbers where those of one label have different configurations.
 
     Returns:
-        The runs in their order, and a sentence for each label that was divided.
+        The runs in their order, and a row for each label that is new.
     """
-    distinguished, sentences = list(runs), []
+    configurations: Configurations = {}
     for label in dict.fromkeys(run.label for run in runs):
         of_label = [index for index, run in enumerate(runs) if run.label == label]
         keys = differing([runs[index] for index in of_label])
-        if not keys:
-            continue
-        configurations = {index: relevant(runs[index]) for index in of_label}
-        keys = _telling_first(keys, list(configurations.values()))
-        sentences += REPORT.said("divided", label=label, keys=keys)
-        values = [[configurations[index].get(key) for key in keys] for index in of_label]
-        for index, shown in zip(of_label, _shown(keys, values), strict=True):
-            distinguished[index] = _relabelled(runs[index], f"{label} ({shown})")
-    return distinguished, sentences
+        configurations[label] = keys, _alike(runs, of_label, keys)
+    named, rows = _named(runs, configurations)
+    distinguished = list(runs)
+    for label, indices in named.items():
+        for index in indices:
+            distinguished[index] = _relabelled(runs[index], label)
+    return distinguished, rows
 
 
-def _shown(keys: Sequence[str], configurations: Sequence[list[Any]]) -> list[str]:
-    """Return a text for each configuration; different ones have different texts.
+def by_test(runs: Sequence[Run]) -> tuple[dict[str, list[Run]], Differing]:
+    """Return the runs that share an env and the cases of its test, by the name of the env.
+
+    Returns:
+        The runs by a name, with a number where one env has several tests, and a row for each of
+        these names.
+    """
+    envs: dict[str, list[int]] = {}
+    for index, run in enumerate(runs):
+        envs.setdefault(env_name(run), []).append(index)
+    tests: Configurations = {}
+    for env, of_env in envs.items():
+        keys = [key for key in differing([runs[index] for index in of_env]) if _is_of_test(key)]
+        tests[env] = keys, _alike(runs, of_env, keys)
+    named, rows = _named(runs, tests)
+    return {name: [runs[index] for index in indices] for name, indices in named.items()}, rows
+
+
+def env_name(run: Run) -> str:
+    """Return the name of the env of a run; empty for one that was made from parts."""
+    node = run.settings.get("env") or {}
+    return str(node.get("id") or str(node.get("_target_", "")).rpartition(".")[2])
+
+
+def _is_of_test(key: str) -> bool:
+    """Return whether the cases of a test depend on a key."""
+    return is_part(key, TEST) and key.rpartition(".")[2] not in BATCH
+
+
+def _alike(runs: Sequence[Run], indices: Sequence[int], keys: Sequence[str]) -> list[list[int]]:
+    """Return the indices of runs in groups that have the same values of some keys."""
+    groups: dict[str, list[int]] = {}
+    for index in indices:
+        values = relevant(runs[index])
+        groups.setdefault(repr([values.get(key) for key in keys]), []).append(index)
+    return list(groups.values())
+
+
+def _named(runs: Sequence[Run], found: Configurations) -> tuple[dict[str, list[int]], Differing]:
+    """Return indices of runs by short names, and a row for each name that is new."""
+    named: dict[str, list[int]] = {}
+    rows: Differing = []
+    unchanged = {
+        name for name, (_, of) in found.items() if len(of) == 1 and len(name) <= LONGEST_NAME
+    }
+    for name, (keys, of_name) in found.items():
+        told = _what_differs([[runs[index] for index in each] for each in of_name], keys)
+        for indices, differs in zip(of_name, told, strict=True):
+            new = (
+                name if name in unchanged else _free_name(name, {*unchanged, *named}, len(of_name))
+            )
+            named[new] = indices
+            if new != name:
+                cut = "" if len(name) <= LONGEST_NAME else f"of {name}"
+                rows.append({"name": new, "differs": ", ".join(filter(None, (cut, differs)))})
+    return named, rows
+
+
+def _free_name(name: str, taken: Collection[str], several: int) -> str:
+    """Return a short name that is not taken, with a number if there are several of it."""
+    if len(name) <= LONGEST_NAME and several == 1 and name not in taken:
+        return name
+    short = name if len(name) <= LONGEST_NAME - 4 else f"{name[: LONGEST_NAME - 5]}…"
+    if several == 1 and short not in taken:
+        return short
+    numbers = (f"{short} {number}" for number in itertools.count(1))
+    return next(each for each in numbers if each not in taken)
+
+
+def _what_differs(groups: Sequence[Sequence[Run]], keys: Sequence[str]) -> list[str]:
+    """Return what was typed for all runs of each of some groups, and not for all groups, as a text.
+
+    Where that does not tell them apart, it is values of their configurations.
 
     Args:
-        configurations: the values of these keys for each run.
+        keys: that tell the groups apart.
     """
-    different: list[list[Any]] = []
-    for values in configurations:
-        if values not in different:
-            different.append(values)
-    texts = []
-    for values in different:
-        pairs = list(zip(keys, values, strict=True))[:MOST_KEYS]
-        texts.append(", ".join(f"{key}={_text(value)}" for key, value in pairs))
-    more = ", ..." if len(keys) > MOST_KEYS else ""
-    if more or len(set(texts)) < len(different):  # the shown values may be alike
-        texts = [f"{number}: {text}{more}" for number, text in enumerate(texts, start=1)]
-    return [texts[different.index(values)] for values in configurations]
+    if len(groups) == 1:
+        return [""]
+    common = [_common([_typed(run) for run in runs]) for runs in groups]
+    typed = list(dict.fromkeys(itertools.chain.from_iterable(common)))
+    typed = [key for key in typed if len({words.get(key) for words in common}) > 1]
+    values = [_common([relevant(run) for run in runs]) for runs in groups]
+    telling = _telling_first(keys, values)
+    texts = [
+        [words.get(key) or f"{key}={_text(of[key])}" for key in typed if key in words or key in of]
+        for words, of in zip(common, values, strict=True)
+    ]
+    if len(set(map(repr, texts))) < len(texts):
+        more = ["..."] if len(telling) > MOST_KEYS else []
+        texts = [
+            [*(f"{key}={_text(of.get(key))}" for key in telling[:MOST_KEYS]), *more]
+            for of in values
+        ]
+    return [", ".join(each) for each in texts]
 
 
-def of_several_envs(runs: Sequence[Run]) -> list[str]:
-    """Return a warning if runs are in different envs, whose rewards cannot be compared."""
-    nodes = [run.settings.get("env") or {} for run in runs]
-    names = dict.fromkeys(str(node.get("id") or node.get("_target_")) for node in nodes)
-    return REPORT.said("several_envs", names=list(map(_text, names)))
+def _common(nodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the values that several mappings have in common."""
+    first, *others = nodes
+    return {
+        key: value
+        for key, value in first.items()
+        if all(key in other and other[key] == value for other in others)
+    }
+
+
+def _typed(run: Run) -> dict[str, str]:
+    """Return the words of the command of a run on which its numbers depend, by their key."""
+    words = {word.partition("=")[0].lstrip("+~"): word for word in run.command[1:]}
+    return {
+        key: word
+        for key, word in words.items()
+        if not is_part(key, IRRELEVANT) and not key.startswith("hydra.")
+    }
 
 
 def of_several_conditions(runs: Sequence[Run]) -> list[str]:
-    """Return a warning if runs in one env have another task, other cases or other frames.
+    """Return a warning if runs with one test observe something else, or have other frames.
 
     What experiments compare, such as the method or the guide, is no such condition.
+
+    Args:
+        runs: of one group of `by_test`.
     """
-    if of_several_envs(runs):
-        return []
-    differ = [key for key in differing(runs) if _is_condition(key)]
+    differ = [key for key in differing(runs) if is_part(key, CONDITIONS)]
     # An empty group beside its keys says nothing.
     keys = [key for key in differ if not any(each.startswith(f"{key}.") for each in differ)]
     return REPORT.said("conditions", keys=keys)
-
-
-def _is_condition(key: str) -> bool:
-    """Return whether runs are compared only if they have the same value of a key."""
-    return is_part(key, CONDITIONS) and key.rpartition(".")[2] not in BATCH
 
 
 def of_several_definitions(runs: Sequence[Run]) -> list[str]:
@@ -199,12 +295,8 @@ def guide_follows_seed(runs: Sequence[Run]) -> bool:
 
 def of_guide(run: Run) -> dict[str, Any]:
     """Return the values on which the returns of the guides of a run depend, by their full keys."""
-    parts = ("guide", "degrade", *TEST)
-    return {
-        key: value
-        for key, value in relevant(run).items()
-        if is_part(key, parts) and key.rpartition(".")[2] not in BATCH
-    }
+    values = relevant(run)
+    return {key: values[key] for key in values if is_part(key, ADVICE) or _is_of_test(key)}
 
 
 def relevant(run: Run) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The figures of `coil-report`: as PNG files, and for its HTML page."""
+"""The figures of `coil-report` for one env: as PNG files, and for its HTML page."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -9,6 +9,7 @@ from typing import Any
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import read_file
 from coil_rl.report import style
+from coil_rl.report.beside import BESIDE, beside_guides, draw_beside_guides
 from coil_rl.report.comparison import Comparison
 from coil_rl.report.curves import draw_curve_grid, draw_learning_curves
 from coil_rl.report.guide_use import draw_guide_use, guide_use
@@ -26,53 +27,45 @@ Draw = Callable[[style.Target], None]
 
 
 def draw_report(
-    runs: Sequence[Run], compared: Mapping[str, Comparison], folder: Path
+    runs: Sequence[Run],
+    compared: Mapping[str, Comparison],
+    folder: Path,
+    strokes: Mapping[str, style.Stroke],
+    suffix: str = "",
 ) -> list[Figure]:
-    """Draw all figures into a folder, and return them for the HTML page.
-
-    A label has one colour in all of them.
+    """Draw all figures of the runs in one env into a folder, and return them for the HTML page.
 
     Args:
         compared: the policies, by kind of actions.
         folder: where the files are written.
+        strokes: by label.
+        suffix: of the names of the files.
     """
-    shown = [comparison.agents or comparison.guides for comparison in compared.values()]
-    strokes = style.strong_strokes(
-        dict.fromkeys(group.name for groups in shown for group in groups)
-    )
-    figures = [_draw_scores(compared, strokes, folder / "report.png")]
-    curves = [run for run in runs if run.curve and run.label in strokes]
-    if curves:
-        draw = _learning_curves(curves, strokes)
-        path = folder / "report_curves.png"
-        figures.append(_draw(draw, path, "Training", "Deterministic policies kept on the way."))
-    use = guide_use(curves)
-    if use:
-        path, draw = folder / "report_guides.png", partial(draw_guide_use, use, strokes=strokes)
-        figures.append(_draw(draw, path, "Use of the guide", "A line for each run."))
-    return [*figures, *films(runs)]
 
+    def drawn(name: str, title: str, caption: str, draw: Draw) -> Figure:
+        draw(folder / f"{name}{suffix}.png")
+        return Figure(title, svg(draw), caption)
 
-def _draw(draw: Draw, path: Path, title: str, caption: str) -> Figure:
-    """Draw a figure into its file and for the page."""
-    draw(path)
-    return Figure(title, svg(draw), caption)
-
-
-def _draw_scores(
-    compared: Mapping[str, Comparison],
-    strokes: Mapping[str, style.Stroke],
-    path: Path,
-) -> Figure:
-    """Draw the scores of the agents, or of the guides if there is no agent."""
     panels = {}
     for kind, comparison in compared.items():
         groups = comparison.agents or comparison.guides
         panels[f"{kind} actions"] = driver_intervals(groups, strokes)
-    normalised = any(comparison.normalised for comparison in compared.values())
-    measure = "reward / guide's (mean)" if normalised else "reward (mean)"
-    draw = partial(draw_intervals, panels, measure=measure)
-    return _draw(draw, path, "Evaluation", f"{measure}, in the cases of the evaluation.")
+    draw: Draw = partial(draw_intervals, panels, measure="return")
+    figures = [drawn("report", "Evaluation", "Mean return in the cases of the evaluation.", draw)]
+    beside = beside_guides(next(iter(compared.values())).agents)
+    if beside:
+        draw = partial(draw_beside_guides, beside, strokes=strokes)
+        figures.append(drawn("report_cases", "Case by case", BESIDE, draw))
+    curves = [run for run in runs if run.curve and run.label in strokes]
+    if curves:
+        draw = _learning_curves(curves, strokes)
+        caption = "Deterministic policies kept on the way."
+        figures.append(drawn("report_curves", "Training", caption, draw))
+    use = guide_use(curves)
+    if use:
+        draw = partial(draw_guide_use, use, strokes=strokes)
+        figures.append(drawn("report_guides", "Use of the guide", "A line for each run.", draw))
+    return [*figures, *films(runs)]
 
 
 def _learning_curves(runs: Sequence[Run], strokes: Mapping[str, style.Stroke]) -> Draw:

@@ -40,19 +40,6 @@ for (const button of document.querySelectorAll("th button")) {
 
 
 @dataclass(frozen=True)
-class Section:
-    """A part of a report.
-
-    Args:
-        heading: of the part; empty for none.
-        blocks: tables and paragraphs.
-    """
-
-    heading: str
-    blocks: Sequence[Table | str]
-
-
-@dataclass(frozen=True)
 class Figure:
     """A picture of a report.
 
@@ -72,19 +59,29 @@ class Figure:
         return isinstance(self.image, Markup)
 
 
-def html_page(title: str, sections: Sequence[Section], figures: Sequence[Figure]) -> str:
-    """Return a report as HTML.
+@dataclass(frozen=True)
+class Section:
+    """A part of a report.
 
     Args:
-        figures: its pictures, below the first section.
+        heading: of the part; empty for none.
+        blocks: tables and paragraphs.
+        figures: pictures below them.
     """
+
+    heading: str
+    blocks: Sequence[Table | str]
+    figures: Sequence[Figure] = ()
+
+
+def html_page(title: str, sections: Sequence[Section]) -> str:
+    """Return a report as HTML."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     text = (resources.files("coil_rl.report") / "page.html").read_text("utf-8")
     digest = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
     return environment.from_string(text).render(
         title=title,
         sections=sections,
-        figures=figures,
         tables=lambda block: isinstance(block, Table),
         script=Markup(SCRIPT),
         digest=digest,

@@ -1,4 +1,4 @@
-"""Interval plot: the score of each policy with its confidence interval, one row per policy."""
+"""Interval plot: the return of each policy with its confidence interval, one row per policy."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from coil_rl.report.comparison import Group
 
 COLOUR = style.AGENTS[0]
+LEAST_SEEDS = 4  # of an interval in a picture
+LONGEST_NAME = 50  # characters of the name of a row
 BAR: dict[str, Any] = {"alpha": 0.38, "lw": 8, "solid_capstyle": "butt"}
 SEED: dict[str, Any] = {
     "ls": "",
@@ -71,7 +73,9 @@ class Interval:
 def driver_intervals(
     groups: Iterable[Group], strokes: Mapping[str, style.Stroke] | None = None
 ) -> list[Interval]:
-    """Return a row for the score of each policy, with its single seeds and its guide.
+    """Return a row for the return of each policy, with its single seeds and its guide.
+
+    An interval of fewer than `LEAST_SEEDS` seeds is so wide that it says nothing: these are dots.
 
     Args:
         groups: the policies, in the order of the rows.
@@ -81,13 +85,14 @@ def driver_intervals(
     groups, rows = list(groups), []
     strokes = strokes or style.strong_strokes(dict.fromkeys(group.name for group in groups))
     for group in groups:
+        few = len(group.returns) < LEAST_SEEDS
         row = Interval(
             group.title,
-            group.score.mean,
-            group.score.low,
-            group.score.high,
-            points=group.scores.mean(axis=1).tolist() if len(group.scores) > 1 else [],
-            guide=group.guide.score.mean if group.guide else None,
+            group.reward.mean,
+            math.nan if few else group.reward.low,
+            math.nan if few else group.reward.high,
+            points=group.returns.mean(axis=1).tolist() if len(group.returns) > 1 else [],
+            guide=group.guide.reward.mean if group.guide else None,
             hollow=bool(group.advice),
             colour=strokes[group.name].colour,
         )
@@ -111,6 +116,9 @@ def draw_intervals(
     """
     rows = list(itertools.chain.from_iterable(panels.values()))
     labels = list(dict.fromkeys(row.label for row in rows))
+    names = [
+        each if len(each) <= LONGEST_NAME else f"{each[: LONGEST_NAME - 1]}…" for each in labels
+    ]
     colours = {row.colour for row in rows}
     dot, hollow, bar = _marks(colours.pop() if len(colours) == 1 else style.INK)
     legend = {
@@ -132,7 +140,7 @@ def draw_intervals(
                 axes.set_title(heading, size=9, loc="left")
             draw_panel(axes, {labels.index(row.label): row for row in panel})
         axes_row[0].set(
-            yticks=range(len(labels)), yticklabels=labels, ylim=(len(labels) - 0.5, -0.5)
+            yticks=range(len(labels)), yticklabels=names, ylim=(len(labels) - 0.5, -0.5)
         )
 
 

@@ -38,7 +38,7 @@ def section(
         against: what the policies are compared with, see `Comparison.table`.
     """
     columns = _columns(comparison, rows, against)
-    shown = with_cells(rows, comparison.score[1])
+    shown = with_cells(rows, comparison.spec)
     columns = fitted(shown, columns)
     shown = with_shares(shown, [group.counts() for group in comparison.groups], columns)
     parts = _parts(comparison, TERM, "term of the reward", AUTO_FORMAT)
@@ -51,11 +51,11 @@ def _columns(
     comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None
 ) -> dict[str, tuple[str, str]]:
     """Return heading and format of the columns of the table of policies."""
-    hidden = _hidden(comparison, rows, against)
+    hidden = _hidden(rows, against)
     columns: dict[str, tuple[str, str]] = {}
     for key, (text, spec) in TABLES["drivers"]["columns"].items():
         if key not in hidden:
-            columns[key] = (text.format(other=_other(against), score=comparison.score[0]), spec)
+            columns[key] = (text.format(other=_other(against)), spec)
     for group in comparison.groups:
         for name, measure in group.measures.items():
             has_column = name in ("completed", "crashed") or name.startswith(PER_STEP)
@@ -65,17 +65,13 @@ def _columns(
     return columns
 
 
-def _hidden(
-    comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None
-) -> set[str]:
+def _hidden(rows: Sequence[Mapping[str, Any]], against: str | None) -> set[str]:
     """Return the keys of columns that would say nothing."""
     hidden = set()
     if not any(row["advice"] for row in rows):
         hidden.add("advice")
     if against is None:
         hidden |= {"difference cell", "p", "better"}
-    if not comparison.normalised:
-        hidden.add("reward")  # it is the score
     for key in ("completed", "crashes"):
         if all(row[key] is None for row in rows):
             hidden.add(key)
@@ -83,15 +79,15 @@ def _hidden(
 
 
 def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, Any]]:
-    """Return rows of `Comparison.table` with `score cell`, `cases cell` and `difference cell`.
+    """Return rows of `Comparison.table` with `reward cell`, `cases cell` and `difference cell`.
 
     These cells show the intervals too.
     """
     shown = []
     for row in rows:
-        score = Estimate(row["score"], row["low"], row["high"])
+        reward = Estimate(row["reward"], row["low"], row["high"])
         difference = Estimate(row["difference"], row["difference_low"], row["difference_high"])
-        cells = {"score cell": score.cell(spec), "difference cell": difference.cell(f"+{spec}")}
+        cells = {"reward cell": reward.cell(spec), "difference cell": difference.cell(f"+{spec}")}
         if cells["difference cell"]:
             cells["difference cell"] += some_of(row["difference_seeds"], row["seeds"])
         low, high = row["low_of_cases"], row["high_of_cases"]
@@ -166,21 +162,52 @@ def some_of(reached: int, seeds: int) -> str:
     return f" ({reached} of {seeds} seeds)" if reached < seeds else ""
 
 
-def notes(against: str | None, compared: Mapping[str, Comparison]) -> list[str]:
+def notes(against: str | None, *, sampled: bool) -> list[str]:
     """Return an explanation of the tables.
 
     Args:
         against: what the policies are compared with, see `Comparison.table`.
-        compared: the policies, by kind of actions, such as "sampled".
+        sampled: whether there are tables of sampled actions.
     """
-    return REPORT.said(
-        "notes",
-        other=_other(against),
-        normalised=any(comparison.normalised for comparison in compared.values()),
-        because="".join(dict.fromkeys(each.plain_because for each in compared.values())),
-        sampled="sampled" in compared,
-        seeds=SIGN_FLIP_SEEDS,
-    )
+    return REPORT.said("notes", other=_other(against), sampled=sampled, seeds=SIGN_FLIP_SEEDS)
+
+
+def what_differs(rows: Sequence[Mapping[str, str]], heading: str) -> list[Table]:
+    """Return the table of what differs between runs that got names with numbers.
+
+    Args:
+        rows: see `configurations.distinguish`.
+        heading: of the column with the names.
+    """
+    return [Table(rows, {"name": (heading, ""), "differs": ("what differs", "")})] if rows else []
+
+
+def summary(tables: Mapping[str, Sequence[Mapping[str, Any]]], against: str | None) -> list[Table]:
+    """Return in how many envs each policy is better than another one; no table for a single env.
+
+    Returns of two envs have no common unit, but signs have: those of the interval.
+
+    Args:
+        tables: `Comparison.table(against)`, by env.
+        against: what the policies are compared with, see `Comparison.table`.
+    """
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for row in chain.from_iterable(tables.values()):
+        if row["difference_seeds"] is not None and not row["advice"]:
+            found.setdefault(row["driver"], []).append(row)
+    rows: list[dict[str, Any]] = []
+    for driver, differences in found.items():
+        better = sum(row["difference_low"] > 0 for row in differences)
+        worse = sum(row["difference_high"] < 0 for row in differences)
+        even = len(differences) - better - worse
+        rows.append({"driver": driver, "better": better, "even": even, "worse": worse})
+    columns = {
+        "driver": (f"in how many envs beside {_other(against)}", ""),
+        "better": ("better", "d"),
+        "even": ("undecided", "d"),
+        "worse": ("worse", "d"),
+    }
+    return [Table(rows, columns)] if rows and len(tables) > 1 else []
 
 
 def unpaired(against: str | None, compared: Mapping[str, Comparison]) -> list[str]:

@@ -57,6 +57,7 @@ class Run:
         handed_over: which policy a test at its end chose, such as "last"; `UNTESTED` if no frames
             were left for it; empty without a test.
         settings: its configuration.
+        command: the words that made it; empty if they are not known.
     """
 
     folder: Path
@@ -70,6 +71,7 @@ class Run:
     seconds: float | None = None
     handed_over: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    command: Sequence[str] = field(default=(), repr=False)
 
     @property
     def finished(self) -> bool:
@@ -155,6 +157,7 @@ def _read_run(folder: Path) -> Run:
         guide_returns=record.GUIDE_RETURNS.read(folder) or {},
         seconds=(record.SECONDS.read(folder) or {}).get("seconds"),
         handed_over=delivery.policy if delivery is not None else "",
+        command=record.COMMAND.read(folder) or (),
     )
 
 

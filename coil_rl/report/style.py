@@ -5,6 +5,7 @@ The colours are safe for colour-blind readers.
 
 import io
 import os
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import cycle
@@ -32,7 +33,10 @@ LEFT_CONE = "#f2b701"
 RIGHT_CONE = "#1f6fd6"
 
 # After Okabe and Ito and after Tol, without the colours of the cones, the strongest first.
-AGENTS = ("#d55e00", "#009e73", "#aa3377", "#56b4e9", "#332288")
+AGENTS = (
+    *("#d55e00", "#009e73", "#aa3377", "#56b4e9", "#332288"),
+    *("#8c510a", "#6b8e23", "#cc79a7", "#b8860b", "#7b68a6"),
+)
 GUIDES = ("#4d4d4d", "#8a8a8a")
 DASHED = (0.0, (3.2, 1.6))
 SECOND_ROUND = (0.0, (6.0, 1.2))  # of a colour that is used again
@@ -79,10 +83,10 @@ OWN = {
     "imitate_then_ppo": Stroke(AGENTS[2]),
     "ppo": Stroke(AGENTS[3]),
     "kickstart": Stroke(AGENTS[4]),
-    "jump_start": Stroke(AGENTS[0], SECOND_ROUND),
-    "residual_coil": Stroke(AGENTS[1], SECOND_ROUND),
-    "tune": Stroke(AGENTS[2], SECOND_ROUND),
-    "residual": Stroke(AGENTS[3], SECOND_ROUND),
+    "residual": Stroke(AGENTS[5]),
+    "jump_start": Stroke(AGENTS[6]),
+    "residual_coil": Stroke(AGENTS[7]),
+    "tune": Stroke(AGENTS[8]),
 }
 
 
@@ -106,7 +110,7 @@ def strokes(labels: Iterable[str]) -> dict[str, Stroke]:
 def strong_strokes(labels: Iterable[str]) -> dict[str, Stroke]:
     """Return a stroke in a strong colour for each label, dashed once the colours are used again.
 
-    The methods of `OWN` have their own, and so have the variants of a method, such as "ppo (1)", of
+    The methods of `OWN` have their own, and so have the variants of a method, such as "ppo 2", of
     which further ones have other dashes. The others take what is left, in the given order.
 
     Args:
@@ -115,7 +119,7 @@ def strong_strokes(labels: Iterable[str]) -> dict[str, Stroke]:
     labels = list(labels)
     result: dict[str, Stroke] = {}
     for label in labels:
-        own = OWN.get(label.partition(" (")[0])
+        own = OWN.get(re.sub(r" \d+$", "", label))
         if own is not None:
             variants = [own, *(Stroke(own.colour, dashes) for dashes in LATER_ROUNDS)]
             free = [stroke for stroke in variants if stroke not in result.values()]

@@ -3,7 +3,6 @@
 import errno
 import os
 import platform
-import shlex
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -82,7 +81,7 @@ def begin(
         )
     record.VERSIONS.write(folder, versions())
     if command:
-        record.COMMAND.write(folder, shlex.join(command))
+        record.COMMAND.write(folder, list(command))
     write_config(folder, saved)
 
 

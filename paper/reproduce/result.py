@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from coil_rl import UserError
-from coil_rl.report import Run, distinguish
+from coil_rl.report import Run, differing, listed
 
 # Finished runs by experiment, the name of a file in `paper/conf/experiment`.
 Runs = Mapping[str, Sequence[Run]]
@@ -85,12 +85,14 @@ def check_pools(result: Result, runs: Runs) -> None:
     """
     for experiments in result.pools:
         pooled = list(chain.from_iterable(runs[each] for each in dict.fromkeys(experiments)))
-        _, differences = distinguish(pooled)
-        if differences:
-            raise UserError(
-                f"experiment={', '.join(experiments)}: {' '.join(differences)} Give them labels of "
-                "their own, label=NAME, or move the folders of the other runs away"
-            )
+        for label in dict.fromkeys(run.label for run in pooled):
+            keys = differing([run for run in pooled if run.label == label])
+            if keys:
+                raise UserError(
+                    f"experiment={', '.join(experiments)}: the runs of {label} differ in "
+                    f"{listed(keys)}; give them labels of their own, label=NAME, or move the "
+                    "folders of the other runs away"
+                )
 
 
 def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:

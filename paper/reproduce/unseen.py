@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from coil_paper.reproduce import pages
+from coil_paper.reproduce.ratio import EARNED, HEADING, earned, is_relative, relative
 from coil_paper.reproduce.result import NO_RUNS, PAGES, Runs, WorldsResult
 from coil_rl.report import (
     GUIDE,
@@ -54,21 +55,25 @@ class Table5(WorldsResult):
                 parts.append(_paper_table(rows))
                 _draw(compared, stem.with_suffix(".png"))
             for actions in ACTIONS:
-                table = self._policy_table(rows[actions], compared[actions].score[0])
+                heading = HEADING if is_relative(compared[actions]) else "reward"
+                table = self._policy_table(rows[actions], heading)
                 parts += [f"**{actions.capitalize()} actions**", table]
                 if not world:
-                    parts.append(str(cases_table(compared[actions].groups, f"{stem.name}.csv")))
+                    groups = list(map(earned, compared[actions].groups))
+                    parts.append(str(cases_table(groups, f"{stem.name}.csv")))
         write_csv(episodes, stem.with_suffix(".csv"))
         notes = PAGES["table_5"]["notes"].format(against=self.against)
         return "\n\n".join([*parts, notes, _claims(worlds)])
 
     def _compare(self, runs: Sequence[Run], actions: str) -> Comparison:
-        """Return the guide of `against`, and the agents by rank.
+        """Return the guide of `against`, and the agents by rank, see `relative`.
 
         Agents that have only deterministic actions are always included.
         """
         agents: dict[str, Group] = {}
-        compared, deterministic = compare(runs, actions), compare(runs, "deterministic")
+        compared, deterministic = (
+            relative(compare(runs, kind)) for kind in (actions, "deterministic")
+        )
         for group in (*compared.agents, *deterministic.agents):
             if not group.advice:
                 agents.setdefault(group.name, group)
@@ -81,18 +86,25 @@ class Table5(WorldsResult):
 
     def _rows(self, comparison: Comparison) -> list[dict[str, Any]]:
         """Return the measures of each policy, compared with `against` and with the guide."""
-        rows = with_cells(comparison.table(self.against), comparison.score[1])
+        rows = with_cells(comparison.table(self.against), _spec(comparison))
         over_guide = [row["better"] for row in comparison.table(GUIDE)]
-        return [row | {"over_guide": better} for row, better in zip(rows, over_guide, strict=True)]
+        return [
+            row | {"over_guide": better, "reward": row.get(EARNED, row["reward"])}
+            for row, better in zip(rows, over_guide, strict=True)
+        ]
 
-    def _policy_table(self, rows: Sequence[Row], score: str) -> str:
-        """Return the table of all policies; the terms of the reward are its last columns."""
+    def _policy_table(self, rows: Sequence[Row], reward: str) -> str:
+        """Return the table of all policies; the terms of the reward are its last columns.
+
+        Args:
+            reward: heading of what they are compared by.
+        """
         columns = {
             "driver": ("driver", ""),
             "seeds": ("seeds", ""),
             "completed": ("completed", ".0%"),
             "crashes": ("seeds with a crash (95 %)", ""),
-            "score cell": (f"{score} (95 %)", ""),
+            "reward cell": (f"{reward} (95 %)", ""),
             "difference cell": (f"difference to {self.against} (95 %)", ""),
             "better": (f"better than {self.against}", ".0%"),
             "over_guide": ("better than the guide", ".0%"),
@@ -120,7 +132,8 @@ def _draw(compared: Mapping[str, Comparison], path: Path) -> None:
     panels = {
         f"{actions} actions": driver_intervals(compared[actions].agents) for actions in ACTIONS
     }
-    measure = f"{compared[ACTIONS[0]].score[0]} (mean)"
+    reward = HEADING if is_relative(compared[ACTIONS[0]]) else "reward"
+    measure = f"{reward} (mean)"
     draw_intervals(panels, path, measure=measure, title="Table 5: unseen tracks")
 
 
@@ -143,8 +156,8 @@ def _claims(worlds: Mapping[str, Mapping[str, Comparison]]) -> str:
                         comparison, by_name[policy], by_name[other], measure, sign
                     )
             if cells:
-                relative = by_actions[ACTIONS[0]].normalised
-                paper = _paper_difference(measure, policy, other, relative)
+                ratio = is_relative(by_actions[ACTIONS[0]])
+                paper = _paper_difference(measure, policy, other, ratio)
                 rows.append({"world": world, "claim": claim, "paper": paper} | cells)
     rows.append(_claim_on_crashes(worlds[""]))
     headings = {"paper": "paper"}
@@ -158,13 +171,12 @@ def _verdict(
 ) -> pages.Claim | None:
     """Return the claim that a policy has more of a measure than another one, or less for sign -1.
 
-    The reward is compared by the score. The result is None if the policies cannot be compared.
+    The result is None if the policies cannot be compared.
     """
-    in_score = measure == "reward"
-    pairs = paired(group, other, "score" if in_score else measure)
+    pairs = paired(group, other, measure)
     if pairs is None:
         return None
-    spec = comparison.score[1] if in_score else MEASURE_COLUMNS[measure][1]
+    spec = _spec(comparison) if measure == "reward" else MEASURE_COLUMNS[measure][1]
     return pages.Claim(pairs.difference, f"+{spec}", sign)
 
 
@@ -209,17 +221,22 @@ def _paper_table(rows: Mapping[str, Sequence[Row]]) -> str:
     return markdown_table(table, columns)
 
 
-def _paper_difference(measure: str, policy: str, other: str, relative: bool) -> str | None:
+def _spec(comparison: Comparison) -> str:
+    """Return the number format of the rewards of a comparison."""
+    return ".3f" if is_relative(comparison) else comparison.spec
+
+
+def _paper_difference(measure: str, policy: str, other: str, ratio: bool) -> str | None:
     """Return the paper's difference between two policies; None if it has not both.
 
     Args:
         policy: the first policy.
         other: the second policy.
-        relative: whether rewards are divided by the guide's.
+        ratio: whether rewards are divided by the guide's.
     """
     if policy not in PAPER_UNSEEN or other not in PAPER_UNSEEN:
         return None
     difference = PAPER_UNSEEN[policy][measure] - PAPER_UNSEEN[other][measure]
-    if measure == "reward" and relative:
+    if measure == "reward" and ratio:
         return f"{difference / PAPER_UNSEEN[GUIDE][measure]:+.3f}"
     return f"{difference:+{MEASURE_COLUMNS[measure][1]}}"

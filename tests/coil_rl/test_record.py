@@ -13,7 +13,7 @@ ROWS = [
 ]
 CONTENTS = [
     (record.EVALUATION, ROWS),
-    (record.COMMAND, "coil-train method=coil 'label=a b'"),
+    (record.COMMAND, ["coil-train", "method=coil", "label=a b"]),
     (record.VERSIONS, {"python": "3.11"}),
     (record.GUIDE_RETURNS, {"guide": 0.1 + 0.2, "guide slow": math.nan}),
     (record.DELIVERY, record.Delivery(policy="last", cases=2, returns={"last": -1e-7})),

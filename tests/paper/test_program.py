@@ -137,7 +137,7 @@ def test_runs_of_one_label_with_other_configurations_are_not_pooled(tmp_path):
     result = Figure22(["one"], ["coil"], {"other": ["two"]})
     alike, differs = runs[:2], runs[2:]
     check_pools(result, {"one": alike, "two": differs})  # worlds are not pooled
-    with pytest.raises(UserError, match=r"=one: The runs of coil differ in learner.gamma"):
+    with pytest.raises(UserError, match=r"=one: the runs of coil differ in learner.gamma"):
         check_pools(result, {"one": runs, "two": []})
 
 
@@ -163,6 +163,7 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
     assert command == [*words, "hydra/launcher=basic"]
 
 
+@pytest.mark.fast(5)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

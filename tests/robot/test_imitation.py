@@ -131,10 +131,8 @@ def test_recording_that_is_there_twice_is_refused(folder, tmp_path):
     assert "hold the same scans; leave one of them out" in done.stderr
 
 
-@pytest.mark.parametrize(
-    "learner",
-    ["forest", *(pytest.param(each, marks=pytest.mark.slow) for each in ("linear", "network"))],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("learner", ["forest", "linear", "network"])
 def test_imitated_policy_is_a_controller_a_guide_an_export_and_drives(learner, folder, monkeypatch):
     monkeypatch.chdir(folder)
     words = [*SHORT[2:], f"learner={learner}", "recording=[a.mcap,b.mcap]"]

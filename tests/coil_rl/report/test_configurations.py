@@ -8,10 +8,11 @@ from run_folders import driven, make_run
 
 from coil_rl.measures import Measure
 from coil_rl.report.configurations import (
+    LONGEST_NAME,
+    by_test,
     distinguish,
     of_several_conditions,
     of_several_definitions,
-    of_several_envs,
 )
 from coil_rl.report.runs import read_runs
 
@@ -52,10 +53,10 @@ def labels(runs):
 )
 def test_runs_that_differ_are_divided_and_the_key_is_named(runs, one, two, names):
     read = runs(one, two)
-    divided, sentences = distinguish(read)
-    assert len({run.label for run in divided}) == 2
-    assert all(run.label.startswith("coil (") and names in run.label for run in divided)
-    assert names in sentences[0]
+    divided, rows = distinguish(read)
+    assert [run.label for run in divided] == ["coil 1", "coil 2"]
+    assert [row["name"] for row in rows] == ["coil 1", "coil 2"]
+    assert all(names in row["differs"] for row in rows)
     for run in divided:
         assert set(run.evaluation["driver"]) == {run.label}
 
@@ -77,39 +78,63 @@ def test_runs_that_differ_in_their_seed_only_are_pooled(runs, one, two):
     assert labels(runs(one, two)) == ["coil", "coil"]
 
 
-def test_keys_of_a_label_tell_the_runs_apart(runs):
+def test_what_differs_tells_the_runs_apart(runs):
     env = dict.fromkeys("abcd", 1)
     of_two = [env, env | {"network": "gru"}, dict.fromkeys("abcd", 2), {"guide": "x", "a": 3}]
-    found = labels(runs(*of_two))
-    assert len({label.partition(": ")[2] for label in found}) == 4
-    assert "network=gru" in found[1]
+    _, rows = distinguish(runs(*of_two))
+    assert len({row["differs"] for row in rows}) == 4
+    assert "network=gru" in rows[1]["differs"]
 
 
-def test_runs_in_several_envs_are_said(runs):
-    read = runs({"env": {"id": "A"}, "label": "a"}, {"env": {"_target_": "my.B"}, "label": "b"})
-    assert of_several_envs(read) == [
-        "The runs are in 2 envs (A, my.B): compare those of one env only."
+def test_only_what_somebody_typed_is_said(runs):
+    learner = {"lr": 1e-3, "gamma": 0.9, "buffer": {"size": 5}}
+    read = runs({"learner": {"lr": 3e-4}}, {"learner": learner}, {"learner": learner | {"lr": 0.1}})
+    words = ([], ["learner=sac", "label=x", "hydra.run.dir=x"], ["learner=sac", "learner.lr=0.1"])
+    read = [
+        replace(run, command=["coil-train", *typed, f"seed={run.seed}"])
+        for run, typed in zip(read, words, strict=True)
     ]
-    assert of_several_envs(read[:1]) == []
+    assert [row["differs"] for row in distinguish(read)[1]] == [
+        "learner.lr=0.0003",
+        "learner=sac, learner.lr=0.001",
+        "learner=sac, learner.lr=0.1",
+    ]
 
 
-def test_many_differences_are_numbered(runs):
+def test_many_differences_that_nobody_typed_are_a_few(runs):
     one, two = (dict.fromkeys("abcde", seed) for seed in (5, 7))
-    divided, sentences = distinguish(runs(one, two))
-    assert [run.label for run in divided] == [
-        "coil (1: a=5, b=5, c=5, ...)",
-        "coil (2: a=7, b=7, c=7, ...)",
-    ]
-    assert "a, b, c and 2 more" in sentences[0]
+    _, rows = distinguish(runs(one, two))
+    assert [row["differs"] for row in rows] == ["a=5, b=5, c=5, ...", "a=7, b=7, c=7, ..."]
 
 
 @pytest.mark.parametrize(
     ("one", "two"), [("a" * 60 + "x", "a" * 60 + "y"), (3, "3"), (None, "null")]
 )
-def test_values_that_look_alike_are_numbered(one, two, runs):
+def test_values_that_look_alike_are_two_names(one, two, runs):
     found = labels(runs({"of": one}, {"of": two}, {"of": one}))
-    assert found[0] == found[2] != found[1]
-    assert [label.partition(": ")[0] for label in found[:2]] == ["coil (1", "coil (2"]
+    assert found == ["coil 1", "coil 2", "coil 1"]
+
+
+def test_labels_are_short_and_different(runs):
+    long = "a" * 40
+    given = [long, f"{long}b", f"{long}c", "coil", "coil 1", "coil"]
+    changes = [{"label": label, "of": label * (index == 5)} for index, label in enumerate(given)]
+    divided, rows = distinguish(runs(*changes))
+    found = [run.label for run in divided]
+    assert len(set(found)) == len(given)
+    assert max(map(len, found)) <= LONGEST_NAME
+    assert found[3:] == ["coil 2", "coil 1", "coil 3"]
+    assert rows[1]["differs"] == f"of {long}b"
+
+
+def test_cases_belong_to_their_env(runs):
+    a, other = {"env": {"id": "A", "num_envs": 4}}, {"env": {"_target_": "my.B"}}
+    late = {"env": {"id": "A", "num_envs": 8}, "disturb": {"late": {"steps": 1}}}
+    read = runs(a, a | {"label": "b"}, other, late)
+    envs, rows = by_test(read)
+    found = {name: [run.seed for run in of_env] for name, of_env in envs.items()}
+    assert found == {"A 1": [0, 1], "A 2": [3], "B": [2]}
+    assert [row["differs"] for row in rows] == ["disturb.late.steps=null", "disturb.late.steps=1"]
 
 
 def test_only_the_policy_of_a_label_is_renamed(tmp_path):
@@ -126,10 +151,7 @@ def test_only_the_policy_of_a_label_is_renamed(tmp_path):
 @pytest.mark.parametrize(
     ("other", "names"),
     [
-        ({"evaluation": {"env": {"first_seed": 5}}}, "evaluation.env.first_seed"),
-        ({"env": {"kwargs": {"hard": True}}, "budget": {"frames": 3}}, "env.kwargs, budget.frames"),
-        ({"disturb": {"late": {"steps": 1}}}, "disturb.late.steps"),
-        ({"track": {"test": "hard"}}, "track.test"),
+        ({"budget": {"frames": 3}}, "budget.frames"),
         ({"evaluation": {"repeats": 5}}, "evaluation.repeats"),
         ({"observes": ["observation", "task"]}, "observes"),
     ],
@@ -141,6 +163,7 @@ def test_runs_under_other_conditions_are_said(other, names, runs):
     (sentence,) = of_several_conditions(read)
     assert all(name in sentence for name in names.split(", "))
     assert of_several_conditions(read[:1]) == []
+    assert len(by_test(read)[0]) == 1
 
 
 def _inside(base, other):
@@ -149,14 +172,16 @@ def _inside(base, other):
     return other | groups
 
 
-def test_what_experiments_compare_is_no_other_condition(runs):
+def test_what_experiments_compare_is_no_other_condition_or_test(runs):
     one = {"label": "a", "env": {"id": "A", "num_envs": 4, "seed": 0}, "guide": {"x": 1}}
     two = {"label": "b", "env": {"id": "A", "num_envs": 8, "seed": 1}, "guide": {"x": 2}}
     more = [
         {"degrade": name, "learner": {"rate": name}, "method": {"needs_guide": True}}
         for name in ("none", "zeroed")
     ]
-    assert of_several_conditions(runs(one | more[0], two | more[1])) == []
+    read = runs(one | more[0], two | more[1])
+    assert of_several_conditions(read) == []
+    assert list(by_test(read)[0]) == ["A"]
 
 
 def test_measure_of_two_definitions_is_said(runs):

@@ -29,10 +29,10 @@ def test_section_has_a_table_of_drivers_and_one_of_cases(tmp_path):
         "cases",
         "completed",
         "seeds with a crash (95 %)",
-        "reward / guide's (95 %)",
+        "return (95 %)",
         "95 % over cases",
     ]
-    assert guide[:7] == ["guide", "", "-", "2", "100%", "0 of 2 cases (0% to 84%)", "1.000"]
+    assert guide[:7] == ["guide", "", "-", "2", "100%", "0 of 2 cases (0% to 84%)", "550.0"]
     over_cases = coil.pop(7)
     assert over_cases.partition(" to ")[1]
     assert coil == [
@@ -42,11 +42,10 @@ def test_section_has_a_table_of_drivers_and_one_of_cases(tmp_path):
         "2",
         "100%",
         "0 of 3 (0% to 71%)",
-        "1.038 (1.034 to 1.043)",
-        "-0.037 (-0.037 to -0.037)",
+        "571.0 (568.5 to 573.5)",
+        "-20.0 (-20.0 to -20.0)",
         "0.000",
         "0%",
-        "571.0",
         "50.00",
         "0.200",
         "0.30",
@@ -191,14 +190,17 @@ def test_all_policies_that_the_seeds_of_a_label_began_with_are_named():
     assert sentence.endswith("_seed2 and 2 more, whose frames are not among theirs.")
 
 
-def test_reason_of_plain_rewards_is_said(tmp_path):
-    make_run(tmp_path / "0", "ppo", 0, driven("ppo", {"a": 1.0, "b": 2.0}))
-    compared = {"deterministic": compare(read_runs([tmp_path]))}
-    sentence = "Means are rewards, not fractions of a guide's: no guide was evaluated in the cases "
-    assert f"{sentence}of ppo." in page.notes(None, compared)[0]
-    make_sweep(tmp_path / "sweep")
-    compared = {"deterministic": compare(read_runs([tmp_path / "sweep"]))}
-    assert "Means are rewards" not in page.notes(None, compared)[0]
+def test_envs_are_counted_by_sign(tmp_path):
+    tables = {}
+    for env, gain, unit in (("one", 1.0, 1.0), ("other", -1.0, 1e6), ("third", 1.0, 1.0)):
+        for seed in range(3):
+            agent = {"a": unit * (2 + gain + 0.01 * seed), "b": unit * (3 + gain)}
+            rows = driven("guide", {"a": 2 * unit, "b": 3 * unit}) + driven("coil", agent)
+            make_run(tmp_path / env / str(seed), "coil", seed, rows)
+        tables[env] = compare(read_runs([tmp_path / env])).table("guide")
+    (summary,) = page.summary(tables, "guide")
+    assert cells(summary)[1] == ["coil", "2", "0", "1"]
+    assert page.summary({"one": tables["one"]}, "guide") == []
 
 
 def test_empty_columns_and_many_cases_are_omitted(tmp_path):
@@ -207,9 +209,8 @@ def test_empty_columns_and_many_cases_are_omitted(tmp_path):
     text = "\n\n".join(section(tmp_path))
     assert not [word for word in ("advice", "better than") if word in text]
     assert text.endswith("The rewards in each of the 9 cases are in report_cases.csv.")
-    compared = {"sampled": compare(read_runs([tmp_path]))}
-    assert "Difference" not in page.notes(None, compared)[0]
-    assert "Difference to its guide: of the same seed" in page.notes("guide", compared)[0]
+    assert "Return over" not in page.notes(None, sampled=True)[0]
+    assert "Return over its guide: the difference" in page.notes("guide", sampled=True)[0]
 
 
 def test_means_of_some_seeds_only_say_so(tmp_path):

@@ -1,0 +1,95 @@
+"""Rewards as fractions of the guide's in the same case, as in the paper's table 5."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from coil_rl import Measure
+from coil_rl.report import Comparison, Group
+
+NEXT_TO_NOTHING = 0.01  # for a guide in a case, of its mean over the others
+EARNED = "earned"  # measure of a group with fractions: the reward itself
+HEADING = "reward / guide's"
+
+References = Mapping[tuple[str, ...], np.ndarray]
+
+
+def relative(comparison: Comparison) -> Comparison:
+    """Return a comparison whose rewards are fractions of the best guide's in the same case.
+
+    The rewards themselves are the measure `EARNED`. Where a policy has cases in which no guide has
+    rewards to divide by, the comparison is returned as it is.
+    """
+    references: dict[tuple[str, ...], np.ndarray] = {}
+    for guide in comparison.guides:  # the best first
+        reference = _reference(guide)
+        if reference is not None:
+            references.setdefault(guide.cases, reference)
+    if any(group.cases not in references for group in comparison.groups):
+        return comparison
+    guides = {group: _divided(group, references) for group in comparison.guides}
+    agents = [_divided(group, references) for group in comparison.agents]
+    agents = [
+        replace(each, guide=guides.get(each.guide)) if each.guide else each for each in agents
+    ]
+    return Comparison(tuple(guides.values()), tuple(agents))
+
+
+def is_relative(comparison: Comparison) -> bool:
+    """Return whether the rewards of a comparison are fractions of a guide's."""
+    return all(EARNED in group.measures for group in comparison.groups)
+
+
+def earned(group: Group) -> Group:
+    """Return a group with its rewards themselves."""
+    if EARNED not in group.table:
+        return group
+    return replace(group, table=group.table.assign(reward=group.table[EARNED]))
+
+
+def _divided(group: Group, references: References) -> Group:
+    """Return a group with fractions of the reference in its cases."""
+    reward = group.table["reward"]
+    table = group.table.assign(
+        **{"reward": reward / np.resize(references[group.cases], len(reward)), EARNED: reward}
+    )
+    return replace(
+        group, table=table, measures={**group.measures, EARNED: Measure("reward", "sum")}
+    )
+
+
+def _reference(guide: Group) -> np.ndarray | None:
+    """Return the rewards of a guide in each case that others are divided by; None for no such.
+
+    In a case where it crashes or earns nothing, or next to nothing, its mean over the other cases
+    is taken: a ratio to such a reward would be all of a mean. There is none for a guide that earns
+    nothing in any case, or loses too much in one for a ratio.
+    """
+    rewards = guide.by_seed("reward").mean()
+    earned, crashed = rewards[rewards > 0], rewards.iloc[:0]
+    if guide.has("crashed"):
+        crashed = rewards[(guide.by_seed("crashed") > 0).any()]
+        earned = earned.drop(crashed.index, errors="ignore")
+    if len(earned) > 1:
+        others = (earned.sum() - earned) / (len(earned) - 1)
+        earned = earned[earned >= NEXT_TO_NOTHING * others]
+    if not len(earned) or _loses(rewards, crashed, earned.mean()):
+        return None
+    filled: np.ndarray = rewards.where(rewards.index.isin(earned.index), earned.mean()).to_numpy()
+    return filled
+
+
+def _loses(rewards: pd.Series, crashed: pd.Series, earned: float) -> bool:
+    """Return whether a guide loses so much in a case that its rewards have no zero to divide by.
+
+    That is more than next to nothing of what it earns, and in a crash, which may be punished, more
+    than all of it.
+
+    Args:
+        crashed: those of the cases in which it crashes.
+        earned: its mean over the cases in which it earns something.
+    """
+    driven = rewards.drop(crashed.index)
+    return bool((driven < -NEXT_TO_NOTHING * earned).any() or (crashed < -earned).any())
