@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from coil_rl.envs import Degrees, Perception
-from coil_rl.envs.recordings.cautions import in_order
+from coil_rl.envs.recordings import in_order
 from coil_rl.envs.robot import BoundaryMemory
 from coil_rl.ranges import Positive, checked
 from coil_robot.watchdog import Limits, Scan, Watchdog

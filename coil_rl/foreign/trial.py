@@ -29,6 +29,7 @@ from coil_rl.foreign.controllers import PerRow
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.foreign.host import called, is_of_user
+from coil_rl.foreign.makers import layers
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import (
     first_choices,
@@ -231,7 +232,7 @@ class Trial:
     def _kinds_of_env(self) -> list[type]:
         if not isinstance(self.base, GymnasiumEnv):
             return []
-        return [type(layer) for layer in _layers(self.base.held.plants[0].env)]
+        return [type(layer) for layer in layers(self.base.held.plants[0].env)]
 
     def recorded(self) -> TensorDictBase:
         """Return data [B, T] of random actions, with at least two rows.
@@ -441,13 +442,8 @@ class _Shared:
 
     def restore(self) -> None:
         """Restore the values that have changed."""
-        for name, value, put in list(self._changed()):
-            old = pickle.loads(self.before[name])
-            for now, then in zip(value, old, strict=True) if put is None else [(value, old)]:
-                if put is not None and isinstance(now, (int, float)):
-                    put(then)
-                else:
-                    _put_back(now, then)
+        for name, _, put in list(self._changed()):
+            put(pickle.loads(self.before[name]))
 
     def _changed(self) -> Iterator[tuple[str, Any, Any]]:
         for name, value, put in self._things():
@@ -455,38 +451,24 @@ class _Shared:
                 yield name, value, put
 
     def _things(self) -> Iterator[tuple[str, Any, Any]]:
-        """Yield name, value, and what sets it; None for default arguments, a tuple of values."""
+        """Yield name, value, and what sets it."""
         for kind in self.kinds:
             for name, value in vars(kind).items():
+                title = f"{kind.__name__}.{name}"
                 if isinstance(value, FunctionType):
-                    defaults = [*(value.__defaults__ or ()), *(value.__kwdefaults__ or {}).values()]
-                    cells = [each for each in value.__closure__ or () if each != CellType()]
-                    around = [each.cell_contents for each in cells]
-                    for title, given in (("a default", defaults), ("a variable", around)):
-                        known = [each for each in given if _is_data(each)]
-                        yield f"{title} of {kind.__name__}.{name}", known, None
+                    for part in ("__defaults__", "__kwdefaults__"):
+                        given = getattr(value, part)
+                        yield f"a default of {title}", given, partial(setattr, value, part)
+                    for cell in value.__closure__ or ():
+                        if cell != CellType() and _is_data(cell.cell_contents):
+                            put = partial(setattr, cell, "cell_contents")
+                            yield f"a variable of {title}", cell.cell_contents, put
                 elif _is_data(value) and not name.startswith("__"):
-                    yield f"{kind.__name__}.{name}", value, partial(setattr, kind, name)
+                    yield title, value, partial(setattr, kind, name)
             module = sys.modules.get(kind.__module__)
             for name, value in vars(module).items() if module else ():
                 if isinstance(value, DATA) and not name.startswith("__"):
                     yield f"{kind.__module__}.{name}", value, partial(setattr, module, name)
-
-
-def _put_back(now: Any, then: Any) -> None:
-    """Give a value the content that it had."""
-    if isinstance(now, Tensor):
-        now.copy_(then)
-    elif isinstance(now, (list, np.ndarray)):
-        now[:] = then
-    elif isinstance(now, (dict, set)):
-        now.clear()
-        now.update(then)
-    elif isinstance(now, deque):
-        now.clear()
-        now.extend(then)
-    elif hasattr(now, "__dict__"):
-        vars(now).update(vars(then))
 
 
 def _is_data(value: Any) -> bool:
@@ -505,13 +487,6 @@ def _pickled(value: Any) -> bytes:
 def _random(env: EnvBase) -> Callable[[TensorDictBase], TensorDictBase]:
     """Return what writes a random action, also where it has no bound."""
     return partial(random_action, env) if len(env.action_keys) == 1 else env.rand_action
-
-
-def _layers(env: Any) -> Iterator[Any]:
-    """Yield an env and what is in its wrappers."""
-    while env is not None:
-        yield env
-        env = getattr(env, "env", None)
 
 
 def _kind_of(make: Callable[[], Any]) -> type:

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from coil_rl.envs.recordings import bearings as bearings
     from coil_rl.envs.recordings import mcap_files as mcap_files
     from coil_rl.envs.recordings import messages as messages
+    from coil_rl.envs.recordings.cautions import in_order as in_order
     from coil_rl.envs.recordings.recording import SIMULATED as SIMULATED
 else:
     require("a recording", "robot", "lz4", "mcap", "rosbags", "zstandard")
