@@ -457,12 +457,14 @@ class _Shared:
                 title = f"{kind.__name__}.{name}"
                 if isinstance(value, FunctionType):
                     for part in ("__defaults__", "__kwdefaults__"):
-                        given = getattr(value, part)
-                        yield f"a default of {title}", given, partial(setattr, value, part)
-                    for cell in value.__closure__ or ():
+                        kind_of = "a default" if part == "__defaults__" else "a keyword default"
+                        put = partial(setattr, value, part)
+                        yield f"{kind_of} of {title}", getattr(value, part), put
+                    cells = zip(value.__code__.co_freevars, value.__closure__ or (), strict=True)
+                    for variable, cell in cells:
                         if cell != CellType() and _is_data(cell.cell_contents):
                             put = partial(setattr, cell, "cell_contents")
-                            yield f"a variable of {title}", cell.cell_contents, put
+                            yield f"the variable {variable} of {title}", cell.cell_contents, put
                 elif _is_data(value) and not name.startswith("__"):
                     yield title, value, partial(setattr, kind, name)
             module = sys.modules.get(kind.__module__)
