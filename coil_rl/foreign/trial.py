@@ -456,10 +456,11 @@ class _Shared:
             for name, value in vars(kind).items():
                 title = f"{kind.__name__}.{name}"
                 if isinstance(value, FunctionType):
-                    for part in ("__defaults__", "__kwdefaults__"):
-                        kind_of = "a default" if part == "__defaults__" else "a keyword default"
-                        put = partial(setattr, value, part)
-                        yield f"{kind_of} of {title}", getattr(value, part), put
+                    given = [each for each in value.__defaults__ or () if _is_data(each)]
+                    yield f"a default of {title}", given, partial(_set_defaults, value)
+                    named = value.__kwdefaults__ or {}
+                    known = {key: each for key, each in named.items() if _is_data(each)}
+                    yield f"a keyword default of {title}", known, named.update
                     cells = zip(value.__code__.co_freevars, value.__closure__ or (), strict=True)
                     for variable, cell in cells:
                         if cell != CellType() and _is_data(cell.cell_contents):
@@ -471,6 +472,12 @@ class _Shared:
             for name, value in vars(module).items() if module else ():
                 if isinstance(value, DATA) and not name.startswith("__"):
                     yield f"{kind.__module__}.{name}", value, partial(setattr, module, name)
+
+
+def _set_defaults(function: FunctionType, then: Sequence[Any]) -> None:
+    """Give a function back the default arguments that are data."""
+    left, given = iter(then), function.__defaults__ or ()
+    function.__defaults__ = tuple(next(left) if _is_data(each) else each for each in given)
 
 
 def _is_data(value: Any) -> bool:
