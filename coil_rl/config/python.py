@@ -238,7 +238,7 @@ def _env(env: Any, name: str) -> Words:
         return words, {} if path is not None else {"env.of": keep(name, env)}
     raise UserError(
         f"env makes {type(made).__name__}; give a maker of a Gymnasium env, or of a TorchRL env "
-        "without batch (a batched one of your own needs a file, see docs/your_env.md)"
+        "without batch (a batched one of your own needs a file, see docs/your_env_reference.md)"
     )
 
 
