@@ -51,6 +51,7 @@ from coil_rl.record import json_file
 from coil_rl.report import write_csv
 from coil_rl.run.folder import locked
 from coil_rl.run.parts import TEST
+from coil_rl.run.run import as_before
 
 TABLE, PAGE, PICTURE = "compare.csv", "compare.md", "compare.png"
 FOUND = json_file("verdict.json", dict[str, Any], "compare again")
@@ -75,6 +76,7 @@ class Worth:
     page: str
 
 
+@as_before()
 def compare(
     env: Any,
     *,

@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +10,18 @@ import numpy as np
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
-from coil_rl.comparison.arms import ANCHORED, ARMS, TUNE
+from coil_rl.comparison.arms import ANCHORED, ARMS, GUIDE, RANDOM, TUNE
 from coil_rl.comparison.entry import Entry, difference
-from coil_rl.comparison.outcome import Outcome
+from coil_rl.comparison.outcome import Outcome, few_cases
 from coil_rl.comparison.sentences import COMPARE
 from coil_rl.comparison.verdict import Verdict
 from coil_rl.config.compose import key_of
 from coil_rl.config.python import Named
-from coil_rl.learners.anchor import StartTest
 from coil_rl.report import draw_learning_curves, markdown_table
 from coil_rl.report.runs import Run
 from coil_rl.report.table import AUTO_FORMAT, return_format
 
-FEW = 4  # cases of a start test, below which only a very large difference is certain
+ROOM = 0.1  # of the scale, below the guide in the picture
 COLUMNS = {
     "policy": ("policy", ""),
     "return": ("return", AUTO_FORMAT),
@@ -54,7 +53,7 @@ def page_of(
         markdown_table(outcome.rows, columns),
     ]
     about = COMPARE.said("about_table", measured=measured)
-    for each in [*about, *few_cases(outcome.runs.get(ANCHORED, ())), *delayed]:
+    for each in [*about, *start_tests(outcome.runs.get(ANCHORED, ())), *delayed]:
         parts += ["", each]
     if command:
         lead = "Train it to the end"
@@ -64,11 +63,9 @@ def page_of(
     return "\n".join(parts)
 
 
-def few_cases(runs: Sequence[Run]) -> list[str]:
+def start_tests(runs: Sequence[Run]) -> list[str]:
     """Return the sentence about start tests that held no guide after few cases; none for others."""
-    *_, cases, weight = StartTest.names
-    firsts = [run.curve[0] for run in runs if run.curve]
-    few = [row[cases] for row in firsts if row.get(cases, np.nan) < FEW and not row[weight]]
+    few = [cases for cases in map(few_cases, runs) if cases]
     return COMPARE.said("few_cases", arm=ANCHORED, cases=few, runs=len(runs))
 
 
@@ -136,8 +133,29 @@ def _bounds(each: Any) -> str:
 
 
 def draw(outcome: Outcome, cases: int | None, path: Path) -> None:
-    """Draw the learning curves of all arms beside the guide, if a run knows its line."""
+    """Draw the learning curves of all arms beside the guide, if a run knows its line.
+
+    The axis is about the guide and what is better: curves far below are cut, with their number.
+    """
     known = [run.guide_returns for runs in outcome.runs.values() for run in runs]
     guides = next(filter(None, known), {})
-    curves = {name: [run.curve for run in runs] for name, runs in outcome.runs.items()}
-    draw_learning_curves(curves, path, guides=guides, cases=cases)
+    curves = {
+        name: [run.curve for run in runs if not few_cases(run)]
+        for name, runs in outcome.runs.items()
+    }
+    curves = {name: runs for name, runs in curves.items() if runs}
+    if curves:
+        least = lowest_shown(outcome.entries)
+        draw_learning_curves(curves, path, guides=guides, cases=cases, least=least)
+
+
+def lowest_shown(entries: Mapping[str, Entry]) -> float | None:
+    """Return the lowest return of the picture; None for a guide that is not above random actions.
+
+    Below the guide there is as much room as above it, and a tenth of the scale at least.
+    """
+    guide, random = entries[GUIDE].mean, entries[RANDOM].mean
+    best = max(each.mean for each in entries.values())
+    if guide <= random:
+        return None
+    return guide - max(best - guide, ROOM * (best - random))

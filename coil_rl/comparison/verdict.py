@@ -41,6 +41,7 @@ class Verdict:
         use: name of an entry, or `NOTHING`.
         train: name of the arm that is worth a whole training; empty for none.
         score: of the guide: 0 for random actions, 1 for the best.
+        score_of_use: of what to use.
         wrong_way_round: whether the opposite of the guide is clearly better than the guide.
         sentences: what to use; what it gained; what is undecided.
     """
@@ -48,17 +49,19 @@ class Verdict:
     use: str
     train: str
     score: float
+    score_of_use: float
     wrong_way_round: bool
     sentences: Sequence[str] = field(default_factory=tuple)
 
     def to_dict(self, command: str) -> dict[str, Any]:
-        """Return the verdict as a dictionary that JSON can hold: a missing score is None.
+        """Return the verdict as a dictionary that JSON can hold: missing scores are None.
 
         Args:
             command: that trains to the end what is recommended.
         """
-        score = None if math.isnan(self.score) else self.score
-        return asdict(self) | {"score": score, "command": command}
+        values = asdict(self) | {"command": command}
+        scores = {key: values[key] for key in ("score", "score_of_use")}
+        return values | {key: None if math.isnan(each) else each for key, each in scores.items()}
 
 
 def verdict(entries: Mapping[str, Entry], failed: Sequence[str] = ()) -> Verdict:
@@ -75,7 +78,7 @@ def verdict(entries: Mapping[str, Entry], failed: Sequence[str] = ()) -> Verdict
     sure = {each.name for each in others if difference(each, random).above(0)}
     train = _leading(others, sure)
     if not sure:
-        return Verdict(NOTHING, train, math.nan, False, sentences.nothing(best, entries))
+        return Verdict(NOTHING, train, math.nan, math.nan, False, sentences.nothing(best, entries))
     use, kept = _chosen(entries, sure, scale)
     score = (guide.mean - random.mean) / scale
     wrong = difference(entries[OPPOSITE], guide).above(REVERSED * scale)
@@ -84,7 +87,8 @@ def verdict(entries: Mapping[str, Entry], failed: Sequence[str] = ()) -> Verdict
     said = sentences.what(use, kept, entries, score, wrong)
     said += sentences.gained(use, entries)
     said += sentences.undecided(use, others, MATERIAL * scale, failed)
-    return Verdict(use.name, train, score, wrong, said)
+    reached = (use.mean - random.mean) / scale
+    return Verdict(use.name, train, score, reached, wrong, said)
 
 
 def _mean(entry: Entry) -> float:

@@ -27,11 +27,12 @@ from coil_rl.config.unread import check_read
 from coil_rl.errors import UserError
 from coil_rl.foreign.faults import foreign
 from coil_rl.run.controller import Controller
-from coil_rl.run.run import Run
+from coil_rl.run.run import Run, as_before
 
 Words = tuple[list[str], dict[str, Any]]  # of the command line, and nodes for objects by their key
 
 
+@as_before()
 def train(
     env: Any,
     *,
@@ -138,7 +139,9 @@ def prepare(
     if tune is not None:
         given.nodes["tune"] = tune if isinstance(tune, str) else dict(tune)
     words += [f"seed={seed}", *overrides]
-    return prepared(Named(words, given.nodes), folder)
+    run = prepared(Named(words, given.nodes), folder)
+    run.in_python = True
+    return run
 
 
 @dataclass(frozen=True)
@@ -294,7 +297,9 @@ def open_run(
         trust_packages(trust)
     config = read_config(folder, "folder", {"device": device}, goes_on=bool(trust))
     give(config, {"guide": guide, "env": env})
-    return assemble(config, folder)
+    run = assemble(config, folder)
+    run.in_python = True
+    return run
 
 
 def pretrained(name: str, *, device: str = "cpu") -> Run:

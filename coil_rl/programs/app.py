@@ -15,7 +15,6 @@ import contextlib
 import functools
 import logging
 import os
-import re
 import signal
 import sys
 import threading
@@ -43,6 +42,7 @@ from coil_rl.config.messages import is_no_bug, refuse
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
 from coil_rl.output import SafeStream
+from coil_rl.plain_yaml import is_part
 from coil_rl.programs.folders import spelled
 from coil_rl.programs.sweeps import Jobs, is_sweep, remove_unused
 from coil_rl.run.stopping import STOP
@@ -80,8 +80,7 @@ class Signals:
     def _interrupt(self, signum: int, frame: FrameType | None) -> None:
         """Raise a `KeyboardInterrupt`, unless a training ends its update first."""
         self.received.append(signum)
-        if signum == signal.SIGINT or not STOP.ask():
-            raise KeyboardInterrupt
+        STOP.interrupt(signum, frame)
 
 
 class OwnFolder(Callback):
@@ -145,12 +144,12 @@ def command_line() -> list[str]:
 def check_used(used: Iterable[str], reason: str) -> None:
     """Raise a `UserError` for an override that has no effect.
 
-    `used` are the top-level keys that have one, besides those of every program that drives;
-    `reason` is why others do not.
+    `used` are the keys that have one with all that is in them, besides those of every program that
+    drives; `reason` is why others do not.
     """
     known = (*used, *COMMON_KEYS)
     for key, text in overrides():
-        if re.split(r"[./]", key)[0] not in known:
+        if not is_part(key, known):
             raise UserError(
                 f"{text} has no effect: {reason}; what can be changed is {', '.join(known)}"
             )
@@ -314,7 +313,7 @@ def program(name: str, signals: Signals | None = None) -> Iterator[None]:
     """End the process with one sentence on standard error instead of a traceback.
 
     The exit code is 2 for a mistake of the user, and 130 for Ctrl-C, SIGTERM, SIGHUP and SIGUSR1.
-    After one of the last three a training first ends its update and saves its state.
+    A training first ends its update and saves its state; a second signal ends it at once.
 
     Args:
         name: of the program.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from coil_rl.errors import UserError
 from coil_rl.programs import app
 
 # Keys that have an effect on the evaluation of a run, and on that of guides alone.
-OF_A_RUN = ("run", "exported", "track", "disturb", "degrade", "beside", "evaluation")
-OF_GUIDES = ("preset", "env", "guide", *(key for key in OF_A_RUN if key != "beside"))
+OF_BOTH = ("run", "exported", "track", "disturb", "degrade", "evaluation")
+OF_NO_TRAINING = ("env.info", "env.workers")  # no number of a training depends on them
+OF_A_RUN = (*OF_BOTH, "beside", *OF_NO_TRAINING)
+OF_GUIDES = ("preset", "env", "guide", *OF_BOTH)
 # Keys of `evaluation` of the command, not of the run.
 OWN = ("repeats", "policy", "gif", "advice", "beside")
 OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
@@ -151,6 +154,15 @@ def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> l
         elif key.partition(".")[0] == "disturb":
             config.disturb = resolved["disturb"]
             changed.append("disturb")
+        elif key in OF_NO_TRAINING:
+            name = key.removeprefix("env.")
+            if name not in config.env:
+                target = config.env["_target_"].rpartition(".")[2]
+                raise UserError(f"{text} has no effect on {target}, the env of run={folder}")
+            value = resolved["env"][name]
+            if isinstance(value, list):  # beside the entries that the policy may observe
+                value = [*dict.fromkeys([*config.env[name], *value])]
+            config.env[name] = value
         elif key.startswith("evaluation."):
             changed.append(key.removeprefix("evaluation."))
     return changed
@@ -181,7 +193,17 @@ def check(config: DictConfig) -> None:
     app.check_run(config)
 
 
-main = partial(app.run_program, evaluate, "evaluate", check)
+def main() -> None:
+    """Entry point.
+
+    A run has its own env, with keys that the env of the default configuration may not have.
+    """
+    arguments = sys.argv[1:]
+    if any(argument.startswith("run=") for argument in arguments):
+        added = [re.sub(rf"^({'|'.join(OF_NO_TRAINING)})=", r"++\1=", each) for each in arguments]
+        sys.argv[1:] = added
+    app.run_program(evaluate, "evaluate", check)
+
 
 if __name__ == "__main__":
     main()

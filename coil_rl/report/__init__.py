@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from coil_rl.report.curves import mean_curve as mean_curve
     from coil_rl.report.curves import points as points
     from coil_rl.report.film import Film as Film
+    from coil_rl.report.in_time import InTime as InTime
     from coil_rl.report.intervals import Interval as Interval
     from coil_rl.report.intervals import draw_intervals as draw_intervals
     from coil_rl.report.intervals import driver_intervals as driver_intervals

@@ -38,6 +38,7 @@ def draw_learning_curves(
     guides: Mapping[str, float] | None = None,
     title: str | None = None,
     cases: int | None = None,
+    least: float | None = None,
 ) -> None:
     """Draw the return of the kept policies against frames, one curve per label.
 
@@ -53,6 +54,7 @@ def draw_learning_curves(
         guides: mean return of each guide by name, drawn as a dashed line.
         title: above the plot.
         cases: number of cases that each return is the mean of; None if it is not known.
+        least: lower end of the axis: of a curve that ends below it the last value is said there.
     """
     returns = RETURNS if cases is None else f"{RETURNS}, mean of {cases} cases"
     curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
@@ -73,6 +75,33 @@ def draw_learning_curves(
         axes.margins(x=0.02)
         axes.set_xlim(left=0)
         draw_guides(axes, guides or {})
+        if least is not None:
+            ends = {label: mean[-1] for label, (_, mean, *_) in curves.items() if len(mean)}
+            _cut(axes, {label: end for label, end in ends.items() if end < least}, strokes, least)
+
+
+def _cut(
+    axes: Axes, below: Mapping[str, float], strokes: Mapping[str, style.Stroke], least: float
+) -> None:
+    """Let an axis begin at a value, and say there where curves end that are below it.
+
+    Args:
+        below: their last values, by label.
+    """
+    if not below:
+        return
+    axes.set_ylim(bottom=least)
+    spec = return_format(below.values())
+    for place, (label, end) in enumerate(sorted(below.items(), key=lambda each: -each[1])):
+        axes.annotate(
+            f"{label} ends at {end:{spec}} ↓",
+            (0.99, 0),
+            (0, 4 + 12 * (len(below) - 1 - place)),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            ha="right",
+            color=strokes[label].colour,
+        )
 
 
 def draw_guides(axes: Axes, guides: Mapping[str, float]) -> None:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,20 @@ from coil_rl.report.beside import BESIDE, beside_guides, draw_beside_guides
 from coil_rl.report.comparison import Comparison
 from coil_rl.report.curves import draw_curve_grid, draw_learning_curves
 from coil_rl.report.guide_use import draw_guide_use, guide_use
-from coil_rl.report.html import Figure, moving, svg
+from coil_rl.report.html import Figure, embedded, svg
 from coil_rl.report.intervals import draw_intervals, driver_intervals
 from coil_rl.report.runs import RESTORE, Run
 
 SAME_LINE = 1e-6  # relative difference of the returns of one guide; the rest is rounding
 MAX_CURVES = 8  # in one plot
-FILMS = ("episode.webp", "lines.gif")
+# Pictures of runs: title and caption by file.
+FILMS = {
+    "in_time.png": ("First case in time", "Observation, advice and executed action"),
+    "episode.webp": ("Film", "The first case of the evaluation"),
+    "lines.gif": ("Film", "The cases of the evaluation"),
+}
 LARGEST_FILM = 2_000_000  # bytes
-MAX_FILMS = 8  # on a page
+MAX_FILMS = 12  # of an env
 
 Draw = Callable[[style.Target], None]
 
@@ -97,19 +103,20 @@ def _cases_of_curve(run: Run) -> int | None:
 
 
 def films(runs: Sequence[Run]) -> list[Figure]:
-    """Return the film of the first run of each label that has one, of the first `MAX_FILMS` labels.
+    """Return the first case of the first run of each label, of the first `MAX_FILMS` labels.
+
+    It is shown in time and as a film, if the run has drawn them.
 
     Raises:
-        UserError: for a file that is no WebP or GIF picture, or too large.
+        UserError: for a file that is no picture, or too large.
     """
-    found: dict[str, Figure] = {}
-    for run in runs:
-        paths = [run.folder / name for name in FILMS if (run.folder / name).exists()]
-        if run.label in found or len(found) == MAX_FILMS or not paths:
+    found: dict[tuple[str, str], Figure] = {}
+    for run, (name, (title, caption)) in product(runs, FILMS.items()):
+        path = run.folder / name
+        if (run.label, title) in found or len(found) == MAX_FILMS or not path.exists():
             continue
-        with file_of_a_run(paths[0], RESTORE):
-            image = moving(read_file(paths[0], LARGEST_FILM))
-        what = "The first case" if paths[0].name == FILMS[0] else "The cases"
-        caption = f"{what} of the evaluation, seed {run.seed}."
-        found[run.label] = Figure(f"Film of {run.label}", image, caption)
+        with file_of_a_run(path, RESTORE):
+            image = embedded(read_file(path, LARGEST_FILM))
+        figure = Figure(f"{title} of {run.label}", image, f"{caption}, seed {run.seed}.")
+        found[run.label, title] = figure
     return list(found.values())

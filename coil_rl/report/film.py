@@ -19,6 +19,7 @@ from coil_rl.report.pictures import Picture
 from coil_rl.report.table import return_format
 
 if TYPE_CHECKING:
+    from tensordict import TensorDictBase
     from torchrl.envs import EnvBase
 
     from coil_rl.run.evaluation import EvaluationResult
@@ -62,13 +63,21 @@ class Film(Picture):
         """Whether the film is made."""
         return self.active
 
-    def watch(self, env: EnvBase, rows: Mapping[str, int]) -> None:
+    def watch(
+        self,
+        env: EnvBase,
+        rows: Mapping[str, int],
+        before: TensorDictBase,
+        after: TensorDictBase,
+    ) -> None:
         """Take a frame of each policy if it is time.
 
         Args:
             env: of the evaluation. Its `render(row)` returns a picture [height, width, 3], or None
                 if it cannot.
             rows: the row in which each policy drives the first case, of those that still drive.
+            before: as of `Picture.watch`.
+            after: as of `Picture.watch`.
         """
         every = self._steps_of_frame(getattr(env, "rate", math.nan))
         for name, row in rows.items():

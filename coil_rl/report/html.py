@@ -45,7 +45,7 @@ class Figure:
 
     Args:
         title: above it.
-        image: an SVG for the page itself, from `svg`, or a `data:` address, from `moving`.
+        image: an SVG for the page itself, from `svg`, or a `data:` address, from `embedded`.
         caption: below it.
     """
 
@@ -104,16 +104,18 @@ def svg(draw: Callable[[io.BytesIO], None]) -> Markup:
     return Markup(text)
 
 
-def moving(content: bytes) -> str:
-    """Return a moving picture as a `data:` address.
+def embedded(content: bytes) -> str:
+    """Return a picture as a `data:` address.
 
     Raises:
-        ValueError: for anything but a WebP or GIF picture.
+        ValueError: for anything but a PNG, WebP or GIF picture.
     """
-    if content[:4] == b"RIFF" and content[8:12] == b"WEBP":
+    if content[:8] == b"\x89PNG\r\n\x1a\n":
+        kind = "png"
+    elif content[:4] == b"RIFF" and content[8:12] == b"WEBP":
         kind = "webp"
     elif content[:6] == b"GIF89a":
         kind = "gif"
     else:
-        raise ValueError("no WebP or GIF picture")
+        raise ValueError("no PNG, WebP or GIF picture")
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

@@ -14,7 +14,7 @@ import numpy as np
 from coil_rl.report import style
 
 if TYPE_CHECKING:
-    from tensordict import NestedKey
+    from tensordict import NestedKey, TensorDictBase
     from torchrl.envs import EnvBase
 
     from coil_rl.run.evaluation import EvaluationResult
@@ -34,11 +34,19 @@ class Picture:
         """Whether the picture needs to see the env, by `watch`."""
         return False
 
-    def watch(self, env: EnvBase, rows: Mapping[str, int]) -> None:
+    def watch(
+        self,
+        env: EnvBase,
+        rows: Mapping[str, int],
+        before: TensorDictBase,
+        after: TensorDictBase,
+    ) -> None:
         """See the env after each step; by default do nothing.
 
         Args:
             rows: the row in which each policy drives the first case, of those that still drive.
+            before: the entries before the step, with the action.
+            after: the entries after it.
         """
 
     def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:

@@ -70,7 +70,7 @@ def evaluate_policy(
     cases: Sequence[str] = (),
     different: int | None = None,
     tick: Callable[[], Any] | None = None,
-    watch: Callable[[Tensor], Any] | None = None,
+    watch: Callable[[Tensor, TensorDictBase, TensorDictBase], Any] | None = None,
 ) -> EvaluationResult:
     """Run one episode on every row of an env, with its transforms in evaluation mode.
 
@@ -85,15 +85,20 @@ def evaluate_policy(
         different: number of rows that draw random numbers; row i gets those of row `i % different`.
             None: as many as cases.
         tick: called after every step.
-        watch: called after every step with whether each row was in its episode, [rows].
+        watch: called after every step with whether each row was in its episode, [rows], and with
+            the entries before, with the action, and after the step.
     """
     measures = {"reward": Measure(unravel_key(env.reward_key), "sum"), **(measures or {})}
     totals, recorded = Totals(measures), {name: list[Tensor]() for name in record or {}}
-    drawing = different or len(cases) or None
-    for after, running in episodes(env, policy, sampled=sampled, cases=drawing, tick=tick):
+    options: dict[str, Any] = {"sampled": sampled, "tick": tick}
+    options["cases"] = different or len(cases) or None
+    step: dict[str, TensorDictBase] = {}
+    if watch is not None:
+        options["seen"] = lambda before, after: step.update(before=before)
+    for after, running in episodes(env, policy, **options):
         totals.add(after, running)
         if watch is not None:
-            watch(running.reshape(-1))
+            watch(running.reshape(-1), step["before"], after)
         for name, key in (record or {}).items():
             recorded[name].append(after[key])
     steps = totals.steps.tolist()

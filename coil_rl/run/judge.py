@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -312,18 +312,27 @@ def not_worse(
     )
 
 
-def _watch(env: EnvBase, pictures: list[Picture], rows: Mapping[str, int], running: Tensor) -> None:
-    """Show an env to pictures; one that fails is taken out of the list.
+def _watch(
+    env: EnvBase,
+    pictures: list[Picture],
+    rows: Mapping[str, int],
+    running: Tensor,
+    before: TensorDictBase,
+    after: TensorDictBase,
+) -> None:
+    """Show a step of an env to pictures; one that fails is taken out of the list.
 
     Args:
         rows: the row in which each policy drives the first case.
         running: whether each row was in its episode, [rows].
+        before: the entries before the step.
+        after: the entries after it.
     """
     rows = {name: row for name, row in rows.items() if running[row]}
     for picture in list(pictures):
         pictures.remove(picture)
         with decoration(f"the picture {type(picture).__name__}"):
-            picture.watch(env, rows)
+            picture.watch(env, rows, before, after)
             pictures.append(picture)
 
 

@@ -92,6 +92,19 @@ def still_rising(rows: Sequence[Mapping[str, float]]) -> bool:
     return last - before > RISE * (max(returns) - min(returns))
 
 
+def next_in_python(frames: int, rows: Sequence[Mapping[str, float]]) -> str:
+    """Return a line with what usually follows a training in Python.
+
+    Args:
+        frames: of the run.
+        rows: of `metrics.csv`.
+    """
+    longer = f"run.train(frames={2 * frames})"
+    if still_rising(rows):
+        return f"Still rising at the end: {longer}"
+    return f"Next: run.evaluate(cases=100) | run.controller() | {longer}"
+
+
 def next_step(
     folder: Path,
     frames: int,
@@ -105,7 +118,8 @@ def next_step(
         trust: packages that these commands must trust.
     """
     longer = f"{resume_command(folder, trust)} budget.frames={2 * frames}"
-    report = f"coil-report folder={shlex.quote(str(folder.parent))}"
+    swept = (folder.parent / "multirun.yaml").exists()
+    report = f"coil-report folder={shlex.quote(str(folder.parent if swept else folder))}"
     if still_rising(rows):
         return f"Still rising at the end: {longer}"
     return f"Next: {command_of('coil-evaluate', 'run', folder, trust)} | {report} | {longer}"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from numbers import Integral
@@ -49,7 +50,8 @@ from coil_rl.run.folder import (
 from coil_rl.run.guide_returns import guide_returns
 from coil_rl.run.judge import Trial, judge, report_outcome
 from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, try_out
-from coil_rl.run.reasons import SENTENCES, handed_over, next_step, start_test
+from coil_rl.run.reasons import SENTENCES, handed_over, next_in_python, next_step, start_test
+from coil_rl.run.shown import line_of, page_of
 from coil_rl.run.stopping import resume_command
 from coil_rl.run.training import training_of
 
@@ -57,6 +59,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ACCEPT = "accept"  # what a user says to go on with changed code
+# What an interpreter offers of a run; the other names are for the programs.
+PUBLIC = (
+    *("folder", "label", "seed", "settings", "train", "evaluate", "controller", "policy"),
+    *("make_env", "weights"),
+)
 
 
 @dataclass(frozen=True)
@@ -82,7 +89,18 @@ class Budget:
     checkpoint_every: int = 10
 
 
-@dataclass(eq=False)
+@contextmanager
+def as_before() -> Iterator[None]:
+    """Put back the caller's number of threads and random numbers of torch when the block ends."""
+    threads = torch.get_num_threads()
+    try:
+        with torch.random.fork_rng():
+            yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@dataclass(eq=False, repr=False)
 class Run:
     """One training of one method with one seed, and its evaluation.
 
@@ -119,6 +137,7 @@ class Run:
         command: what was typed to make the run.
         trust: packages that a command which goes on with it must trust.
         code: returns the SHA-256 of each file of the user that it depends on, by module.
+        in_python: whether what to do next is said in Python, not for a shell.
 
     Example:
         >>> import coil_rl
@@ -152,6 +171,16 @@ class Run:
     command: Sequence[str] = ()
     trust: Sequence[str] = ()
     code: Callable[[], Mapping[str, str]] = dict
+    in_python: bool = False
+
+    def __repr__(self) -> str:
+        return line_of(self)
+
+    def _repr_html_(self) -> str:
+        return page_of(self)
+
+    def __dir__(self) -> Iterable[str]:
+        return PUBLIC
 
     def __post_init__(self) -> None:
         self.folder = Path(self.folder).absolute()  # the working folder may change
@@ -172,7 +201,10 @@ class Run:
 
     @property
     def resume_command(self) -> str:
-        """The command that continues the run, as a shell reads it."""
+        """What continues the run, as a shell or Python reads it."""
+        if self.in_python:
+            trust = f", trust={list(self.trust)}" if self.trust else ""
+            return f"coil_rl.open_run({str(self.folder)!r}{trust}).train()"
         return resume_command(self.folder, self.trust)
 
     def weights(self, which: str) -> Path:
@@ -188,6 +220,7 @@ class Run:
             )
         return weights_file(self.folder, which if self.delivery == "tested" else "last")
 
+    @as_before()
     def train(self, frames: int | None = None, *, changed: str = "") -> Run:
         """Train to the end, evaluate, and return the run.
 
@@ -213,11 +246,13 @@ class Run:
                 self.finish()
         return self
 
+    @as_before()
     def resume(self) -> float:
         """Finish a run that was stopped; return the mean test reward of its policy."""
         with locked(self.folder):
             return self.finish_begun()
 
+    @as_before()
     def evaluate(self, cases: int | None = None, folder: str | Path | None = None) -> pd.DataFrame:
         """Evaluate the policy and the guides, and return the rows of `evaluation.csv`.
 
@@ -337,6 +372,7 @@ class Run:
         """
         if is_evaluated(self.folder):
             self.check_unchanged()
+            say(f"{self.folder} is finished already, and not trained again", error=True)
             reward = report_outcome(self.folder)
             self._say_next()
             return reward
@@ -408,10 +444,14 @@ class Run:
         return reward
 
     def _say_next(self) -> None:
-        """Print the command that usually follows a training."""
-        if self.has_agent:
-            rows = record.METRICS.need(self.folder)
-            say(next_step(self.folder, self.budget.frames, rows, self.trust))
+        """Print what usually follows a training."""
+        if not self.has_agent:
+            return
+        rows, frames = record.METRICS.need(self.folder), self.budget.frames
+        if self.in_python:
+            say(next_in_python(frames, rows))
+        else:
+            say(next_step(self.folder, frames, rows, self.trust))
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
         """Train, draw the learning curve and return the policy to evaluate."""

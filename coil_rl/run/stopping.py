@@ -1,13 +1,16 @@
 """How a run is stopped by a signal, and by which command it goes on."""
 
 import shlex
+import signal
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
 
 class Stop:
-    """Whether this process is asked to stop, by SIGTERM, SIGHUP or SIGUSR1.
+    """Whether this process is asked to stop, by Ctrl-C, SIGTERM, SIGHUP or SIGUSR1.
 
     A training first ends its update and saves its state. Everything else is interrupted at once,
     and so is a training that is asked twice.
@@ -27,13 +30,26 @@ class Stop:
 
     @contextmanager
     def after_update(self) -> Iterator[None]:
-        """Say that what runs in the block stops by itself."""
+        """Say that what runs in the block stops by itself, also at Ctrl-C in a plain Python."""
         self.requested, before = False, self._patient
         self._patient = True
+        is_plain = (
+            threading.current_thread() is threading.main_thread()
+            and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        )
+        if is_plain:
+            signal.signal(signal.SIGINT, self.interrupt)
         try:
             yield
         finally:
             self._patient = before
+            if is_plain:
+                signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def interrupt(self, signum: int, frame: FrameType | None) -> None:
+        """Raise a `KeyboardInterrupt` at a signal, unless something runs that stops by itself."""
+        if not self.ask():
+            raise KeyboardInterrupt
 
     @contextmanager
     def at_once(self) -> Iterator[None]:

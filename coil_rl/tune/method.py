@@ -41,7 +41,11 @@ class Tuning(Search, OwnRun):
         """Return what makes the run."""
         make_guide = GuideWithNumbers(config)
         return partial(
-            TunedRun, numbers=numbers_to_tune(config), make_guide=make_guide, search=self
+            TunedRun,
+            numbers=numbers_to_tune(config),
+            make_guide=make_guide,
+            search=self,
+            words=make_guide.words,
         )
 
     def found(self, config: DictConfig, folder: Path) -> DictConfig:

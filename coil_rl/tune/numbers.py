@@ -235,6 +235,16 @@ class GuideWithNumbers:
         )
         return guide
 
+    def words(self, values: Mapping[str, float]) -> list[str]:
+        """Return the words of a command line that give the guide some values of its numbers."""
+        name = f"guide.{self.name}"
+        before, after = leaves(self.node), leaves(with_numbers(self.node, name, values))
+        return [
+            f"++{name}.{key}={yaml_text(value)}"
+            for key, value in after.items()
+            if key not in before or before[key] != value
+        ]
+
 
 def with_values(config: DictConfig, values: Mapping[str, float]) -> DictConfig:
     """Return a configuration whose guide has other numbers.

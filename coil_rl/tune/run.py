@@ -5,8 +5,9 @@ policy of the run follows that guide.
 """
 
 import math
+import shlex
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ TUNED = record.json_file("tuned.json", dict[str, float], PUT_BACK)  # numbers of
 NAMES = {OWN: "guide", MEAN: "tuned", BEST: "best_candidate"}  # in delivery.json
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class TunedRun(Run):
     """A run that tunes its guide.
 
@@ -47,12 +48,14 @@ class TunedRun(Run):
         numbers: of the guide that are searched.
         make_guide: makes the guide with some values of them.
         search: settings.
+        words: returns the words of a command line that give the guide some values.
     """
 
     _: KW_ONLY
     numbers: Sequence[Number] = ()
     make_guide: MakeGuide
     search: Search = field(default_factory=Search)
+    words: Callable[[Values], Sequence[str]] = lambda values: ()
 
     @property
     def has_agent(self) -> bool:
@@ -111,6 +114,18 @@ class TunedRun(Run):
         if values is not None:
             found.append(numbers_sentence(values, {each.name: each.own for each in self.numbers}))
         return [*found, *beyond_budget(self.folder, self.budget.frames)]
+
+    def _say_next(self) -> None:
+        """Print what usually follows: a training with the guide itself, faster than this run."""
+        values = read_tuned(self.folder, self.numbers) or {}
+        if self.in_python:
+            numbers = ", ".join(f"{name}={value:.6g}" for name, value in values.items())
+            say(f"Next: coil_rl.train(env, guide=functools.partial(GUIDE, {numbers}))")
+            return
+        typed = [*self.command] or record.COMMAND.read(self.folder) or ["coil-train"]
+        own = ("method=", "method.run.", "tune=", "tune.", "label=", "run_dir=", "existing=")
+        kept = [word for word in typed if not word.lstrip("+").startswith(own)]
+        say(f"Next: {shlex.join([*kept, *self.words(values), 'method=coil_anchored'])}")
 
     def _env_of(self, candidates: Candidates) -> Any:
         """Return what makes the env in which candidates act."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from coil_rl.comparison.entry import Entry
-from coil_rl.comparison.page import command_of, delayed_sentence, few_cases
+from coil_rl.comparison.page import command_of, delayed_sentence, lowest_shown, start_tests
 from coil_rl.comparison.verdict import Verdict
 from coil_rl.config.compose import compose_train
 from coil_rl.config.python import Named
@@ -39,7 +39,7 @@ def test_delay_says_nothing_of_a_distance_that_there_is_not(own):
 )
 def test_printed_command_has_the_values_of_the_comparison(word):
     words = ["env=gym", "env.id='Pendulum-v1'", word]
-    command = command_of(Named(words, {}), Verdict("ppo", "ppo", 1.0, False))
+    command = command_of(Named(words, {}), Verdict("ppo", "ppo", 1.0, 1.0, False))
     program, *printed = shlex.split(command)
     assert (program, printed[1]) == ("coil-train", "env.id=Pendulum-v1")
     place = ["method=ppo", "run_dir=unused"]
@@ -56,8 +56,18 @@ def anchored(seed, **first):
 def test_start_test_of_few_cases_that_held_no_guide_is_said():
     weak = anchored(0, cases=2.0, weight=0.0)
     strong = anchored(1, cases=2.0, weight=1.0), anchored(2, cases=4.0, weight=0.0), anchored(3)
-    assert few_cases(strong) == few_cases(()) == []
-    (sentence,) = few_cases((*strong, weak))
+    assert start_tests(strong) == start_tests(()) == []
+    (sentence,) = start_tests((*strong, weak))
     assert (
         "had only 2 cases in the frames of a training here, and held none in 1 of 4 s" in sentence
     )
+
+
+def test_picture_is_about_the_guide_and_what_is_better():
+    means = {"random": -173.0, "guide": 24.6, "ppo": -170.0}
+    entries = {name: Entry(name, np.full((1, 2), mean)) for name, mean in means.items()}
+    assert lowest_shown(entries) == pytest.approx(24.6 - 19.76)
+    entries["tune"] = Entry("tune", np.full((1, 2), 64.6))
+    assert lowest_shown(entries) == pytest.approx(24.6 - 40)
+    entries["guide"] = entries["random"]
+    assert lowest_shown(entries) is None

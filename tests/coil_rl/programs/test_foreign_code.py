@@ -177,15 +177,23 @@ def test_env_that_ignores_its_seed_and_cannot_draw_is_trained_with_warnings(tmp_
 
 
 @pytest.mark.slow
-def test_flag_of_info_says_which_steps_count(tmp_path):
-    words = [*TINY, "method=ppo", "env.id=odd_plants:Told", "env.info=[late,time]"]
+def test_flag_of_info_says_which_steps_count_and_a_run_is_measured_again(tmp_path):
+    words = [*TINY, "method=ppo", "env.id=odd_plants:Told", "env.info=[late]"]
     measure = "evaluation.measures.after"
-    words += [f"{measure}.entry=[info,time]", f"{measure}.reduction=count"]
-    words += [f"{measure}.where=[info,late]", "evaluation.gif=false"]
+    counted = [f"{measure}.reduction=count", f"{measure}.where=[info,late]"]
+    words += [f"{measure}.entry=[info,late]", *counted, "evaluation.gif=false"]
     called("train", *words, cwd=tmp_path)
-    with (tmp_path / "run" / "episodes.csv").open(newline="") as file:
-        found = {row["after"] for row in csv.DictReader(file)}
-    assert found == {"7.0"}, "steps 6 to 12"
+    again = ["run=run", "trust=[odd_plants]", "hydra.run.dir=again", "env.info=[time]"]
+    again.append("evaluation.measures.end={entry: [info, time], reduction: last}")
+    called("evaluate", *again, cwd=tmp_path)
+    found = {}
+    for folder in ("run", "again"):
+        with (tmp_path / folder / "episodes.csv").open(newline="") as file:
+            found[folder] = list(csv.DictReader(file))
+    assert {row["after"] for row in found["run"]} == {"7.0"}, "steps 6 to 12"
+    assert {row["after"] for row in found["again"]} == {"7.0"}
+    assert {row["end"] for row in found["again"]} == {"12.0"}
+    assert (tmp_path / "again" / "in_time.png").exists()
 
 
 class Model:

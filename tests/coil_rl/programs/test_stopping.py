@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import time
+from functools import partial
 
 import pytest
 from programs import TINY, called, command, environment, program
@@ -18,9 +19,16 @@ SMALL = [*TINY, "evaluation.gif=false", "method=ppo", "learner.epochs=1"]
 LONG = [*SMALL, "budget.frames=200_000", "checkpoint_every=10_000"]
 
 
+def _heed(number):
+    plain = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+    signal.signal(number, plain)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "number", [signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP], ids=lambda number: number.name
+    "number",
+    [signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP],
+    ids=lambda number: number.name,
 )
 def test_signal_saves_the_present_update_and_says_how_to_go_on(tmp_path, number):
     folder = tmp_path / "a run"
@@ -32,7 +40,7 @@ def test_signal_saves_the_present_update_and_says_how_to_go_on(tmp_path, number)
         stderr=subprocess.PIPE,
         text=True,
         # As in a terminal: under nohup the tests ignore SIGHUP, and so would the program.
-        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),
+        preexec_fn=partial(_heed, number),
     )
     log = folder / "metrics.csv"
     deadline = time.monotonic() + 120

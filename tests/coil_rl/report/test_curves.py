@@ -1,3 +1,4 @@
+import io
 import math
 
 import numpy as np
@@ -113,3 +114,12 @@ def test_frames_until_a_level_are_interpolated():
     frames, returns = [0, 100, 200, 300], [0.0, 50.0, 40.0, 90.0]
     assert [frames_until(frames, returns, level) for level in (50, 65, -1)] == [100, 250, 0]
     assert all(math.isnan(frames_until(frames, returns, level)) for level in (91, math.nan))
+
+
+def test_curve_below_the_axis_is_said():
+    bad = [{"frames": n, RETURN: -9e4} for n in range(5)]
+    picture = io.BytesIO()
+    draw_learning_curves({"good": [run(0)], "bad": [bad]}, picture, least=200.0)
+    text = picture.getvalue().decode()
+    assert "bad ends at -90000.0" in text
+    assert "good ends" not in text

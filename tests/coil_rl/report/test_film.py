@@ -35,7 +35,7 @@ def drive(steps=30, reward=10.0):
 def filmed(screen, steps, rows=AGENT, **options):
     film = Film(**options)
     for _ in range(steps):
-        film.watch(screen, rows)
+        film.watch(screen, rows, None, None)
     return film
 
 
@@ -103,7 +103,7 @@ def test_a_second_evaluation_has_a_film_of_its_own(tmp_path):
     film = filmed(screen, 10, every=1)
     film.draw({"agent": drive(10)}, tmp_path)
     for _ in range(4):
-        film.watch(screen, AGENT)
+        film.watch(screen, AGENT, None, None)
     film.draw({"agent": drive(4)}, tmp_path)
     assert len(frames(tmp_path)) == 4
 
@@ -123,6 +123,6 @@ def test_film_that_would_be_cut_has_no_file(tmp_path):
     screen = Screen()
     film = filmed(screen, 6, every=1)
     screen.size = None  # the env cannot draw any more
-    film.watch(screen, AGENT)
+    film.watch(screen, AGENT, None, None)
     film.draw({"agent": drive(7)}, tmp_path)
     assert not list(tmp_path.iterdir())

@@ -10,7 +10,7 @@ from coil_rl.errors import UserError
 from coil_rl.report import draw_learning_curves, page, style
 from coil_rl.report.comparison import compare
 from coil_rl.report.figures import draw_report, films
-from coil_rl.report.html import SCRIPT, Section, html_page, moving, svg
+from coil_rl.report.html import SCRIPT, Section, embedded, html_page, svg
 from coil_rl.report.runs import read_runs
 from coil_rl.report.table import Table
 
@@ -113,8 +113,9 @@ def test_equal_pictures_are_equal_texts():
 
 
 def test_file_that_is_no_picture_is_refused(tmp_path):
-    assert moving(WEBP).startswith("data:image/webp;base64,")
-    assert moving(b"GIF89a" + EVIL.encode()).startswith("data:image/gif;base64,")
+    assert embedded(WEBP).startswith("data:image/webp;base64,")
+    assert embedded(b"\x89PNG\r\n\x1a\n").startswith("data:image/png;base64,")
+    assert embedded(b"GIF89a" + EVIL.encode()).startswith("data:image/gif;base64,")
     folder = make_run(
         tmp_path / "run", "coil", 0, driven("guide", {"a": 1.0}) + driven("coil", {"a": 2.0})
     )

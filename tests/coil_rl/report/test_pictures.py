@@ -41,7 +41,7 @@ def names(folder):
 def test_driven_lines_are_drawn_with_an_animation(measures, tmp_path):
     picture = DrivenLines(TRACKS)
     assert picture.record == {"pose": ("info", "pose")}
-    picture.watch(None, {})
+    picture.watch(None, {}, None, None)
     assert not picture.watches
     picture.draw({"guide": drive(), "agent": drive(**measures)}, tmp_path)
     assert names(tmp_path) == {"lines.png", "lines.gif"}

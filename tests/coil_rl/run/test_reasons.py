@@ -90,7 +90,7 @@ def test_next_command_is_quoted_and_doubles_the_frames():
     line = next_step(Path("my runs/one"), 1000, curve_of(0, 1, 2, 3))
     assert line == "Still rising at the end: coil-train 'resume=my runs/one' budget.frames=2000"
     line = next_step(Path("runs/one"), 1000)
-    assert "coil-evaluate run=runs/one | coil-report folder=runs |" in line
+    assert "coil-evaluate run=runs/one | coil-report folder=runs/one |" in line
 
 
 def test_next_command_trusts_what_the_command_of_the_run_named():

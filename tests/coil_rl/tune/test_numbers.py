@@ -156,3 +156,14 @@ def test_mistake_is_one_sentence_that_says_what_exists(overrides, sentence):
     given = overrides.replace(" tune", "|tune").split("|")
     with pytest.raises(UserError, match=sentence):
         numbers_to_tune(composed("env=pendulum", *given))
+
+
+@pytest.mark.parametrize(
+    ("env", "values"),
+    [("pendulum", {"gain": 7.123456789012345}), ("cart_pole", {"weights.1": -0.5, "weights.3": 1})],
+)
+def test_words_give_the_controller_itself_its_numbers(env, values):
+    make = GuideWithNumbers(composed(f"env={env}"))
+    config = composed(f"env={env}", *make.words(values))
+    found = numbers_of(GuideWithNumbers(config).node, make.name)
+    assert {name: found[name][0] for name in values} == values
