@@ -20,6 +20,10 @@ IN_THE_WAY = (
 )
 
 
+# What libraries say where there is no memory for tensors, threads or a library.
+NO_MEMORY = ("allocate memory", "bad_alloc", "failed to map segment", "start new thread")
+
+
 class UserError(Exception):
     """A mistake in the input of the user.
 
@@ -34,6 +38,17 @@ class RunningError(UserError):
 def is_outside(error: BaseException) -> bool:
     """Return whether an error has its cause in the user's input, or in code of other people."""
     return isinstance(error, UserError) or bool(getattr(error, "outside", False))
+
+
+def lacks_memory(error: BaseException | None) -> bool:
+    """Return whether an error, or one that it comes from, is about a lack of memory."""
+    while error is not None:
+        if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+            return True
+        if any(text in str(error) for text in NO_MEMORY):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 @contextmanager

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from coil_rl.envs import Degrees, Perception
+from coil_rl.envs.recordings import in_order
 from coil_rl.envs.robot import BoundaryMemory
 from coil_rl.ranges import Positive, checked
 from coil_robot.watchdog import Limits, Scan, Watchdog
@@ -184,7 +185,7 @@ class LiveDriver:
         found, number = self.perception(scan.returns()[None], scan.angles)
         cones, count = torch.from_numpy(found).float(), torch.from_numpy(number)
         entries, valid = self._entries(cones, count, way)
-        reason = self.watchdog.of_view(valid, now)
+        reason = self.watchdog.of_view(valid, in_order(found, number), now)
         if reason:
             return self._fail(reason, now, scan, valid, entries)
         try:

@@ -25,7 +25,7 @@ class Drive:
     Attributes:
         scans: number of scans.
         states: number of scans after which the driver was in each state.
-        stops: s of the clock and reason of each stop.
+        stops: s since the start and reason of each stop.
         waits: number of scans after which the driver waited, by the reason.
         milliseconds: of CPU for each scan that was driven by.
         laps: completed, of the simulated robot; None where nobody counts them.
@@ -47,10 +47,11 @@ class _Watched:
     Args:
         driver: of a car.
         lift_after: s after which a stop is lifted; None: never.
+        start: s of the clock.
     """
 
-    def __init__(self, driver: LiveDriver, lift_after: float | None) -> None:
-        self.driver, self.lift_after, self.drive = driver, lift_after, Drive()
+    def __init__(self, driver: LiveDriver, lift_after: float | None, start: float = 0.0) -> None:
+        self.driver, self.lift_after, self.start, self.drive = driver, lift_after, start, Drive()
         self.stopped_at: float | None = None
 
     def scan(self, scan: Scan, now: float) -> Command:
@@ -79,7 +80,7 @@ class _Watched:
         """Note a stop."""
         if self.driver.state == "stopped" and self.stopped_at is None:
             self.stopped_at = now
-            self.drive.stops.append((now, self.driver.reason))
+            self.drive.stops.append((now - self.start, self.driver.reason))
 
     def _lift(self, now: float) -> None:
         if self.stopped_at is None or self.lift_after is None:
@@ -99,7 +100,8 @@ def drive_recording(
     Args:
         lift_after: s after which a stop is lifted; None: never.
     """
-    watched, before = _Watched(driver, lift_after), None
+    watched = _Watched(driver, lift_after, recording.log_time[0] / 1e9)
+    before = None
     for scan, now in scans_of(recording):
         if before is not None:
             watched.ticks(before, now)

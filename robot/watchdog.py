@@ -18,6 +18,7 @@ from coil_rl.ranges import Positive, Share, checked
 
 INTERVALS = 6  # between scans, of which the median is the rate
 NEAR = 1.5  # m, ranges that change as the car moves
+ORDERED = 6  # last scans with cones of both sides
 FEWEST_NEAR = 10  # ranges by which a scan tells whether the car moves
 
 
@@ -64,6 +65,7 @@ class Limits:
         speed_tolerance: share of the commanded speed by which the measured one may differ.
         turn_tolerance: radians/s by which the measured turn rate may differ.
         still: share of the way between two scans; the car stands if ranges change by less.
+        late: turns by which a scan may come later than the quickest one, as from a queue.
 
     Raises:
         ValueError: for a value outside its range.
@@ -79,6 +81,7 @@ class Limits:
     speed_tolerance: Positive = 0.5
     turn_tolerance: Positive = 0.3
     still: Share = 0.2
+    late: Positive = 2.0
 
     def __post_init__(self) -> None:
         if self.longest_gap <= 1 / self.rate:
@@ -103,6 +106,8 @@ class Watchdog:
         """Begin anew, as before the first scan."""
         self.stamps: deque[float] = deque(maxlen=INTERVALS + 1)
         self.arrivals: deque[float] = deque(maxlen=INTERVALS + 1)
+        self.quickest = math.inf  # s between stamp and arrival, on two clocks
+        self.ordered: deque[bool] = deque(maxlen=ORDERED)  # whether the left cones lay left
         self.seen = -math.inf  # when both boundaries were seen last
         self.last: NDArray[np.float32] | None = None  # ranges of the last scan
         self.beams = 0
@@ -121,8 +126,17 @@ class Watchdog:
         if reason is None:
             self.stamps.append(scan.stamp)
             self.arrivals.append(now)
-            reason = self._of_rate()
+            reason = self._of_age(now - scan.stamp) or self._of_rate()
         return reason
+
+    def _of_age(self, age: float) -> str | None:
+        self.quickest = min(self.quickest, age)
+        later = age - self.quickest
+        if later > self.limits.late / self.limits.rate:
+            return (
+                f"scans that come late: {later:.2f} s later than the quickest one, as from a queue"
+            )
+        return None
 
     def _of_content(self, scan: Scan) -> str | None:
         if np.ndim(scan.ranges) != 1 or not np.size(scan.ranges):
@@ -179,16 +193,26 @@ class Watchdog:
                 )
         return None
 
-    def of_view(self, valid: NDArray[np.bool_], now: float) -> str | None:
-        """Return why the car stops by what it sees: no boundaries for too long.
+    def of_view(
+        self, valid: NDArray[np.bool_], ordered: NDArray[np.bool_], now: float
+    ) -> str | None:
+        """Return why the car stops by what it sees: no boundaries for too long, or the wrong ones.
 
         Args:
             valid: [2], whether each side is valid in this scan.
+            ordered: [1], whether the left cones lie left; [0] without cones of both sides.
             now: s.
         """
-        if bool(valid.all()):
+        self.ordered.extend(ordered.tolist())
+        if bool(valid.all()) and bool(ordered.all()):
             self.seen = now
-        if self.seen == -math.inf:
+        wrong, begins = self.ordered.count(False), self.seen == -math.inf
+        if wrong > ORDERED / 2 or (begins and wrong):
+            return (
+                f"scans that are mirrored or turned: left cones right of the right ones in {wrong} "
+                f"of the last {len(self.ordered)}, see perception.laser_yaw"
+            )
+        if begins:
             return "no view of both boundaries yet"
         if now - self.seen > self.limits.blind:
             return f"no view of both boundaries for {now - self.seen:.1f} s"

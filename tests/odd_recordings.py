@@ -245,6 +245,41 @@ def gaps(drive):
     del drive.scans[10:15], drive.scans[20:28]
 
 
+def bursts(drive, period=400_000_000):
+    for messages in (drive.scans, drive.commands, drive.odometry):
+        messages[:] = [(-(-time // period) * period, fields) for time, fields in messages]
+
+
+def bursts_of_scans(drive):
+    kept = drive.commands, drive.odometry
+    bursts(drive)
+    drive.commands, drive.odometry = kept
+
+
+def long_bursts_in_order(drive):
+    bursts(drive, 10**9)
+    drive.scans = [(time + n * 1000, fields) for n, (time, fields) in enumerate(drive.scans)]
+    drive.commands = [(time + n * 1000, fields) for n, (time, fields) in enumerate(drive.commands)]
+
+
+def bursts_of_stamped_commands(drive):
+    stamped_commands(drive)
+    bursts(drive)
+
+
+def two_scanners_on_a_topic(drive):
+    for time, fields in list(drive.scans):
+        other = fields | {"ranges": np.roll(fields["ranges"], 60), "stamp_ns": 0}
+        other["header"] = header(fields["stamp_ns"] + 91_000_000, "laser")
+        drive.scans.append((time + 91_000_000, other))
+
+
+def pairs_of_scans(drive):
+    for time, fields in list(drive.scans):
+        other = fields | {"header": header(fields["stamp_ns"] + 9_000_000, "laser")}
+        drive.scans.append((time + 9_000_000, other))
+
+
 def one_log_time(drive):
     for messages in (drive.scans, drive.commands, drive.odometry):
         messages[:] = [(10**9, fields) for _, fields in messages]
@@ -264,6 +299,57 @@ def commands_before_the_drive(drive):
 def commands_in_degrees(drive):
     for _, fields in drive.commands:
         fields["angular"]["z"] *= 180 / np.pi
+
+
+def _change(drive, part, name, factor):
+    for _, fields in drive.commands:
+        fields[part][name] *= factor
+
+
+def commands_in_cm(drive):
+    _change(drive, "linear", "x", 100)
+
+
+def commands_in_throttle(drive):
+    _change(drive, "linear", "x", 4)
+
+
+def commands_to_the_other_side(drive):
+    _change(drive, "angular", "z", -1)
+
+
+def commands_of_half_a_turn(drive):
+    _change(drive, "angular", "z", 0.5)
+
+
+def commands_a_second_late(drive):
+    drive.commands = [(time + 10**9, fields) for time, fields in drive.commands]
+
+
+def commands_two_seconds_early(drive):
+    drive.commands = [(time - 10**9, fields) for time, fields in drive.commands]
+
+
+def commands_of_another_drive(drive):
+    times = [time for time, _ in drive.commands]
+    fields = [fields for _, fields in drive.commands]
+    drive.commands = list(zip(times, fields[20:] + fields[:20], strict=True))
+
+
+def odometry_in_cm(drive):
+    for _, fields in drive.odometry:
+        for axis in "xy":
+            fields["pose"]["pose"]["position"][axis] *= 100
+
+
+def odometry_in_cm_and_commands_without_speed(drive):
+    odometry_in_cm(drive)
+    commands_without_speed(drive)
+
+
+def odometry_of_the_other_side(drive):
+    for _, fields in drive.odometry:
+        fields["pose"]["pose"]["orientation"]["z"] *= -1
 
 
 def commands_without_numbers(drive):
@@ -342,6 +428,14 @@ def two_types_of_commands(drive):
     ]
 
 
+def stamped_commands_by_turns(drive):
+    drive.more = [
+        ("/cmd_vel", TWIST_STAMPED, time, {"header": header(time, "base"), "twist": fields})
+        for time, fields in drive.commands[1::2]
+    ]
+    del drive.commands[1::2]
+
+
 def other_topic_of_odometry(drive):
     drive.more = [("/pf/odom", ODOMETRY, *each) for each in drive.odometry]
     drive.odometry = []
@@ -383,10 +477,26 @@ ODD = {
     stamps_three_times_too_fast: "run 3 times as fast",
     slow_scanner: "0.275 scans a second",
     gaps: "2 gaps of more than 2.5 turns without a scan, the longest of 1.6 s",
+    bursts: "logged up to 0.36 s late",
+    bursts_of_scans: "logged up to 0.36 s late",
+    long_bursts_in_order: "logged up to 0.91 s late",
+    bursts_of_stamped_commands: "logged up to 0.36 s late",
+    two_scanners_on_a_topic: "as those of two scanners",
+    pairs_of_scans: "as those of two scanners",
     one_log_time: "log times that are all the same",
     commands_end_early: "no command of the last 0.55 s at",
     commands_before_the_drive: "no command of the last 0.55 s at 44 of 44 scans (44 on /cmd_vel)",
     commands_in_degrees: "beyond what the robot can steer",
+    commands_in_cm: "drives 0.01 times as fast as it is told (0.15 for 15 m/s)",
+    commands_in_throttle: "drives 0.25 times as fast as it is told",
+    commands_to_the_other_side: "against its commands",
+    commands_of_half_a_turn: "times as fast as it is told",
+    commands_a_second_late: "before its commands",
+    commands_two_seconds_early: "after its commands",
+    commands_of_another_drive: "with the commands, by its odometry",
+    odometry_in_cm: "drives 100 times as fast as it is told",
+    odometry_in_cm_and_commands_without_speed: "that of the odometry, 15 m/s, is taken",
+    odometry_of_the_other_side: "against its commands",
     commands_without_numbers: "5 of 44 commands",
     commands_of_zeros: "only zeros",
     commands_without_speed: "commands without a speed",
@@ -400,9 +510,36 @@ ODD = {
     two_topics_of_commands: "commands on /cmd_vel, which are read, and on /joy_vel",
     two_other_topics_of_commands: "choose with command=/joy_vel or command=/nav_vel",
     two_types_of_commands: "several types on topic /cmd_vel",
+    stamped_commands_by_turns: "where one of the 22 others was the last",
     other_topic_of_odometry: "choose with odometry=/pf/odom",
     short_odometry: "no odometry at the time of",
 }
+
+# Those of which a replay tells: the perception, the size of the robot, or the odometry.
+OF_A_REPLAY = (
+    mirrored,
+    backwards,
+    turned_left,
+    clockwise_with_a_positive_step,
+    room,
+    commands_in_degrees,
+    ackermann_in_degrees,
+    commands_in_cm,
+    commands_in_throttle,
+    commands_to_the_other_side,
+    commands_of_half_a_turn,
+    commands_a_second_late,
+    commands_two_seconds_early,
+    commands_of_another_drive,
+    odometry_in_cm,
+    odometry_of_the_other_side,
+)
+IN_BURSTS = (
+    bursts,
+    bursts_of_scans,
+    long_bursts_in_order,
+    bursts_of_stamped_commands,
+)
 
 
 # Folders of rosbag2

@@ -45,7 +45,7 @@ from coil_rl.config.python import Named, composed, named, new_folder
 from coil_rl.config.trust import trust_own
 from coil_rl.config.unread import check_read
 from coil_rl.errors import UserError
-from coil_rl.files import FAILED_JOBS, write_text
+from coil_rl.files import FAILED_JOBS, remove_unfinished, write_text
 from coil_rl.output import decoration, quietly, say
 from coil_rl.record import json_file
 from coil_rl.report import write_csv
@@ -184,6 +184,7 @@ class Comparison:
         is_new = not lock.exists()
         made = [each for each in (self.folder, *self.folder.parents) if not each.exists()]
         with locked(self.folder):
+            remove_unfinished(self.folder)
             try:
                 yield
             except BaseException:

@@ -23,7 +23,7 @@ from omegaconf.errors import (
 from yaml.error import MarkedYAMLError
 
 from coil_rl import conf
-from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean, is_outside
+from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean, is_outside, lacks_memory
 from coil_rl.plain_yaml import entries
 from coil_rl.run.folder import is_begun
 
@@ -70,7 +70,7 @@ def is_no_bug(error: BaseException) -> bool:
 
     That is the input, the configuration, an env or controller of somebody else, or the disk.
     """
-    outside = is_outside(error) or isinstance(error, OmegaConfBaseException)
+    outside = is_outside(error) or isinstance(error, OmegaConfBaseException) or lacks_memory(error)
     return outside or getattr(error, "errno", None) in (*NO_SPACE, *IN_THE_WAY)
 
 
@@ -97,6 +97,11 @@ def _message(error: BaseException) -> str:
     """Return the message of an error, which may have several lines."""
     if isinstance(error, UserError):
         return str(error)
+    if lacks_memory(error):
+        return (
+            "there is not enough memory; free some, or make it smaller, such as budget.num_envs or "
+            "the network"
+        )
     if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
         mark = error.problem_mark
         place = "" if mark.name.startswith("<") else f"{mark.name}, "  # of a text that was read
@@ -186,9 +191,7 @@ def _unusable_file(error: OSError) -> str:
             f"{name} cannot be used ({error.strerror}); "
             "put the right file or folder there, with the right to use it"
         )
-    return (
-        f"{name} cannot be used ({error.strerror}); choose another folder with hydra.run.dir=FOLDER"
-    )
+    return f"{name} cannot be used ({error.strerror}); choose another folder, or make room"
 
 
 def _unknown_file(error: MissingConfigException) -> str:

@@ -19,7 +19,7 @@ from pydantic_core import SchemaError
 from torchrl.envs import Transform
 
 from coil_rl.config.messages import similar
-from coil_rl.errors import UserError
+from coil_rl.errors import UserError, lacks_memory
 from coil_rl.ranges import adapter, settings_of, validation_message, yaml_text
 
 # Largest numbers of arguments of other libraries, by class: memory grows with them, and the
@@ -54,6 +54,8 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
         built = hydra.utils.instantiate({**node, "_convert_": "all"}, **arguments)
     except hydra.errors.InstantiationException as error:
         cause = error.__cause__
+        if lacks_memory(cause):
+            raise UserError(f"{name}: there is not enough memory; make it smaller") from error
         if isinstance(cause, (UserError, ValueError, KeyError, TypeError, AttributeError, OSError)):
             message = cause.args[0] if isinstance(cause, KeyError) and cause.args else cause
             raise UserError(
@@ -65,8 +67,6 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
             ) from error
         if cause is None:  # Hydra itself refuses to call the target
             raise UserError(f"{name}: {error}") from error
-        if isinstance(cause, MemoryError) or "allocate" in str(cause):
-            raise UserError(f"{name}: there is not enough memory; make it smaller") from error
         raise
     if expected is not None and not isinstance(built, expected):
         raise UserError(
@@ -138,14 +138,27 @@ def find_target(path: Any, name: str) -> Callable[..., Any]:
     except UserError as error:  # an extra is missing
         raise UserError(f"{name}: {error}") from error
     except Exception as error:
+        cause, parts = error.__cause__ or error, str(path).split(".")
+        if isinstance(cause, ImportError | AttributeError) and _is_named(cause, parts):
+            raise UserError(
+                f"{name}: there is no {path!r}; check the spelling, and that its package is "
+                "installed"
+            ) from error
         raise UserError(
-            f"{name}: there is no {path!r}; check the spelling, and that its package is installed"
+            f"{name}: {path} cannot be imported ({type(cause).__name__}: "
+            f"{textwrap.shorten(str(cause), 200, placeholder=' ...')}); mend what it needs"
         ) from error
     if not callable(target):
         raise UserError(
             f"{name}: {path} is {target!r}, which cannot be called; give a class or a function"
         )
     return target
+
+
+def _is_named(error: ImportError | AttributeError, parts: Sequence[str]) -> bool:
+    """Return whether an error is about a part of a full name, not about what is behind it."""
+    missing = str(error.name or parts[-1]).split(".")
+    return list(parts[: len(missing)]) == missing or (len(missing) == 1 and missing[0] in parts)
 
 
 def build_all(nodes: Mapping[str, Any], name: str) -> list[Transform]:

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from coil_rl.config.nodes import build, build_all, find_target
 from coil_rl.config.own_run import own_run
 from coil_rl.errors import UserError
+from coil_rl.foreign.guard import hold
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import MEAN_CASE, measures_of
 from coil_rl.plain_yaml import entries
@@ -317,7 +318,7 @@ def build_nodes_of_guides(nodes: Mapping[str, Any]) -> dict[str, TensorDictModul
     """Return guides by name."""
     guides = {}
     for name, node in nodes.items():
-        guides[str(name)] = build(node, f"guide.{name}", TensorDictModuleBase)
+        guides[str(name)] = hold(build(node, f"guide.{name}", TensorDictModuleBase))
     return guides
 
 

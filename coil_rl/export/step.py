@@ -175,8 +175,6 @@ def _flat(policy: TensorDictModuleBase) -> Iterable[TensorDictModuleBase]:
     if isinstance(policy, TensorDictSequential):
         for module in policy.module:
             yield from _flat(module)
-    elif not all(getattr(part, "is_network", True) for part in policy.modules()):
-        raise NotExportableError("it is a forest, not a network")
     elif isinstance(policy, GRUModule):
         yield WrittenGru(policy)
     else:

@@ -22,14 +22,12 @@ from torch import nn
 
 from coil_rl.errors import did_you_mean
 from coil_rl.foreign.faults import ForeignError, foreign, shown
-from coil_rl.foreign.guard import Guard
+from coil_rl.foreign.guard import NUMBERS, Guard, hold
 from coil_rl.foreign.host import Host, Predictor, called, check_call, role_of
 from coil_rl.foreign.remembered import copied, maker_of_rows, restore, state_of
 from coil_rl.foreign.shared import FunctionGuide, NetworkGuide
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key, written_key
 from coil_rl.transforms.hosted import HostedGuide, ToldGuide
-
-NUMBERS = "global random numbers"  # key of a saved state
 
 
 class PerRow(HostedGuide):
@@ -313,7 +311,7 @@ def _of_module(module: nn.Module, title: str, keys: list[NestedKey] | None) -> T
     if isinstance(module, TensorDictModuleBase):
         if keys is not None:
             raise ValueError(f"of={title} has its own in_keys={module.in_keys}; leave in_keys out")
-        return module
+        return hold(module)
     read = keys or ["observation"]
     if role_of(module) != "act":
         return NetworkGuide(module, read, title)

@@ -5,6 +5,7 @@ the folder would break the paths of the run. So foreign code has its own: what i
 is called again, and what the process had is back after each call.
 """
 
+import ctypes
 import logging
 import os
 import random
@@ -14,17 +15,24 @@ import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch import _tensor_str as tensor_str
 
 WATCHED = 12  # first calls of a row, more than in a trial: does it use the global numbers?
+NUMBERS = "global random numbers"  # key of a saved state
 SEEDS = 2**32  # seeds of NumPy are below
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
 LOGGERS = (logging.root, logging.getLogger("coil_rl"))
+# Python's global generator, and its state in place: an index and 624 numbers of four bytes. Its
+# `getstate` takes fifty times as long, because it makes an object of each number.
+_PYTHON: Any = random._inst
+_STATE: Any = (ctypes.c_char * (4 * 625)).from_address(id(_PYTHON) + object.__basicsize__)
 
 
 def _folder() -> str | None:
@@ -212,10 +220,7 @@ def _set_torch(states: Sequence[Tensor]) -> None:
 
 
 def _equal(states: Sequence[Tensor], others: Sequence[Tensor]) -> bool:
-    return all(
-        state.numpy().tobytes() == other.numpy().tobytes()
-        for state, other in zip(states, others, strict=False)
-    )
+    return all(map(torch.equal, states, others))
 
 
 class Guard:
@@ -228,7 +233,6 @@ class Guard:
     def __init__(self) -> None:
         self.theirs: dict[int, Any] = {}  # what the foreign code has set, by its place in SETTINGS
         self.bits, self.same_bits = np.random.MT19937(0), np.random.MT19937(0)
-        self.same_python = random.Random()
         self.touched, self.count = False, QUICK
 
     def whole(self) -> "Guard":
@@ -240,9 +244,9 @@ class Guard:
         self.settings = [get() for get, _ in SETTINGS[: self.count]]
         for place, value in self.theirs.items():
             SETTINGS[place][1](value)
-        self.numbers = np.random.mtrand.get_bit_generator(), _of_torch(), random.getstate()
+        self.numbers = np.random.mtrand.get_bit_generator(), _of_torch(), _STATE.raw
+        self.gauss = _PYTHON.gauss_next
         np.random.mtrand.set_bit_generator(self.bits)
-        self.same_python.setstate(self.numbers[2])
 
     def __exit__(self, *_: object) -> None:
         bits, of_torch, python = self.numbers
@@ -250,11 +254,11 @@ class Guard:
         # A number that is drawn shows whether others were, in less time than a comparison.
         self.touched = (
             self.bits.random_raw() != self.same_bits.random_raw()
-            or random.random() != self.same_python.random()
+            or _STATE.raw != python
             or not _equal(_of_torch(), of_torch)
         )
-        random.setstate(python)
         if self.touched:
+            _STATE.raw, _PYTHON.gauss_next = python, self.gauss
             _set_torch(of_torch)
             self.bits, self.same_bits = np.random.MT19937(0), np.random.MT19937(0)
         for place, before in enumerate(self.settings):
@@ -266,3 +270,53 @@ class Guard:
             if put is not _set_handlers:  # without ours a Ctrl-C would be missed
                 self.theirs[place] = now
         self.count = QUICK if not self.theirs else len(SETTINGS)
+
+
+class Held:
+    """Hooks of a guide of other people: a guard around its calls, and random numbers of its own.
+
+    The numbers are a part of the state of the guide.
+
+    Args:
+        guide: the guide.
+    """
+
+    def __init__(self, guide: TensorDictModuleBase) -> None:
+        self.guard = Guard()
+        self.numbers: Numbers | None = None  # not seeded yet
+        guide.register_forward_pre_hook(self.before)
+        guide.register_forward_hook(self.after, always_call=True)
+        guide.register_state_dict_post_hook(partial(self.save))
+        guide.register_load_state_dict_pre_hook(self.load)
+
+    def before(self, *_: object) -> None:
+        """Begin a block, but where a call is traced: that has no effect on the process."""
+        if torch.compiler.is_compiling():
+            return
+        if self.numbers is None:
+            self.numbers = Numbers(torch.initial_seed())
+        self.guard.__enter__()
+        self.numbers.__enter__()
+
+    def after(self, *_: object) -> None:
+        """End the block."""
+        if self.numbers is not None and not torch.compiler.is_compiling():
+            self.numbers.__exit__()
+            self.guard.__exit__()
+
+    def save(self, _: object, state: dict[str, Any], prefix: str, *__: object) -> None:
+        """Add the numbers to the state of the guide, if it uses any."""
+        if self.numbers is not None and self.numbers.used:
+            state[f"{prefix}{NUMBERS}"] = self.numbers.state_dict()
+
+    def load(self, _: object, state: dict[str, Any], prefix: str, *__: object) -> None:
+        """Take the numbers out of a state."""
+        self.numbers = Numbers(torch.initial_seed())
+        self.numbers.load_state_dict(state.pop(f"{prefix}{NUMBERS}", {}))
+
+
+def hold(guide: TensorDictModuleBase) -> TensorDictModuleBase:
+    """Keep from the process what a guide does to it, unless it is one of this package."""
+    if type(guide).__module__.partition(".")[0] != "coil_rl":
+        Held(guide)
+    return guide

@@ -4,7 +4,7 @@ import importlib
 import inspect
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
 
@@ -90,8 +90,7 @@ def make_env(
 
 def _check_statistics(env: Env, name: str) -> None:
     """Refuse wrappers that normalise by statistics, which a new env of an evaluation lacks."""
-    layer: Any = env
-    while layer is not None:
+    for layer in layers(env):
         kinds = {kind.__name__ for kind in type(layer).__mro__}
         if any(kind.startswith("NormalizeObservation") for kind in kinds):
             raise ValueError(
@@ -104,7 +103,13 @@ def _check_statistics(env: Env, name: str) -> None:
                 "that a table shows by statistics of its own; leave it out, returns are the env's "
                 "own"
             )
-        layer = getattr(layer, "env", None)
+
+
+def layers(env: Any) -> Iterator[Any]:
+    """Yield an env and what is in its wrappers."""
+    while env is not None:
+        yield env
+        env = getattr(env, "env", None)
 
 
 def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from types import FunctionType, ModuleType
+from types import CellType, FunctionType, ModuleType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -29,6 +29,7 @@ from coil_rl.foreign.controllers import PerRow
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.foreign.host import called, is_of_user
+from coil_rl.foreign.makers import layers
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import (
     first_choices,
@@ -42,7 +43,9 @@ from coil_rl.transforms.guide_actions import UnfitActionError
 STEPS, FEWEST = 10, 3
 PATIENCE = 0.02  # s, of a rollout; a slower env takes fewer steps
 PAUSE, PAUSED = 0.02, 3  # s, and how many steps have it
-DATA = (int, float, list, dict, set, np.ndarray, Tensor)  # what classes may hold of their rows
+QUICK, SLOW = 1e-6, 1e-4  # s, of a reading of the clock, without and with pauses
+# What classes may hold of their rows.
+DATA = (int, float, list, dict, set, deque, np.ndarray, Tensor)
 LARGEST_SEED = 2**64  # of a person
 
 Kind = Literal["finite", "seed", "clock", "bounds", "input", "rows", "draws", "past"]
@@ -79,6 +82,7 @@ class Trial:
         self.base = env.base_env if isinstance(env, TransformedEnv) else env
         self.findings: list[Finding] = []
         self.seconds: dict[str, float] = {}
+        self.clock = Clock()
         if isinstance(self.base, GymnasiumEnv):
             self.base.stay_in_process()
         if patience < math.inf:
@@ -124,20 +128,19 @@ class Trial:
             state: of the transforms, which have no seed.
             pause: before each of the first steps, in seconds.
         """
-        act = _random(self.env)
-        clock, left = _Clock(), [PAUSED if pause else 0]
+        act, left = _random(self.env), [PAUSED if pause else 0]
 
         def policy(data: TensorDictBase) -> TensorDictBase:
             if left[0]:
                 left[0] -= 1
-                clock.pause(pause)
+                self.clock.pause(pause)
             return act(data)
 
         if state is not None:
             self.env.load_state_dict(state)
         self.env.set_seed(seed)
         torch.manual_seed(0)  # of the actions
-        with clock:
+        with self.clock:
             return self.env.rollout(self.steps, policy, break_when_any_done=False)
 
     def _look_at_numbers(self, rollout: TensorDictBase) -> None:
@@ -159,9 +162,9 @@ class Trial:
         self.find(
             "seed",
             f"the same seed gives other values of {written_key(key)}: the env does not obey its "
-            "seed, so the cases of an evaluation are not the same for each policy; draw random "
-            "numbers from self.np_random or another seeded generator, count time by steps, and "
-            "begin each episode anew (env.fresh=true makes a new env for each)",
+            "seed, or lives by the clock, so the cases of an evaluation are not the same for each "
+            "policy; draw random numbers from self.np_random or another seeded generator, count "
+            "time by steps, and begin each episode anew (env.fresh=true makes a new env for each)",
         )
 
     def _look_at_bounds(self, rollout: TensorDictBase) -> None:
@@ -229,7 +232,7 @@ class Trial:
     def _kinds_of_env(self) -> list[type]:
         if not isinstance(self.base, GymnasiumEnv):
             return []
-        return [type(layer) for layer in _layers(self.base.held.plants[0].env)]
+        return [type(layer) for layer in layers(self.base.held.plants[0].env)]
 
     def recorded(self) -> TensorDictBase:
         """Return data [B, T] of random actions, with at least two rows.
@@ -269,7 +272,7 @@ class Trial:
             action_key: of the action.
             tolerance: allowed effect of other rows.
         """
-        asked, middle = AskedGuide(guide, self.env, recorded, action_key), recorded.shape[1] // 2
+        asked, middle = self._asked(guide, recorded, action_key), recorded.shape[1] // 2
         first, again, fresh = asked.advice(), asked.advice(), asked.advice(begin=middle)
         try:
             interrupted = asked.advice(reset_at=middle)
@@ -297,6 +300,14 @@ class Trial:
         if not torch.equal(first, asked.advice(pause=PAUSE)) and torch.equal(first, again):
             self.find("clock", f"the guide's action is another one when {PAUSE:g} s pass {CLOCK}")
 
+    def _asked(
+        self,
+        guide: TensorDictModuleBase,
+        recorded: TensorDictBase,
+        action_key: NestedKey = "action",
+    ) -> "AskedGuide":
+        return AskedGuide(guide, self.env, recorded, action_key, self.clock)
+
     def ask_controller(self, guide: TensorDictModuleBase) -> None:
         """Ask objects of a controller along a few steps, each time new ones.
 
@@ -317,7 +328,7 @@ class Trial:
 
     def _ask_objects(self, own: PerRow, recorded: TensorDictBase, shared: "_Shared") -> None:
         first, start = _new(own, own.make), time.perf_counter()
-        advice = AskedGuide(first, self.env, recorded).advice()
+        advice = self._asked(first, recorded).advice()
         slow = math.ceil((time.perf_counter() - start) / self.patience)
         if slow > 1:
             recorded = recorded[:, : max(FEWEST, recorded.shape[1] // slow)]
@@ -326,7 +337,7 @@ class Trial:
 
         def ask(data: TensorDictBase, **how: Any) -> Tensor:
             again = _new(own, lambda: _reseeded(own.make(), first))
-            return AskedGuide(again, self.env, data).advice(**how)
+            return self._asked(again, data).advice(**how)
 
         title = f"the controller {own.title}"
         if not torch.allclose(advice, ask(recorded)):
@@ -338,6 +349,10 @@ class Trial:
             else:
                 self.find("draws", f"{title} {text}: {UNREPEATED}")
             return
+        # First, because the readings of one row pass the time of the others.
+        if not torch.allclose(advice, ask(recorded, pause=PAUSE)):
+            self.find("clock", f"{title} gives other actions when {PAUSE:g} s pass {CLOCK}")
+            return
         alone, reset = ask(recorded[:1]), ask(recorded, reset_at=recorded.shape[1] // 2)
         if not torch.allclose(advice[:1], alone) or not torch.allclose(advice[1:], reset[1:]):
             self.find(
@@ -345,8 +360,6 @@ class Trial:
                 f"{title} gives a row other actions beside other rows: "
                 f"{_shares(shared.changed() or SOMETHING)}",
             )
-        elif not torch.allclose(advice, ask(recorded, pause=PAUSE)):
-            self.find("clock", f"{title} gives other actions when {PAUSE:g} s pass {CLOCK}")
 
 
 SOMETHING = "something, such as an attribute or a default argument of their class"
@@ -356,9 +369,10 @@ CLOCK = (
 )
 UNREPEATED = (
     "it draws random numbers that no seed of the run reaches, such as from a generator without a "
-    "seed, or reads the clock, so the run cannot be repeated or resumed to the bit; give it a "
-    "generator of its own with a seed, such as np.random.default_rng(0), and count time by steps, "
-    "such as sample_time=None of a PID controller"
+    "seed, reads the clock, or keeps something outside of its object, so the run cannot be "
+    "repeated or resumed to the bit; give it a generator of its own with a seed, such as "
+    "np.random.default_rng(0), count time by steps, such as sample_time=None of a PID controller, "
+    "and make in __init__ what it remembers"
 )
 
 
@@ -372,35 +386,46 @@ def _title(key: NestedKey) -> str:
     return f"{written_key(key)} of the env"
 
 
-class _Clock:
+class Clock:
     """The clock of Python, which stands still in a block, but for the pauses that are made there.
 
-    What is asked twice at two speeds is then asked the same, unless it reads another clock.
+    What is asked twice at two speeds is then asked the same, unless it reads another clock. Each
+    reading takes a microsecond, so that a loop which waits ends, and more where pauses are made: a
+    search that ends by the clock ends earlier.
     """
 
-    names = ("time", "monotonic", "perf_counter")
+    names = ("time", "monotonic", "perf_counter", "time_ns", "monotonic_ns", "perf_counter_ns")
 
-    def __enter__(self) -> "_Clock":
-        self.passed, self.read = 0.0, {name: getattr(time, name) for name in self.names}
-        for name, read in self.read.items():
-            setattr(time, name, partial(self._now, read()))
+    def __init__(self) -> None:
+        self.read = {name: getattr(time, name) for name in self.names}
+        self.start = {name: read() for name, read in self.read.items()}
+        self.tick = QUICK
+
+    def __enter__(self) -> "Clock":
+        self.passed = 0.0
+        for name in self.names:
+            setattr(time, name, partial(self._now, name))
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.tick = QUICK
         for name, read in self.read.items():
             setattr(time, name, read)
 
-    def _now(self, start: float) -> float:
-        return start + self.passed
+    def _now(self, name: str) -> float:
+        self.passed += self.tick
+        since = round(self.passed * 1e9) if name.endswith("_ns") else self.passed
+        return self.start[name] + since
 
     def pause(self, seconds: float) -> None:
         """Wait, also by every other clock."""
         self.passed += seconds
+        self.tick = SLOW
         time.sleep(seconds)
 
 
 class _Shared:
-    """What all objects of some classes share: attributes, default arguments, names of the module.
+    """What all objects of some classes share: attributes, defaults, variables around, the module.
 
     Args:
         kinds: the classes.
@@ -417,16 +442,8 @@ class _Shared:
 
     def restore(self) -> None:
         """Restore the values that have changed."""
-        for name, value, put in list(self._changed()):
-            old = pickle.loads(self.before[name])
-            for now, then in zip(value, old, strict=True) if put is None else [(value, old)]:
-                if isinstance(now, (list, np.ndarray)):
-                    now[:] = then
-                elif isinstance(now, (dict, set)):
-                    now.clear()
-                    now.update(then)
-                elif put is not None:
-                    put(then)
+        for name, _, put in list(self._changed()):
+            put(pickle.loads(self.before[name]))
 
     def _changed(self) -> Iterator[tuple[str, Any, Any]]:
         for name, value, put in self._things():
@@ -434,18 +451,38 @@ class _Shared:
                 yield name, value, put
 
     def _things(self) -> Iterator[tuple[str, Any, Any]]:
-        """Yield name, value, and what sets it; None for default arguments, a tuple of values."""
+        """Yield name, value, and what sets it."""
         for kind in self.kinds:
             for name, value in vars(kind).items():
+                title = f"{kind.__name__}.{name}"
                 if isinstance(value, FunctionType):
-                    given = [each for each in value.__defaults__ or () if isinstance(each, DATA)]
-                    yield f"a default of {kind.__name__}.{name}", given, None
-                elif isinstance(value, DATA) and not name.startswith("__"):
-                    yield f"{kind.__name__}.{name}", value, partial(setattr, kind, name)
+                    given = [each for each in value.__defaults__ or () if _is_data(each)]
+                    yield f"a default of {title}", given, partial(_set_defaults, value)
+                    named = value.__kwdefaults__ or {}
+                    known = {key: each for key, each in named.items() if _is_data(each)}
+                    yield f"a keyword default of {title}", known, named.update
+                    cells = zip(value.__code__.co_freevars, value.__closure__ or (), strict=True)
+                    for variable, cell in cells:
+                        if cell != CellType() and _is_data(cell.cell_contents):
+                            put = partial(setattr, cell, "cell_contents")
+                            yield f"the variable {variable} of {title}", cell.cell_contents, put
+                elif _is_data(value) and not name.startswith("__"):
+                    yield title, value, partial(setattr, kind, name)
             module = sys.modules.get(kind.__module__)
             for name, value in vars(module).items() if module else ():
                 if isinstance(value, DATA) and not name.startswith("__"):
                     yield f"{kind.__module__}.{name}", value, partial(setattr, module, name)
+
+
+def _set_defaults(function: FunctionType, then: Sequence[Any]) -> None:
+    """Give a function back the default arguments that are data."""
+    left, given = iter(then), function.__defaults__ or ()
+    function.__defaults__ = tuple(next(left) if _is_data(each) else each for each in given)
+
+
+def _is_data(value: Any) -> bool:
+    """Return whether a value may be what rows share: data, or an object of a user's class."""
+    return isinstance(value, DATA) or (not isinstance(value, type) and is_of_user(type(value)))
 
 
 def _pickled(value: Any) -> bytes:
@@ -459,13 +496,6 @@ def _pickled(value: Any) -> bytes:
 def _random(env: EnvBase) -> Callable[[TensorDictBase], TensorDictBase]:
     """Return what writes a random action, also where it has no bound."""
     return partial(random_action, env) if len(env.action_keys) == 1 else env.rand_action
-
-
-def _layers(env: Any) -> Iterator[Any]:
-    """Yield an env and what is in its wrappers."""
-    while env is not None:
-        yield env
-        env = getattr(env, "env", None)
 
 
 def _kind_of(make: Callable[[], Any]) -> type:
@@ -539,6 +569,7 @@ class AskedGuide:
         env: of which the data is.
         recorded: the data, [B, T].
         action_key: of the action.
+        clock: that it reads.
     """
 
     def __init__(
@@ -546,9 +577,10 @@ class AskedGuide:
         guide: TensorDictModuleBase,
         env: EnvBase,
         recorded: TensorDictBase,
-        action_key: NestedKey = "action",
+        action_key: NestedKey,
+        clock: Clock,
     ) -> None:
-        self.action_key, self.recorded = action_key, recorded
+        self.action_key, self.recorded, self.clock = action_key, recorded, clock
         advise = GuideActions({"guide": guide}, action_key)
         self.env = TransformedEnv(Recorded(env, recorded), advise)
 
@@ -562,12 +594,10 @@ class AskedGuide:
         """
         data = self.recorded[:, begin:].exclude("next")
         self.env.base_env.data = data
-        with _Clock() as clock:
-            return self._asked(data, reset_at, pause, clock)
+        with self.clock:
+            return self._asked(data, reset_at, pause)
 
-    def _asked(
-        self, data: TensorDictBase, reset_at: int | None, pause: float, clock: "_Clock"
-    ) -> Tensor:
+    def _asked(self, data: TensorDictBase, reset_at: int | None, pause: float) -> Tensor:
         present, taken = self.env.reset(), []
         for step in range(data.shape[1]):
             if step == reset_at:
@@ -577,7 +607,7 @@ class AskedGuide:
             taken.append(present["guide_action"])
             if step + 1 < data.shape[1]:
                 if pause and step < PAUSED:
-                    clock.pause(pause)
+                    self.clock.pause(pause)
                 action = TensorDict(
                     {self.action_key: data[self.action_key][:, step]}, present.batch_size
                 )

@@ -244,14 +244,21 @@ def choose(
 
 
 def timed(make: MakeRows, draw: Callable[[], Any]) -> float | None:
-    """Return the seconds of a step of one row, timed in a process of its own; None if it fails."""
-    pipe, process = _started(_time, make, draw)
-    try:
-        seconds: float | None = pipe.recv()
-    except (EOFError, OSError):
-        seconds = None
-    _ended([pipe], [process])
-    return seconds
+    """Return the shortest seconds of a step of one row, but the first; None if it fails."""
+    with warnings.catch_warnings(), suppress(Exception):  # the same fault follows where it is told
+        warnings.simplefilter("ignore")
+        shard, taken = make(range(1)), list[float]()
+        shard.begin({0: 0}, {})
+        shard.step([draw()])
+        while len(taken) < MOST_STEPS and (len(taken) < LEAST_STEPS or sum(taken) < LONGEST):
+            began = time.perf_counter()
+            (entries,) = shard.step([draw()])
+            taken.append(time.perf_counter() - began)
+            if entries["done"].any():
+                shard.begin({0: len(taken)}, {})
+        shard.close()
+        return min(taken)  # other programs only make a step longer
+    return None
 
 
 def _cores() -> int:
@@ -320,29 +327,6 @@ def _caught(call: Callable[[], Any]) -> tuple[_Reply, Any]:
             reply.bug = traceback.format_exc()
     reply.warned = [(str(each.message), each.category) for each in caught]
     return reply, value
-
-
-def _time(pipe: Connection, make: MakeRows, draw: Callable[[], Any]) -> None:
-    """Send the duration of a step; the first one is left out."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            shard = make(range(1))
-            shard.begin({0: 0}, {})
-            shard.step([draw()])
-            taken: list[float] = []
-            while len(taken) < MOST_STEPS and (len(taken) < LEAST_STEPS or sum(taken) < LONGEST):
-                began = time.perf_counter()
-                (entries,) = shard.step([draw()])
-                taken.append(time.perf_counter() - began)
-                if entries["done"].any():
-                    shard.begin({0: len(taken)}, {})
-            shard.close()
-            seconds: float | None = min(taken)  # other programs only make a step longer
-        except Exception:  # the same fault follows where it is told
-            seconds = None
-    with suppress(OSError):  # the program has ended
-        pipe.send(seconds)
 
 
 def _ended(pipes: Sequence[Connection], processes: Sequence[Any]) -> None:

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from coil_rl.errors import UserError
 from coil_rl.ranges import Count, checked
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
@@ -175,6 +176,12 @@ class FollowAdvice(TensorDictModuleBase):
         super().__init__()
         self.action_space = ActionSpace(env.full_action_spec[out_key], env.batch_dims)
         self.guide: Tensor = nn.Buffer(torch.as_tensor(guide, device=env.device))
+        known, acts = env.observation_spec[in_key].shape[-2], int(self.guide.max())
+        if acts >= known:
+            raise UserError(
+                f"guide: the configuration has {acts + 1} guides, but its method.transforms give "
+                f"the advice of {known}; they must be the same"
+            )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from coil_rl.errors import UserError
@@ -15,7 +14,7 @@ from coil_rl.extras import require
 from coil_rl.imitation.regressors import Regressor
 from coil_rl.ranges import Count, Interval, checked
 
-MOST_TREES = 10_000
+MOST_TREES, MOST_DEPTH = 10_000, 1_000
 AT_ONCE = 16_384  # rows times trees, whose nodes fit into the cache
 # The arrays of all trees, one after the other: dtype, and shape of a node.
 ARRAYS = {
@@ -30,6 +29,8 @@ ARRAYS = {
 @checked
 class ForestRegressor(Regressor):
     """A random forest (Breiman 2001), with the fit and the predictions of scikit-learn.
+
+    It predicts by operations of torch, so that it can be exported as a network can.
 
     Its state is a few arrays of numbers, see `ARRAYS`; empty before the first fit.
 
@@ -50,8 +51,6 @@ class ForestRegressor(Regressor):
         tensor([1.])
     """
 
-    is_network: ClassVar[bool] = False
-
     def __init__(
         self,
         n_estimators: Annotated[int, Interval(ge=1, le=MOST_TREES)] = 200,
@@ -66,8 +65,8 @@ class ForestRegressor(Regressor):
             "random_state": random_state,
             "n_jobs": max(-1, min(n_jobs, os.cpu_count() or 1)),
         }
-        self.inputs, self.outputs = 0, 1
-        self.arrays: dict[str, NDArray[np.number]] = {}
+        self.inputs, self.outputs, self.depth = 0, 1, 0
+        self.arrays: dict[str, Tensor] = {}
 
     def fresh(self, inputs: int, outputs: int) -> ForestRegressor:
         """Return an unfitted forest, which predicts 0."""
@@ -92,48 +91,49 @@ class ForestRegressor(Regressor):
         leaf = np.concatenate([tree.children_left for tree in trees]) == -1
         own = np.arange(len(leaf))
         children = np.where(leaf, own, [left, right]).T
-        self.arrays = {
+        arrays = {
             "roots": roots,
             "features": np.maximum(np.concatenate([tree.feature for tree in trees]), 0),
             "thresholds": np.concatenate([tree.threshold for tree in trees]),
             "children": np.ascontiguousarray(children),
             "values": np.concatenate([tree.value[..., 0] for tree in trees]),
         }
+        self.arrays = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        self.depth = max(tree.max_depth for tree in trees)
 
     def forward(self, x: Tensor) -> Tensor:
         """Predict y [*batch, outputs] for x [*batch, inputs]; a `ValueError` if not finite."""
         if not self.arrays:
             return x.new_zeros(*x.shape[:-1], self.outputs)
-        rows = x.detach().reshape(-1, self.inputs).float().cpu().numpy()
-        if not np.isfinite(rows).all():
+        rows = x.detach().reshape(-1, self.inputs).float().cpu()
+        if torch.compiler.is_exporting():  # an exported function cannot raise
+            prediction = self._predicted(rows)
+        elif not rows.isfinite().all():
             raise ValueError("a forest predicts for finite inputs only")
-        # One tree after the other, as scikit-learn adds them, so that the sums are the same.
-        total = np.cumsum(self.arrays["values"][self._leaves(rows)], 0)[-1]
-        prediction = torch.from_numpy(total / len(self.arrays["roots"])).to(x)
-        return prediction.reshape(*x.shape[:-1], self.outputs)
+        else:
+            parts = rows.split(max(1, AT_ONCE // len(self.arrays["roots"])))
+            prediction = torch.cat([self._predicted(part) for part in parts])
+        return prediction.to(x).reshape(*x.shape[:-1], self.outputs)
 
-    def _leaves(self, rows: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Return the leaf [trees, N] that each row [N, inputs] reaches in each tree."""
-        parts = 1 + self.arrays["roots"].size * len(rows) // AT_ONCE
-        trees = np.array_split(self.arrays["roots"], min(parts, self.arrays["roots"].size))
-        return np.concatenate([self._reached(rows, roots) for roots in trees])
-
-    def _reached(self, rows: NDArray[np.float32], roots: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the leaf [trees, N] that each row reaches from the roots of some trees."""
+    def _predicted(self, rows: Tensor) -> Tensor:
+        """Return the prediction [N, outputs] for rows [N, inputs]."""
         features, thresholds = self.arrays["features"], self.arrays["thresholds"]
-        children, flat = self.arrays["children"].reshape(-1), rows.reshape(-1)
-        first = np.arange(len(rows)) * rows.shape[1]
-        nodes = np.repeat(roots[:, None], len(rows), 1)
-        while True:
-            right = flat.take(first + features.take(nodes)) > thresholds.take(nodes)
-            following = children.take(2 * nodes + right)
-            if np.array_equal(following, nodes):
-                return nodes
-            nodes = following
+        children, roots = self.arrays["children"].reshape(-1), self.arrays["roots"]
+        count, trees, numbers = rows.shape[0], len(roots), rows.reshape(-1)
+        # For each row and tree, which take half of the time in one dimension.
+        first = (torch.arange(count) * self.inputs)[:, None].expand(-1, trees).reshape(-1)
+        nodes = roots.repeat(count)
+        for _ in range(self.depth):
+            chosen = numbers.index_select(0, first + features.index_select(0, nodes))
+            right = chosen.double() > thresholds.index_select(0, nodes)
+            nodes = children.index_select(0, 2 * nodes + right)
+        leaves = self.arrays["values"].index_select(0, nodes).reshape(count, trees, -1)
+        # One tree after the other, as scikit-learn adds them, so that the sums are the same.
+        return leaves.cumsum(1)[:, -1] / trees
 
     def get_extra_state(self) -> dict[str, Tensor]:
         """Return the arrays of the fitted forest; none before the first fit."""
-        return {name: torch.from_numpy(array) for name, array in self.arrays.items()}
+        return dict(self.arrays)
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
         """Restore a fitted forest from its arrays; a `UserError` if they are none."""
@@ -142,7 +142,22 @@ class ForestRegressor(Regressor):
                 f"the state is not a forest of {self.inputs} inputs and {self.outputs} outputs; "
                 "train again"
             )
-        self.arrays = {name: each.cpu().contiguous().numpy() for name, each in state.items()}
+        self.arrays = {name: each.cpu().contiguous() for name, each in state.items()}
+        self.depth = self._depth()
+        if self.depth > MOST_DEPTH:
+            raise UserError(f"the state is a forest of more than {MOST_DEPTH} levels; train again")
+
+    def _depth(self) -> int:
+        """Return the number of steps from a root to the deepest leaf, or too many."""
+        if not self.arrays:
+            return 0
+        children, nodes = self.arrays["children"], self.arrays["roots"].unique()
+        for depth in range(MOST_DEPTH + 1):
+            inner = nodes[children[nodes, 0] != nodes]
+            if not len(inner):
+                return depth
+            nodes = children[inner].unique()
+        return MOST_DEPTH + 1
 
     def _is_forest(self, state: dict[str, Tensor]) -> bool:
         """Return whether arrays are of trees: children come after their parents."""

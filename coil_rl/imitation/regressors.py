@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Self
+from typing import Self
 
 import torch
 from scipy import linalg
@@ -24,13 +24,9 @@ from coil_rl.schedules import Linear, Schedule, schedule
 class Regressor(nn.Module, ABC):
     """Regression from vectors to vectors; the fitted state is the `state_dict`.
 
-    The constructor makes a specification; `fresh` makes a regressor that can be fitted.
-
-    Attributes:
-        is_network: whether it predicts by operations of torch alone, so that it can be exported.
+    The constructor makes a specification; `fresh` makes a regressor that can be fitted. It predicts
+    by operations of torch, so that it can be exported.
     """
-
-    is_network: ClassVar[bool] = True
 
     @abstractmethod
     def fresh(self, inputs: int, outputs: int) -> Self:

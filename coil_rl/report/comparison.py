@@ -118,21 +118,29 @@ class Group:
         """Mean reward, with the interval over the cases: of the means over seeds in each case."""
         return estimate(self.returns.mean(axis=0))
 
+    @cached_property
+    def of_measures(self) -> dict[str, tuple[Array, Array, Array]]:
+        """The reward and each measure: values, episodes that have one, episodes, [seeds, cases]."""
+        count, found = len(self.table.index.unique("seed")), {}
+        for name in ("reward", *self.measures):
+            if name in self.table:
+                columns = (self.table[name], *_episodes(self.table, name))
+                values, known, episodes = (each.to_numpy().reshape(count, -1) for each in columns)
+                found[name] = values, known, episodes
+        return found
+
     def counts(self, case: int | None = None) -> dict[str, int]:
         """Return the number of `episodes`, and by measure in how many of them it is known.
 
         Args:
             case: index of the only case to count; None for all of them.
         """
-        rows = self._rows(case)
-        counts = {"episodes": int(_episodes(rows, "reward")[1].sum())}
+        at = slice(None) if case is None else slice(case, case + 1)
+        counts = {"episodes": int(self.of_measures["reward"][2][:, at].sum())}
         for name in self.measures:
-            if name in rows:
-                counts[name] = int(_episodes(rows, name)[0].sum())
+            if name in self.of_measures:
+                counts[name] = int(self.of_measures[name][1][:, at].sum())
         return counts
-
-    def _rows(self, case: int | None) -> pd.DataFrame:
-        return self.table if case is None else self.table.xs(self.cases[case], level="case")
 
     @property
     def rank(self) -> tuple[bool, float, float]:
@@ -172,12 +180,12 @@ class Group:
         Args:
             case: index of the only case to count; None for all of them.
         """
-        rows = self._rows(case)
-        means = {"reward": float(rows["reward"].mean(skipna=False))}
+        at = slice(None) if case is None else slice(case, case + 1)
+        means = {"reward": float(self.of_measures["reward"][0][:, at].mean())}
         for name, each in self.measures.items():
-            if name in rows:
-                known, _ = _episodes(rows, name)
-                means[name] = each.pool(rows[name].tolist(), known.tolist())
+            if name in self.of_measures:
+                values, known, _ = (part[:, at].ravel() for part in self.of_measures[name])
+                means[name] = each.pool(values.tolist(), known.tolist())
         return means
 
     def parts(self, prefix: str) -> dict[str, float]:
@@ -273,6 +281,12 @@ class Comparison:
             row["p"] = float(p)
         return rows
 
+    @cached_property
+    def _unknown(self) -> list[str]:
+        """The measures that are not known in all episodes."""
+        found = [each.counts() for each in self.groups]
+        return [name for each in found for name in each if 0 < each[name] < each["episodes"]]
+
     def _partial(self, group: Group, case: int | None = None) -> dict[str, int]:
         """Return in how many episodes each measure is known, unless it is in all episodes.
 
@@ -281,12 +295,10 @@ class Comparison:
         Args:
             case: index of the only case to count; None for all of them.
         """
-        found = [each.counts() for each in self.groups]
-        names = [name for each in found for name in each if 0 < each[name] < each["episodes"]]
-        if not names:
+        if not self._unknown:
             return {}
         counts = group.counts(case)
-        known = {f"{name}{EPISODES}": counts.get(name, 0) for name in names}
+        known = {f"{name}{EPISODES}": counts.get(name, 0) for name in self._unknown}
         return {"episodes": counts["episodes"]} | known
 
     def case_table(self) -> list[dict[str, Any]]:

@@ -21,7 +21,7 @@ from torchrl.envs import (
     VecNormV2,
 )
 
-from coil_rl.errors import UserError
+from coil_rl.errors import UserError, lacks_memory
 from coil_rl.foreign.batch import SeededRows
 from coil_rl.foreign.limit import limits_of
 from coil_rl.foreign.trial import PATIENCE, Trial
@@ -214,7 +214,7 @@ def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> Env
     except (KeyError, ValueError) as error:
         raise UserError(f"{name}: {error.args[0]}") from error
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "allocate" not in str(error):
+        if not lacks_memory(error):
             raise
         raise UserError(f"{name}: there is not enough memory; make it smaller") from error
     return env

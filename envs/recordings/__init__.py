@@ -9,8 +9,8 @@ if TYPE_CHECKING:
     from coil_rl.envs.recordings import bearings as bearings
     from coil_rl.envs.recordings import mcap_files as mcap_files
     from coil_rl.envs.recordings import messages as messages
+    from coil_rl.envs.recordings.cautions import in_order as in_order
     from coil_rl.envs.recordings.recording import SIMULATED as SIMULATED
-    from coil_rl.envs.recordings.views import caution_about_view as caution_about_view
 else:
     require("a recording", "robot", "lz4", "mcap", "rosbags", "zstandard")
     __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -1,14 +1,18 @@
 """The commands of a recording: choice of their topic, and the messages as numbers."""
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from coil_rl.envs.recordings.mcap_files import Contents
-from coil_rl.envs.recordings.messages import COMMANDS, command_of
+from coil_rl.envs.recordings.messages import COMMANDS, command_of, stamp_of
+from coil_rl.envs.recordings.recording import AT_ONCE, Recording, arrivals
 from coil_rl.envs.recordings.scans import LARGEST, decoded
 
+MOST = 0.5  # share of the commands
 ADDED = "/coil/"  # topics that coil-replay adds to a copy: what policies would have done
 
 
@@ -51,31 +55,67 @@ def command_topic(wanted: str, contents: Contents, remarks: list[str]) -> str | 
 def commands_of(path: Path, topic: str, contents: Contents, remarks: list[str]) -> dict[str, Any]:
     """Return the fields of a `Recording` that come from its commands.
 
+    A command of another type than the first, or one that is no number, is NaN: none is known from
+    there on.
+
     Args:
-        contents: of the recording; messages of other types than the first are left out.
-        remarks: a remark is added on messages that are left out.
+        contents: of the recording.
+        remarks: a remark is added on such messages.
     """
     messages = contents.messages[topic]
     kind = messages[0].channel.message_type
-    of_kind = [message for message in messages if message.channel.message_type == kind]
-    if len(of_kind) < len(messages):
+    time, rows = decoded(path, topic, contents, partial(_fields, kind))
+    stamps, commands = np.array([row[0] for row in rows]), np.array([row[1:] for row in rows])
+    others = sum(message.channel.message_type != kind for message in messages)
+    if others:
         remarks.append(
             f"has commands of several types on topic {topic}, of which the "
-            f"{len(of_kind)} of {kind} are read, and {len(messages) - len(of_kind)} others are not"
+            f"{len(messages) - others} of {kind} are read; where one of the {others} others was "
+            "the last, there is no recorded steering"
         )
-        contents.messages[topic] = of_kind
-    time, rows = decoded(path, topic, contents, command_of)
-    commands = np.array(rows, dtype=np.float64)
     usable = np.asarray((np.abs(commands) < LARGEST).all(axis=1))
-    if not usable.all():
+    wrong = int((~usable).sum()) - others
+    if wrong:
         remarks.append(
-            f"has {(~usable).sum()} of {len(usable)} commands on topic {topic} that are no numbers "
-            f"below {LARGEST:g}, and they are left out"
+            f"has {wrong} of {len(usable)} commands on topic {topic} that are no numbers below "
+            f"{LARGEST:g}; where one was the last, there is no recorded steering"
         )
     if not usable.any():
         return {}
+    commands[~usable] = np.nan
     return {
-        "commands": (commands[usable], time[usable]),
+        "commands": (commands, arrivals(stamps, time)),
         "command_topic": topic,
         "command_type": kind,
     }
+
+
+def _fields(kind: str, message: Any, sent: int) -> tuple[float, ...]:
+    """Return the time in ns when a command was sent, and its two numbers; NaN for another type."""
+    stamp = stamp_of(message) if hasattr(message, "header") else sent
+    numbers = command_of(message) if message.__msgtype__ == kind else (np.nan, np.nan)
+    return (stamp, *numbers)
+
+
+def spread(recording: Recording) -> Recording:
+    """Return a recording whose commands are spread over the scans with which they were logged.
+
+    A recorder that writes late and many messages at once gives commands without a stamp one time.
+    """
+    late, turn = recording.log_time - recording.arrival, recording.turn * 1e9
+    if recording.commands is None or not late.max() > turn > 0:
+        return recording
+    commands, times = recording.commands
+    log_time, arrival = recording.log_time, recording.arrival
+    begins = np.flatnonzero(np.diff(log_time, prepend=log_time[0] - turn) > AT_ONCE * turn)
+    of_burst = log_time[begins]
+    middle = (of_burst[1:] + log_time[begins[1:] - 1]) / 2
+    burst = np.searchsorted(middle, times)
+    if (np.abs(times - of_burst[burst]) > AT_ONCE * turn).mean() > MOST:
+        return recording  # these were not late
+    start = arrival[begins]
+    end = np.append(start[1:], arrival[-1] + turn)
+    rank = np.arange(len(times)) - np.searchsorted(burst, burst)
+    share = (rank + 0.5) / np.bincount(burst, minlength=len(start))[burst]
+    since = (share * (end - start)[burst]).astype(np.int64)
+    return replace(recording, commands=(commands, start[burst] + since))

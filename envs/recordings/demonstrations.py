@@ -1,9 +1,9 @@
 """What recordings demonstrate: how many scans have steering to learn, and why others have none."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from coil_rl.envs.recordings.views import caution_about_view
+from coil_rl.envs.recordings.recording import Recording
 
 
 def about_demonstrations(env: Any) -> Iterator[str]:
@@ -18,10 +18,10 @@ def about_demonstrations(env: Any) -> Iterator[str]:
     Raises:
         ValueError: if no scan has steering to learn.
     """
-    first, kept, total = 0, 0, 0
-    for recording in env.recordings:
-        scans = slice(first, first + len(recording.ranges))
-        first = scans.stop
+    kept, total = 0, 0
+    _check_different(env.recordings)
+    for row, recording in enumerate(env.recordings):
+        scans = env.scans_of(row)
         stale, standing = env.stale[scans], env.standing[scans]
         number, usable = len(stale), int((~stale & ~standing).sum())
         kept, total = kept + usable, total + number
@@ -31,18 +31,21 @@ def about_demonstrations(env: Any) -> Iterator[str]:
             f"{int((standing & ~stale).sum())} of a robot that stands"
         )
         yield "; the file ".join([line, *recording.remarks])
-        caution = caution_about_view(
-            recording,
-            env.cones[scans].cpu().numpy(),
-            env.count[scans].cpu().numpy(),
-            env.valid[:, scans].all(0).cpu().numpy(),
-            env.perception,
-        )
-        if caution:
-            yield f"Warning: {caution}."
+        yield from (f"Warning: {text}." for text in env.cautions(row))
     yield f"{len(env.recordings)} recordings: {kept} of {total} scans are learned."
     if not kept:
         raise ValueError(
             "no scan has recorded steering to learn: there is no recent command at any, or the "
             "robot stands; give env.command=TOPIC, or other recordings"
         )
+
+
+def _check_different(recordings: Sequence[Recording]) -> None:
+    """Raise a `ValueError` for a recording that is there twice, which would test itself."""
+    known: dict[bytes, Recording] = {}
+    for recording in recordings:
+        other = known.setdefault(recording.ranges.tobytes(), recording)
+        if other is not recording:
+            raise ValueError(
+                f"{other.path} and {recording.path} hold the same scans; leave one of them out"
+            )

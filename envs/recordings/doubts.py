@@ -5,6 +5,8 @@ without an error, and gives numbers that mean little. Each of the functions here
 of a sentence that begins with the name of the file.
 """
 
+import warnings
+
 import numpy as np
 
 from coil_rl.envs.recordings.recording import Recording, Times, ascending, believed
@@ -14,12 +16,16 @@ GAP = 2.5  # turns without a scan
 MANY = 0.1  # share of the scans
 NARROW = 0.8  # of the largest number of ranges
 CLOCKS_DIFFER = 2.0  # times as fast
+FEWEST, CHECKED_SCANS = 12, 512  # scans that are compared, at most
+PAIRED = 0.5  # of a pause between scans, and of what changes between them
+DIFFERENT = 0.01  # m
 
 
 def doubts_about(recording: Recording) -> list[str]:
     """Return remarks on what makes the meaning of a recording doubtful."""
     return [
         *_about_clock(recording),
+        *_about_turns(recording),
         *_about_scans(recording),
         *_about_odometry(recording),
         *_about_commands(recording),
@@ -27,7 +33,7 @@ def doubts_about(recording: Recording) -> list[str]:
 
 
 def _about_clock(recording: Recording) -> list[str]:
-    """Return remarks on stamps that are no clock, on the rate of the scans, and on gaps."""
+    """Return remarks on stamps that are no clock, and on log times that are none."""
     stamp, log_time = recording.stamp, recording.log_time
     if len(stamp) < 2:
         return ["has a single scan"]
@@ -46,11 +52,24 @@ def _about_clock(recording: Recording) -> list[str]:
                 f"has stamps that run {ratio:.3g} times as fast as its log times; the stamps are "
                 "the clock"
             )
+    late = (log_time - recording.arrival).max() / 1e9
+    if late > recording.turn > 0:
+        remarks.append(
+            f"has scans that were logged up to {late:.2g} s late, so their stamps are the clock, "
+            "and commands that were logged at once are spread over the scans between"
+        )
     if not log_time.any() or log_time[0] == log_time[-1]:
         remarks.append("has log times that are all the same, so no command belongs to a scan")
-    turn = recording.turn
+    return remarks
+
+
+def _about_turns(recording: Recording) -> list[str]:
+    """Return remarks on the rate of the scans, and on gaps."""
+    turn, remarks = recording.turn, []
+    if len(recording.stamp) < 2:
+        return []
     if turn == 0:
-        return [*remarks, "has no clock: most of its scans have the same time"]
+        return ["has no clock: most of its scans have the same time"]
     if not RATES[0] <= 1 / turn <= RATES[1]:
         remarks.append(
             f"has {1 / turn:.3g} scans a second, and policies are made for {RATES[0]:g} to "
@@ -99,23 +118,42 @@ def _about_scans(recording: Recording) -> list[str]:
         )
     if points.min() < NARROW * points.max():
         remarks.append(f"has scans of {points.min()} to {points.max()} ranges")
+    if _alternate(recording):
+        remarks.append(
+            "has scans that are taken by turns from two places, or come in pairs, as those of two "
+            "scanners: record each on a topic of its own"
+        )
     return remarks
+
+
+def _alternate(recording: Recording) -> bool:
+    """Return whether scans are like the one before the last, not like the last, or are in pairs."""
+    if len(recording.ranges) < FEWEST:
+        return False
+    between = np.diff(recording.seconds)
+    pauses = np.median(between[::2]), np.median(between[1::2])
+    if min(pauses) < PAIRED * max(pauses):
+        return True
+    some = np.where(np.isfinite(recording.ranges), recording.ranges, np.nan)[:CHECKED_SCANS]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of scans without a return
+        last, before_last = (
+            np.nanmedian(np.nanmedian(np.abs(some[step:] - some[:-step]), axis=1))
+            for step in (1, 2)
+        )
+    return bool(last > DIFFERENT and before_last < PAIRED * last)
 
 
 def _about_odometry(recording: Recording) -> list[str]:
     """Return a remark on scans at whose time there is no odometry."""
     if recording.odometry is None:
         return []
-    _, log_time, stamp = recording.odometry
-    stamped = ascending(recording.stamp) and ascending(stamp)
-    at, known = (recording.stamp, stamp) if stamped else (recording.log_time, log_time)
-    limit = round(recording.command_age * 1e9)
-    outside = int(((at < known[0] - limit) | (at > known[-1] + limit)).sum())
+    outside = int((~recording.located).sum())
     if not outside:
         return []
     return [
-        f"has no odometry at the time of {outside} of {len(at)} scans, so their poses are those of "
-        "its start or its end"
+        f"has no odometry at the time of {outside} of {len(recording.log_time)} scans, so their "
+        "poses are those of its start or its end"
     ]
 
 
@@ -133,10 +171,12 @@ def _about_commands(recording: Recording) -> list[str]:
             f"has no command of the last {recording.command_age:.2f} s at {missing} of {scans} "
             f"scans ({number} on {topic}), and no recorded steering there"
         )
-    if not commands.any():
+    if not np.nan_to_num(commands).any():
         return [*remarks, f"has only zeros in its commands on {topic}"]
-    if not commands[:, 0].any():
-        source = "the nominal speed" if recording.odometry is None else "that of the odometry"
+    if not np.nan_to_num(commands[:, 0]).any():
+        source = "the nominal speed"
+        if recording.odometry is not None:
+            source = f"that of the odometry, {np.median(recording.motion()[0]):.3g} m/s,"
         return [*remarks, f"has commands without a speed on {topic}, so {source} is taken"]
     standing, back = int((speed == 0).sum()), int((speed < 0).sum())
     if standing:

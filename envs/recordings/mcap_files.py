@@ -93,7 +93,7 @@ class Contents:
     """Contents of a recording.
 
     Attributes:
-        messages: by topic, in order of log time.
+        messages: by topic, as they are in the files.
         channels: of all topics.
         notes: metadata records by name.
         attachments: by name.
@@ -134,8 +134,6 @@ def read_messages(
     for file in folder.files:
         _read_file(file, topics, types, contents)
     contents.remarks = [*folder.remarks, *_miscounted(folder.counts, contents)]
-    for messages in contents.messages.values():
-        messages.sort(key=lambda message: message.log_time)
     contents.channels = list(dict.fromkeys(contents.channels))
     return contents
 

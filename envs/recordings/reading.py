@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from coil_rl.envs.recordings.commands import command_topic, commands_of
+from coil_rl.envs.recordings.commands import command_topic, commands_of, spread
 from coil_rl.envs.recordings.doubts import doubts_about
 from coil_rl.envs.recordings.folders import RecordingError
 from coil_rl.envs.recordings.mcap_files import Contents, read_messages
 from coil_rl.envs.recordings.messages import COMMANDS, ODOMETRY, SCAN, pose_of, stamp_of
-from coil_rl.envs.recordings.recording import Recording
+from coil_rl.envs.recordings.recording import Recording, ascending
 from coil_rl.envs.recordings.scans import check_finite, decoded, scans_of
 
 
@@ -70,6 +70,7 @@ def read_recording(
             remarks.append(remark)
     if not contents.messages[scan]:
         raise _no_scans(path, scan, contents)
+    remarks += _put_in_order(path, contents, scan)
     if strict and (contents.cut_off or contents.damage):
         raise RecordingError(
             f"{path} {remarks[0]}; copy it again from where it was recorded, or set strict=false."
@@ -82,10 +83,32 @@ def read_recording(
     if read is not None:
         fields |= commands_of(path, read, contents, remarks)
     recording = Recording(path=path, **scans_of(path, scan, contents, frame, remarks), **fields)
+    recording = spread(recording)
     remarks += doubts_about(recording)
     for remark in remarks:
         warnings.warn(f"{path} {remark}", stacklevel=2)
     return replace(recording, remarks=remarks)
+
+
+def _put_in_order(path: Path, contents: Contents, scan: str) -> list[str]:
+    """Sort messages by their log times, or say that the clock of the log was set back.
+
+    Then the scans are in the order of their stamps, and what was logged later is taken as later.
+    """
+    back = -np.diff([message.log_time for message in contents.messages[scan]]).min(initial=0)
+    stamps = decoded(path, scan, contents, lambda each, _: (stamp_of(each),))[1] if back else []
+    if back and ascending(np.array(stamps)[:, 0]):
+        for messages in contents.messages.values():
+            step = np.diff([message.log_time for message in messages])
+            usual = np.median(step) if len(step) else 0
+            missing = np.cumsum(np.where(step < 0, usual - step, 0)).astype(np.int64)
+            for number, more in enumerate(missing.tolist(), start=1):
+                later = messages[number].log_time + more
+                messages[number] = messages[number]._replace(log_time=later)
+        return [f"has log times that step back by {back / 1e9:.3g} s, so stamps give the order"]
+    for messages in contents.messages.values():
+        messages.sort(key=lambda message: message.log_time)
+    return []
 
 
 def _odometry(path: Path, topic: str, contents: Contents, remarks: list[str]) -> dict[str, Any]:
@@ -102,7 +125,7 @@ def _odometry(path: Path, topic: str, contents: Contents, remarks: list[str]) ->
         elif others and not kinds:
             remarks.append(f"has no odometry on topic {topic}; choose with odometry={others}")
         return {}
-    time, rows = decoded(path, topic, contents, lambda each: (stamp_of(each), pose_of(each)))
+    time, rows = decoded(path, topic, contents, lambda each, _: (stamp_of(each), pose_of(each)))
     poses = np.array([pose for _, pose in rows])
     check_finite(path, topic, time, poses, "the pose")
     return {"odometry": (poses, time, np.array([stamp for stamp, _ in rows]))}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from coil_rl.envs.recordings.messages import ACKERMANN, ACKERMANN_STAMPED
 
@@ -15,8 +16,12 @@ SIMULATED = "simulated"  # metadata record of simulated recordings
 # drive send them faster, and robots stop without one.
 LIVES = 3  # turns
 LIVES_LONG = 0.5  # s
+AT_ONCE = 0.1  # turns, between messages that came at once
 STANDS = 0.01  # m/s, below which a robot does not drive
 PLAUSIBLE_RATES = (1.0, 100.0)  # scans per second of a clock that is believed
+# A message may be logged this much later than the quickest of so many beside it; what is later was
+# not delayed, but one of the clocks is wrong.
+LATE, BESIDE = 3.0, 61  # s, messages
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -36,8 +41,9 @@ class Recording:
         angle_increment: [N] radians, step of the bearing, negative for clockwise rotation.
         odometry: poses [M, 3] (m, m, radians), with their log times and stamps [M] ns; None without
             odometry.
-        commands: [M, 2], with their log times [M] ns; None without commands. They are m/s and
-            radians/s, or with Ackermann messages m/s and the steering angle in radians.
+        commands: [M, 2], with the times [M] ns when they came, see `arrivals`; None without
+            commands. They are m/s and radians/s, or with Ackermann messages m/s and the steering
+            angle in radians; NaN where a command was sent that is not known.
         frame: of the scanner.
         command_topic: topic of the commands; None without commands.
         command_type: message type of the commands.
@@ -82,6 +88,11 @@ class Recording:
         return (clock - clock[0]) / 1e9
 
     @property
+    def arrival(self) -> Times:
+        """[N] ns, when each scan came, by the clock of the log, see `arrivals`."""
+        return arrivals(self.stamp, self.log_time)
+
+    @property
     def turn(self) -> float:
         """Seconds of a turn of the scanner: the median time between scans, 0 for a single scan."""
         return float(np.median(np.diff(self.seconds))) if len(self.seconds) > 1 else 0.0
@@ -108,9 +119,7 @@ class Recording:
             car_length: m, between the axles, for commands with steering angles.
         """
         if self.odometry is not None:
-            pose, log_time, stamp = self.odometry
-            stamped = ascending(self.stamp) and ascending(stamp)
-            scan_time, pose_time = (self.stamp, stamp) if stamped else (self.log_time, log_time)
+            pose, (scan_time, pose_time) = self.odometry[0], self._times_of_poses()
             # Relative times, as floating point would round absolute nanoseconds to a quarter of a
             # microsecond.
             at = (scan_time - pose_time[0]).astype(float)
@@ -122,33 +131,50 @@ class Recording:
             if self.steered:
                 speed, angle = commands.T
                 commands = np.stack([speed, speed * np.sin(angle) / car_length], axis=1)
-            return _integrate_commands(commands, times, self.log_time, self.command_age)
+            return _integrate_commands(commands, times, self.arrival, self.command_age)
         return np.zeros((len(self.log_time), 3))
+
+    @property
+    def located(self) -> NDArray[np.bool_]:
+        """[N], whether there is odometry at the time of a scan; false without any."""
+        if self.odometry is None:
+            return np.zeros(len(self.log_time), dtype=np.bool_)
+        at, known = self._times_of_poses()
+        limit = round(self.command_age * 1e9)
+        return np.asarray((at >= known[0] - limit) & (at <= known[-1] + limit))
+
+    def _times_of_poses(self) -> tuple[Times, Times]:
+        """Return the times of scans and of poses by one clock, in ns."""
+        _, log_time, stamp = self.odometry  # type: ignore[misc]
+        stamped = ascending(self.stamp) and ascending(stamp)
+        return (self.stamp, stamp) if stamped else (self.log_time, log_time)
 
     def commands_of_scans(self, nominal_speed: float) -> Floats:
         """Return the command of each scan, [N, 2], in the units of `commands`; NaN without one.
 
-        It is the last command before the next scan: a controller needs time for a scan, and a
-        program that sends commands at a higher rate repeats the old one meanwhile. One that is
-        older than `command_age` counts no longer, and neither does one that comes so long after the
-        scan. The speed is the command's own, with which its turn rate means a steering angle; if no
-        command has one, that of the odometry, and without it the nominal one. A recording without
-        commands is a `ValueError`.
+        It is the last command before those that come with the next scan: a controller needs time
+        for a scan, and a program that sends commands at a higher rate repeats the old one
+        meanwhile. One that is older than `command_age` counts no longer, and neither does one that
+        comes so long after the scan. The speed is the command's own, with which its turn rate means
+        a steering angle; if no command has one, that of the odometry, and without it the nominal
+        one. A recording without commands is a `ValueError`.
 
         Args:
             nominal_speed: m/s.
         """
         if self.commands is None:
             raise ValueError(f"{self.path} has no commands; check that commands is not None")
-        commands, times = self.commands
+        (commands, times), arrival = self.commands, self.arrival
         limit = round(self.command_age * 1e9)
-        next_scan = np.append(self.log_time[1:], np.iinfo(np.int64).max)
-        end = np.minimum(next_scan, self.log_time + limit + 1)
+        next_scan = np.append(arrival[1:], np.iinfo(np.int64).max)
+        next_scan -= round(AT_ONCE * self.turn * 1e9)
+        end = np.minimum(next_scan, arrival + limit + 1)
         last = np.searchsorted(times, end) - 1
-        stale = (last < 0) | (self.log_time - times[last] > limit)
+        stale = (last < 0) | (arrival - times[last] > limit)
         rows = np.where(stale[:, None], np.nan, commands[last])
-        if not commands[:, 0].any():
-            rows[:, 0] = np.where(stale, np.nan, self._speeds(nominal_speed))
+        if not np.nan_to_num(commands[:, 0]).any():
+            speed = np.full(len(rows), nominal_speed) if self.odometry is None else self.motion()[0]
+            rows[:, 0] = np.where(np.isnan(rows[:, 1]), np.nan, speed)
         return rows
 
     def steering(self, nominal_speed: float, car_length: float) -> tuple[Floats, Floats, Floats]:
@@ -171,19 +197,22 @@ class Recording:
         sine = np.divide(second * car_length, speed, out=straight, where=speed != 0)
         return np.arcsin(sine.clip(-1, 1)), second, speed
 
-    def _speeds(self, nominal_speed: float) -> Floats:
-        """Return the speed from each scan to the next one by the odometry, or the nominal one.
+    def motion(self) -> tuple[Floats, Floats]:
+        """Return speed (m/s) and turn rate (radians/s) from each scan to the next one, [N] each.
 
-        It is negative for a robot that drives backwards. After the last scan it is that before it.
+        They are those of the poses. The speed is negative for a robot that drives backwards. After
+        the last scan they are those before it.
         """
-        if self.odometry is None or len(self.log_time) < 2:
-            return np.full(len(self.log_time), nominal_speed)
+        if len(self.log_time) < 2:
+            return np.zeros(1), np.zeros(1)
         x, y, heading = self.poses().T
         east, north, middle = np.diff(x), np.diff(y), (heading[1:] + heading[:-1]) / 2
         ahead = east * np.cos(middle) + north * np.sin(middle)
         way, time = np.copysign(np.hypot(east, north), ahead), np.diff(self.seconds)
-        speed = np.divide(way, time, out=np.zeros_like(way), where=time > 0)
-        return np.append(speed, speed[-1])
+        motion = np.stack([way, np.diff(heading)])
+        rates = np.divide(motion, time, out=np.zeros_like(motion), where=time > 0)
+        speed, turn_rate = np.append(rates, rates[:, -1:], axis=1)
+        return speed, turn_rate
 
 
 def ascending(times: Times) -> bool:
@@ -207,6 +236,23 @@ def believed(stamp: Times, log_time: Times) -> bool:
     if len(stamp) < 2 or _plausible(stamp):
         return True
     return not (ascending(log_time) and _plausible(log_time))
+
+
+def arrivals(stamp: Times, log_time: Times) -> Times:
+    """Return when messages came, in ns by the clock of the log.
+
+    A recorder may write messages late and several at once. Where the sender's stamps are believed,
+    they give order and age, as much later as the quickest message was logged; else log times do.
+    """
+    if not believed(stamp, log_time):
+        return log_time
+    delay = log_time - stamp
+    offset = delay.min()
+    # Not the smallest of all, as clocks drift apart.
+    least = minimum_filter1d((delay - offset).astype(float), BESIDE)
+    if (delay - offset - least).max() > LATE * 1e9:
+        return log_time
+    return stamp + offset + least.round().astype(np.int64)
 
 
 def _plausible(times: Times) -> bool:
@@ -233,7 +279,7 @@ def _integrate_commands(commands: Floats, command_time: Times, time: Times, age:
     moments = np.unique(np.concatenate([command_time, end, time]))
     index = np.searchsorted(command_time, moments, side="right") - 1
     stands = (index < 0) | (moments >= end[index])
-    speed, turn_rate = np.where(stands[:, None], 0.0, commands[index]).T
+    speed, turn_rate = np.where(stands[:, None], 0.0, np.nan_to_num(commands[index])).T
     step = np.diff(moments, append=moments[-1:]) / 1e9
     heading = np.cumsum(turn_rate * step) - turn_rate * step
     # The chord of an arc has the direction of the arc's middle.

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import Degrees
+from coil_rl.envs.recordings.cautions import cautions_about
 from coil_rl.envs.recordings.demonstrations import about_demonstrations
 from coil_rl.envs.recordings.folders import RecordingError, files_of
 from coil_rl.envs.recordings.mcap_files import read_messages
@@ -105,6 +106,15 @@ class McapReplayEnv(EnvBase):
         """Scans per second: the median of all recordings; NaN where there are single scans only."""
         turns = [each.turn for each in self.recordings if each.turn]
         return 1 / float(np.median(turns)) if turns else math.nan
+
+    def scans_of(self, number: int) -> slice:
+        """Return the scans of a recording among all scans."""
+        lengths = [len(each.ranges) for each in self.recordings[: number + 1]]
+        return slice(sum(lengths[:-1]), sum(lengths))
+
+    def cautions(self, number: int) -> list[str]:
+        """Return what makes the meaning of a recording doubtful here, see `cautions_about`."""
+        return cautions_about(self, number)
 
     def demonstrations(self) -> Iterator[str]:
         """Yield lines on what there is to learn; a `ValueError` if there is nothing."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.envs.recordings.bearings import Angles, bearings
-from coil_rl.envs.recordings.folders import RecordingError
+from coil_rl.envs.recordings.folders import CONVERT, RecordingError
 from coil_rl.envs.recordings.mcap_files import Contents
 from coil_rl.envs.recordings.messages import decode, stamp_of
 from coil_rl.envs.recordings.recording import Times
@@ -19,6 +19,7 @@ LARGEST = 1e7  # of poses, commands and angles
 # All scans together may have this many ranges with their padding, and this many times their own.
 LARGEST_PADDED, PADDED_SHARE = 10**7, 4
 FEW_RANGES = 0.01  # share of all ranges
+ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of what zstd has compressed
 FAR = 100.0  # m, beyond the ranges of a scanner for robots
 
 # Frame, smallest and greatest range, name of the program that sent its scans.
@@ -71,7 +72,7 @@ def _of_one_scanner(
         remarks: a remark is added if there are several scanners.
     """
 
-    def fields(message: Any) -> tuple[Any, ...]:
+    def fields(message: Any, _: int) -> tuple[Any, ...]:
         scanner = message.header.frame_id, message.range_min, message.range_max
         if math.isnan(message.range_min + message.range_max):
             raise ValueError("its smallest or greatest range is not a number")
@@ -92,19 +93,25 @@ def _of_one_scanner(
 
 
 def decoded(
-    path: Path, topic: str, contents: Contents, fields: Callable[[Any], tuple[Any, ...]]
+    path: Path, topic: str, contents: Contents, fields: Callable[[Any, int], tuple[Any, ...]]
 ) -> tuple[Times, list[tuple[Any, ...]]]:
     """Return the log times of a topic, and the chosen fields of its messages.
 
     Args:
-        fields: takes a decoded message and returns what is needed of it.
+        fields: takes a decoded message and the time in ns when it was sent, and returns what is
+            needed of it.
     """
     rows = []
-    for index, (channel, log_time, _, data) in enumerate(contents.messages[topic]):
+    for index, (channel, log_time, sent, data) in enumerate(contents.messages[topic]):
         try:
             message = decode(data, channel.message_type, channel.language, channel.definition)
-            rows.append(fields(message))
+            rows.append(fields(message, sent))
         except Exception as error:  # bytes and definition may be anything
+            if data.startswith(ZSTD):
+                raise RecordingError(
+                    f"{path}, topic {topic} has messages that are compressed one by one "
+                    f"(compression_mode: MESSAGE); convert its folder: {CONVERT}."
+                ) from None
             raise RecordingError(
                 f"{path}, topic {topic}, message {index} at {log_time / 1e9:.3f} s: it is not a "
                 f"valid {channel.message_type} ({' '.join(str(error).split())}); record it again, "

@@ -37,7 +37,6 @@ def replay(config: DictConfig) -> None:
     from coil_rl import build, write_text
     from coil_rl.envs import McapReplayEnv
     from coil_rl.for_guests import progress
-    from coil_robot.replay.cautions import caution
     from coil_robot.replay.open_loop import open_loop
     from coil_robot.replay.report import NOTES, describe, outcome
 
@@ -62,8 +61,8 @@ def replay(config: DictConfig) -> None:
     for destination, result in zip(destinations, results, strict=True):
         _write(config, result, runs, destination)
     parts = [describe(result) for result in results]
-    cautions = [text for text in (caution(result, env.perception) for result in results) if text]
-    parts += [f"Warning: {each}." for each in cautions]
+    doubts = [text for number in range(len(results)) for text in env.cautions(number)]
+    parts += [f"Warning: {each}." for each in doubts]
     parts += [f"{name} is {run.folder} (policy {config.policy})." for name, run in runs.items()]
     parts.append(NOTES.format(max_steering=math.degrees(env.max_steering)))
     text = "\n\n".join(parts)
@@ -71,7 +70,7 @@ def replay(config: DictConfig) -> None:
     print(f"{text}\n")
     for destination, result in zip(folders, results, strict=True):
         print(f"{outcome(result)}; see {destination}")
-    for text in cautions:
+    for text in doubts:
         print(f"replay: {text}", file=sys.stderr)
 
 

@@ -3,7 +3,6 @@
 The policies act at every scan of a drive that they did not control.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +18,6 @@ from coil_rl import UserError
 from coil_rl.envs import HISTORY, McapReplayEnv, Recording, recent_mean
 
 RECORDED = "recorded"  # name of the recorded commands among the policies
-ROUNDING = 1.001  # of commands at the limit
 STEERING_KEYS = (("next", "steering"), ("next", "omega"), ("next", "info", "smoothness"))
 VIEW_KEYS = ("cones", "cone_count", "observation", ("info", "valid"))
 
@@ -58,7 +56,6 @@ class OpenLoop:
         steering: by policy; `recorded_steering` is last, as `RECORDED`, if there are commands.
         max_steering: radians of an action of 1.
         sight: m, range of view in the scale of the cone world.
-        beyond: share of the recorded commands that ask for more than the robot can steer.
     """
 
     recording: Recording
@@ -69,7 +66,6 @@ class OpenLoop:
     steering: dict[str, Steering]
     max_steering: float
     sight: float
-    beyond: float = 0.0
 
     @property
     def both_valid(self) -> NDArray[np.bool_]:
@@ -131,18 +127,16 @@ def _result(env: McapReplayEnv, row: int, rollouts: Mapping[str, TensorDictBase]
     # A recording shorter than the longest one restarts; its first pass counts.
     steps = {name: rollout[row, : len(recording.ranges)] for name, rollout in rollouts.items()}
     steering: dict[str, Steering] = {}
-    beyond = 0.0
     for name, step in steps.items():
         columns = [step[key].squeeze(-1).double().numpy() for key in STEERING_KEYS]
         steering[name] = Steering(*columns)
     if recording.commands is not None:
         car = env.speed, env.car_length, env.max_steering
         steering[RECORDED] = recorded_steering(recording, *car)
-        beyond = _share_beyond(recording, *car)
     view = next(iter(steps.values()))  # equal for all policies
     cones, count, observation, valid = (view[key].numpy() for key in VIEW_KEYS)
     robot = env.max_steering, env.memory.sight
-    return OpenLoop(recording, cones, count, observation, valid, steering, *robot, beyond)
+    return OpenLoop(recording, cones, count, observation, valid, steering, *robot)
 
 
 def recorded_steering(
@@ -166,24 +160,3 @@ def recorded_steering(
     history = np.lib.stride_tricks.sliding_window_view(before, HISTORY)[:, ::-1].T.copy()
     smoothness[known] = np.abs(given - recent_mean(torch.from_numpy(history)).numpy())
     return Steering(action, omega, smoothness)
-
-
-def _share_beyond(
-    recording: Recording, speed: float, car_length: float, max_steering: float
-) -> float:
-    """Return the share of the recorded commands that no steering of the robot fulfils.
-
-    Args:
-        speed: m/s of the robot, for a recording without speeds.
-        car_length: length L of the robot, m.
-        max_steering: radians of an action of 1.
-    """
-    speeds, second = recording.commands_of_scans(speed).T
-    moves = speeds != 0
-    if recording.steered:
-        beyond = np.abs(second) > max_steering * ROUNDING
-    else:
-        largest = np.abs(speeds) * math.sin(max_steering) / car_length
-        beyond = moves & (np.abs(second) > largest * ROUNDING)
-    known = ~np.isnan(second)
-    return float(beyond[known].mean()) if known.any() else 0.0

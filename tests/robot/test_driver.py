@@ -134,6 +134,10 @@ def double_rate(index, scan, now):
     return replace(scan, stamp=scan.stamp - early), now - early
 
 
+def queued(index, scan, now):
+    return scan, now + 0.15 * max(0, index - FAULT) / RATE
+
+
 class Frozen:
     """Scans of which one repeats."""
 
@@ -219,6 +223,17 @@ FAULTS = {
         "no view of both boundaries for 2.",
         2.6,
     ),
+    "mirrored scans": (
+        {"change": changed(ranges=lambda index, scan: np.roll(scan.ranges[::-1], -1))},
+        "mirrored or turned: left cones right of the right ones in 4 of the last 6",
+        0.8,
+    ),
+    "turned scans": (
+        {"change": changed(ranges=lambda index, scan: np.roll(scan.ranges, 180))},
+        "mirrored or turned: left cones right of the right ones in 4 of the last 6",
+        0.8,
+    ),
+    "queue that grows": ({"change": queued}, "come late: 0.38 s later than the quickest", 3.0),
     "half the rate": ({"change": half_rate}, "rate: scans arrive 3.7 times", 2.0),
     "twice the rate": ({"change": double_rate}, "rate: scans arrive 7.3 times", 1.0),
     "clock goes back": ({"change": late_clock}, "steady clock that goes back", 0.2),
@@ -287,6 +302,18 @@ def test_the_car_does_not_move_before_it_has_seen_both_boundaries():
     result, env = driven(live, 5.0, change=blind)
     assert result.states == {"waiting": result.scans}
     assert live.reason == "no view of both boundaries yet"
+    assert torch.equal(env.pose, env.start_pose[:, :1])
+
+
+@pytest.mark.parametrize("change", [FAULTS["mirrored scans"], FAULTS["turned scans"]])
+def test_the_car_does_not_move_by_scans_that_are_mirrored_or_turned_from_the_start(change):
+    def from_the_start(index, scan, now):
+        return change[0]["change"](index + FAULT, scan, now)
+
+    live = driver()
+    result, env = driven(live, 3.0, change=from_the_start)
+    assert result.states == {"waiting": result.scans}
+    assert "mirrored or turned" in live.reason
     assert torch.equal(env.pose, env.start_pose[:, :1])
 
 

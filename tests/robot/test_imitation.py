@@ -2,6 +2,7 @@
 
 import csv
 import math
+import shutil
 
 import odd_recordings as odd
 import pytest
@@ -124,18 +125,14 @@ def test_run_is_evaluated_and_replayed_like_any_other(folder):
     assert "| oil " in called("replay", *arguments, cwd=folder).stdout
 
 
-@pytest.mark.slow
-def test_forest_that_imitates_is_a_controller_and_no_export(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    words = [*SHORT[2:], "learner=forest", "recording=[a.mcap,b.mcap]"]
-    run = coil_rl.train("mcap_replay", method="oil", overrides=words, folder="of_forest")
-    assert abs(run.controller().act({"observation": torch.zeros(20).numpy()})[0]) <= 1
-    with pytest.raises(coil_rl.UserError, match="it is a forest, not a network"):
-        export_policy(run, "forest_file", observations=9)
+def test_recording_that_is_there_twice_is_refused(folder, tmp_path):
+    shutil.copy(folder / "a.mcap", tmp_path / "copy.mcap")
+    done = trained(folder, f"recording=[a.mcap,{tmp_path / 'copy.mcap'}]", code=2)
+    assert "hold the same scans; leave one of them out" in done.stderr
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("learner", ["linear", "network"])
+@pytest.mark.parametrize("learner", ["forest", "linear", "network"])
 def test_imitated_policy_is_a_controller_a_guide_an_export_and_drives(learner, folder, monkeypatch):
     monkeypatch.chdir(folder)
     words = [*SHORT[2:], f"learner={learner}", "recording=[a.mcap,b.mcap]"]
@@ -151,7 +148,7 @@ def test_imitated_policy_is_a_controller_a_guide_an_export_and_drives(learner, f
     data = env.reset()
     first = run.controller().act({"observation": data["observation"][0].numpy()})
     assert float(data["guide_action"][0, 0, 0]) == pytest.approx(float(first[0]), abs=1e-6)
-    if learner == "linear":
+    if learner == "forest":
         done = called("drive", f"run={run.folder}", "simulation.seconds=2", cwd=folder)
         assert "driving" in done.stdout
 

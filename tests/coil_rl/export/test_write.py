@@ -22,7 +22,6 @@ from coil_rl.run.delivery import GUIDE
 
 METHODS = shipped("method")
 OBSERVATIONS = 30
-REFUSED = {"dagger", "oil"}  # regressors of scikit-learn
 
 
 @pytest.fixture(autouse=True)
@@ -125,13 +124,13 @@ def test_first_policy_that_was_handed_over_is_said_to_have_learned_nothing(tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [name for name in METHODS if name not in REFUSED])
+@pytest.mark.parametrize("method", METHODS)
 def test_every_method_is_exported(method, tmp_path):
     tuned = {"tune": ("thermostat.control:proportional", ["tune={kp: [0.1, 1]}"])}
     guide, words = tuned.get(method, ("thermostat.control:Feedforward", []))
     run, policy = exported(tmp_path, method, *words, guide=guide)
     # The guides that dynamic COIL learns are networks of the policy itself.
-    without = method == "ppo" or method.startswith("dynamic_coil")
+    without = method in ("ppo", "oil", "dagger") or method.startswith("dynamic_coil")
     assert policy.contract["guide"]["place"] == ("absent" if without else "inside")
     same_actions(run, policy, rooms())
 
@@ -219,15 +218,6 @@ def test_numbering_of_an_env_of_choices_is_kept(tmp_path):
     assert action in (0, 1)
     observations = np.random.default_rng(0).normal(0, 1, (10, 4)).astype(np.float32)
     same_actions(run, policy, observations)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", sorted(REFUSED))
-def test_forest_is_refused(method, tmp_path):
-    run = coil_rl.open_run(learned(tmp_path / "run", method))
-    with pytest.raises(coil_rl.UserError, match="it is a forest"):
-        coil_rl.export_policy(run, tmp_path / "exported", observations=5)
-    assert not (tmp_path / "exported").exists()
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import os
 import random
 import re
 import signal
+import struct
 import sys
 import time
 import warnings
@@ -18,12 +19,15 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import TransformedEnv
 
 from coil_rl import GymnasiumEnv
+from coil_rl.foreign import guard as guard_file
 from coil_rl.foreign.faults import ForeignError
-from coil_rl.foreign.guard import SETTINGS
+from coil_rl.foreign.guard import SETTINGS, hold
 from coil_rl.foreign.trial import Trial
 from coil_rl.guides import ControllerGuide, PerRow
 from coil_rl.transforms import GuideActions
@@ -692,6 +696,30 @@ def seeded():
     torch.manual_seed(9), np.random.seed(9), random.seed(9)
 
 
+def acts_that(change):
+    """Return controllers that change the process, by what they are."""
+
+    class Controller:
+        def act(self, observation):
+            change()
+            return [0.0]
+
+    def function(observation):
+        change()
+        return observation[..., :1]
+
+    class Module(TensorDictModuleBase):
+        in_keys, out_keys = ["observation"], ["action"]
+
+        def forward(self, tensordict):
+            return tensordict.set("action", function(tensordict["observation"]))
+
+    return {"act": Controller, "function": function, "module": Module, "held": hold(Module())}
+
+
+ACTS = tuple(acts_that(None))
+
+
 def process_after(change, place):
     """Return the state of the process after a place of an env or a controller has changed it."""
 
@@ -712,19 +740,11 @@ def process_after(change, place):
             self.at("step")
             super().move(action)
 
-    class Controller:
-        def act(self, observation):
-            change()
-            return [0.0]
-
-    def function(observation):
-        change()
-        return observation[..., :1]
-
     seeded()
     env = GymnasiumEnv(Does, 2, first_seed=0)
-    if place in ("act", "function"):
-        guide = ControllerGuide(Controller if place == "act" else function)
+    if place in ACTS:
+        acts = acts_that(change)[place]
+        guide = acts if place == "held" else ControllerGuide(acts)
         env = TransformedEnv(env, GuideActions({"theirs": guide}))
     carrier = env.reset()
     for _ in range(6):
@@ -732,7 +752,7 @@ def process_after(change, place):
     return state()
 
 
-@pytest.mark.parametrize("place", ["the maker", "reset", "step", "act", "function"])
+@pytest.mark.parametrize("place", ["the maker", "reset", "step", *ACTS])
 @pytest.mark.parametrize("change", [*CHANGES, *MADE])
 def test_process_is_as_before_whatever_foreign_code_does_to_it(change, place):
     if change in MADE and place not in ("the maker", "reset"):
@@ -740,6 +760,44 @@ def test_process_is_as_before_whatever_foreign_code_does_to_it(change, place):
     seeded()
     before = state()
     assert process_after((CHANGES | MADE)[change], place) == before
+
+
+class Dithers(TensorDictModuleBase):
+    """A guide that seeds the process in its first call, and draws from it in each."""
+
+    in_keys, out_keys = ["observation"], ["action"]
+
+    def forward(self, tensordict):
+        if not hasattr(self, "calls"):
+            self.calls = torch.manual_seed(0)
+        drawn = torch.rand(()) + np.random.rand() + random.random()
+        return tensordict.set("action", tensordict["observation"][..., :1] * 0 + drawn)
+
+
+def test_random_numbers_of_a_guide_are_its_own_and_in_its_state():
+    data = TensorDict({"observation": torch.zeros(2, 3)}, [2])
+    seeded()
+    plain = torch.rand(4)
+    seeded()
+    guide, drawn = hold(Dithers()), []
+    for _ in range(4):
+        drawn.append(torch.rand(()))
+        guide(data)
+    assert torch.equal(torch.stack(drawn), plain)
+    saved = guide.state_dict()
+    later = [float(guide(data)["action"][0]) for _ in range(3)]
+    assert len(set(later)) == 3
+    again = hold(Dithers())
+    again.calls = 0
+    again.load_state_dict(saved)
+    assert [float(again(data)["action"][0]) for _ in range(3)] == later
+
+
+def test_state_of_pythons_generator_is_where_it_is_looked_for():
+    random.seed(3)
+    random.random()
+    index, *numbers = struct.unpack("=i624I", guard_file._STATE.raw)
+    assert (*numbers, index) == random.getstate()[1]
 
 
 def test_foreign_code_finds_again_what_it_has_set():

@@ -5,20 +5,14 @@ import warnings
 import numpy as np
 import odd_recordings as odd
 import pytest
+import zstandard
+from drives import store
+from mcap.writer import CompressionType, Writer
 
 from coil_rl.envs.recordings.folders import RecordingError
+from coil_rl.envs.recordings.mcap_files import read_messages
+from coil_rl.envs.recordings.messages import encode
 from coil_rl.envs.recordings.reading import read_recording
-
-# What the perception or the size of the robot tells is said by a replay, see test_cautions.py.
-OF_A_REPLAY = (
-    odd.mirrored,
-    odd.backwards,
-    odd.turned_left,
-    odd.clockwise_with_a_positive_step,
-    odd.room,
-    odd.commands_in_degrees,
-    odd.ackermann_in_degrees,
-)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +40,7 @@ def test_good_drive_leaves_no_doubts(good, tmp_path):
     assert remarks(good) == remarks(odd.write(tmp_path / "same.mcap", odd.messages_of(good))) == []
 
 
-@pytest.mark.parametrize("change", [each for each in odd.ODD if each not in OF_A_REPLAY])
+@pytest.mark.parametrize("change", [each for each in odd.ODD if each not in odd.OF_A_REPLAY])
 def test_odd_recording_is_said_to_be_odd(good, change, tmp_path):
     said, words = remarks(changed(good, change, tmp_path)), odd.ODD[change]
     assert any(words in remark for remark in said) if words else said == [], said
@@ -64,6 +58,54 @@ def test_command_that_is_too_old_is_none(good, tmp_path):
     known = ~np.isnan(recording.commands_of_scans(0.15)[:, 1])
     # The twelfth command is sent with the twelfth scan, and counts for three turns.
     assert known.tolist() == [True] * 15 + [False] * 29
+
+
+@pytest.mark.parametrize("change", odd.IN_BURSTS)
+def test_commands_belong_to_the_scans_of_their_time_and_not_of_their_log(good, change, tmp_path):
+    expected = read_recording(good).commands_of_scans(0.15)
+    with pytest.warns(UserWarning, match="late, so their stamps are the clock"):
+        found = read_recording(changed(good, change, tmp_path)).commands_of_scans(0.15)
+    np.testing.assert_allclose(found, expected)
+
+
+def test_command_of_another_type_is_no_label_for_its_scan(good, tmp_path):
+    with pytest.warns(UserWarning, match="22 of geometry_msgs/msg/Twist are read"):
+        recording = read_recording(changed(good, odd.stamped_commands_by_turns, tmp_path))
+    commands = recording.commands_of_scans(0.15)[:, 1]
+    assert np.isnan(commands).tolist() == [False, True] * 22
+    np.testing.assert_allclose(commands[::2], read_recording(good).commands_of_scans(0.15)[::2, 1])
+
+
+def test_log_clock_that_is_set_back_is_named_and_stamps_give_the_order(good, tmp_path):
+    contents, path = read_messages(good), tmp_path / "back.mcap"
+    start = 10**10
+    with path.open("wb") as stream:
+        writer = Writer(stream, 10**7, CompressionType.NONE)
+        writer.start("ros2")
+        channels = {}
+        for topic, messages in contents.messages.items():
+            channel = messages[0].channel
+            schema = writer.register_schema(channel.message_type, "ros2msg", channel.definition)
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        sent = [each for messages in contents.messages.values() for each in messages]
+        for each in sorted(sent, key=lambda each: (each.log_time, each.channel.topic != "/scan")):
+            later = start + each.log_time - (5 * 10**9 if each.log_time > 4 * 10**9 else 0)
+            writer.add_message(channels[each.channel.topic], later, each.data, later)
+        writer.finish()
+    with pytest.warns(UserWarning, match="log times that step back by 4.82 s, so stamps give"):
+        recording = read_recording(path)
+    assert len(recording.remarks) == 1
+    expected = read_recording(good)
+    np.testing.assert_array_equal(recording.ranges, expected.ranges)
+    found = recording.commands_of_scans(0.15), recording.poses()
+    np.testing.assert_allclose(found[0], expected.commands_of_scans(0.15))
+    np.testing.assert_allclose(found[1], expected.poses())
+
+
+def test_messages_that_are_compressed_one_by_one_are_named(tmp_path):
+    scan = zstandard.compress(encode(odd.SCAN, {"ranges": np.ones(9)}))
+    path = store(tmp_path / "compressed.mcap", scan)
+    assert "compression_mode: MESSAGE); convert its folder" in remarks(path)[0]
 
 
 def test_command_long_after_the_last_scan_before_a_gap_does_not_belong_to_it(good, tmp_path):
