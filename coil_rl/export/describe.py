@@ -14,7 +14,7 @@ from torchrl.data import Bounded
 
 from coil_rl import record
 from coil_rl.envs.meanings import meaning, meanings_of
-from coil_rl.export.contract import FORMAT, VERSION, checksum
+from coil_rl.export.contract import FORMAT, VERSION
 from coil_rl.export.files import OPSET
 from coil_rl.export.parity import Parity
 from coil_rl.export.step import ADVICE, Entry, PolicyStep
@@ -42,16 +42,14 @@ def describe(
     controller: Controller,
     step: PolicyStep,
     parity: Parity,
-    contents: Mapping[str, bytes],
     *,
     which: str,
     outside: str | None,
     meanings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the contract of an exported policy.
+    """Return the contract of an exported policy, but for its `files`.
 
     Args:
-        contents: of the files, by name.
         which: policy of the run, "handed_over" or "last".
         outside: why the guides are outside; None if they are not.
         meanings: of entries, in place of what the env says, see `coil_rl.envs.meanings`.
@@ -63,10 +61,6 @@ def describe(
     return {
         "format": FORMAT,
         "version": VERSION,
-        "files": {
-            name: {"sha256": checksum(content), "bytes": len(content)}
-            for name, content in contents.items()
-        },
         "policy": _policy(run, which, guide_itself(controller, step)),
         "env": {"title": title_of(plant), "control_rate": _rate(plant)},
         "batch": "any number of rows; the first dimension of every input and output",

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+import json
 import logging
+import math
 import textwrap
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Any
 
@@ -121,6 +123,37 @@ def _smaller(model: Any) -> bytes:
         del part.metadata_props[:]
     content: bytes = proto.SerializeToString()
     return content
+
+
+def explained(content: bytes, contract: Mapping[str, Any]) -> bytes:
+    """Return the content of a file of ONNX that says what its numbers mean, as metadata.
+
+    `contract` is all of it as JSON. The other entries are what programs of robots read today, lists
+    with commas: an entry of the observation needs no scale, and no steps before the present one,
+    and the action is in the unit of the env, so that all scales are 1.
+
+    Args:
+        contract: without its `files`, among which is this one.
+    """
+    import onnx
+
+    names = [entry["name"] for entry in contract["inputs"]]
+    (output,) = contract["outputs"]
+    said = {
+        "observation_names": names,
+        "observation_scales": [1.0] * len(names),
+        "observation_history_lengths": [1] * len(names),
+        "action_scale": [1.0] * math.prod(output["shape"]),
+        "action_units": str(output["unit"]).split(", "),
+    }
+    if rate := contract["env"]["control_rate"]:
+        said["control_rate"] = [rate["value"]]
+    texts = {key: ",".join(map(str, values)) for key, values in said.items()}
+    texts["contract"] = json.dumps(contract, ensure_ascii=False, allow_nan=False)
+    model = onnx.load_from_string(content)
+    onnx.helper.set_model_props(model, texts)
+    written: bytes = model.SerializeToString()
+    return written
 
 
 @contextmanager

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from coil_rl.errors import UserError
-from coil_rl.export.contract import CONTRACT, DRIVER, ONNX, TORCH
+from coil_rl.export.contract import CONTRACT, DRIVER, ONNX, TORCH, checksum
 from coil_rl.export.describe import LEARNED, describe
-from coil_rl.export.files import as_onnx, as_torch, traced
+from coil_rl.export.files import as_onnx, as_torch, explained, traced
 from coil_rl.export.parity import LIMIT, WITH_GUIDE, Parity, compare
 from coil_rl.export.policy import ExportedPolicy
 from coil_rl.export.recording import Recording, record
@@ -88,12 +88,16 @@ def export_policy(
         controller,
         step,
         parity,
-        contents,
         which=which,
         outside=outside,
         meanings=meanings or {},
     )
-    _save(Path(folder), contents, contract)
+    contents[ONNX] = explained(contents[ONNX], contract)
+    files = {
+        name: {"sha256": checksum(content), "bytes": len(content)}
+        for name, content in contents.items()
+    }
+    _save(Path(folder), contents, contract | {"files": files})
     say(f"export: {parity}")
     if run.make_learner is not None:
         _say_if_not_learned(contract["policy"]["acts"], outside)

@@ -1,9 +1,44 @@
-"""`coil-info`: versions, and the command that made a run."""
+"""`coil-info`: versions, the command that made a run, and what a policy says about itself."""
 
+import json
+
+import onnx
 import pytest
+from exported_sums import model, write
 
 from coil_rl.errors import UserError
-from coil_rl.programs.info import describe
+from coil_rl.export.files import explained
+from coil_rl.programs.info import describe, explain
+
+
+def test_exported_policy_explains_itself(tmp_path):
+    path = write(tmp_path) / "policy.onnx"
+    contract = json.loads((tmp_path / "contract.json").read_text())
+    contract["outputs"][0]["unit"] = "N, m"
+    contract["env"]["control_rate"] = {"value": 50.0, "unit": "steps per second"}
+    path.write_bytes(explained(model(), contract))
+    said = explain(path)
+    assert said["observation_names"] == "observation,guide_action"
+    assert said["observation_history_lengths"] == "1,1"
+    assert (said["action_scale"], said["action_units"]) == ("1.0", "N,m")
+    assert said["control_rate"] == "50.0"
+    assert said["inputs.observation.shape"] == "[2]"
+    assert said["guide.reason"] == "it is Python"
+    # The graph is the same, and nothing but the texts makes the file larger.
+    bare, whole = onnx.load_from_string(model()), onnx.load(path)
+    assert bare.graph == whole.graph
+    texts = sum(len(prop.key) + len(prop.value.encode()) for prop in whole.metadata_props)
+    assert path.stat().st_size - len(model()) < texts + 200
+
+
+def test_file_without_words_is_refused(tmp_path):
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(model())
+    with pytest.raises(UserError, match="says nothing about itself"):
+        explain(path)
+    path.write_bytes(b"no model")
+    with pytest.raises(UserError, match="cannot be read as a file of ONNX"):
+        explain(path)
 
 
 def test_damaged_command_is_named(tmp_path):
