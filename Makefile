@@ -68,7 +68,7 @@ kill-test: $(INSTALLED) ## kill 20 short trainings at random moments, resume and
 check: $(INSTALLED) ## lint, formatting, types and import directions
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy -p coil_rl -p coil_paper -p coil_robot -p coil_studies -p benchmarks
+	$(BIN)/mypy -p coil_rl -p coil_fmu -p coil_paper -p coil_robot -p coil_studies -p benchmarks
 	$(BIN)/lint-imports --no-logo
 
 format: $(INSTALLED) ## format the code and apply the automatic lint fixes

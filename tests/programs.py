@@ -12,13 +12,14 @@ from unittest.mock import patch
 
 from hydra._internal.hydra import Hydra
 
+import coil_fmu.conf
 import coil_rl.conf
 import coil_robot.conf
 import coil_studies.conf
 
 ROOT = Path(__file__).parents[1]
 CONF = Path(coil_rl.conf.__path__[0])  # of the library that is tested, which may be a wheel
-GUEST_CONFS = (coil_robot.conf, coil_studies.conf)
+GUEST_CONFS = (coil_fmu.conf, coil_robot.conf, coil_studies.conf)
 CONFS = (CONF, *(Path(each.__path__[0]) for each in GUEST_CONFS))
 
 # Programs of guests, by command.

@@ -10,11 +10,12 @@ import pytest
 from omegaconf import OmegaConf
 from programs import CONF
 
+import coil_fmu.conf
 import coil_paper.conf
 import coil_robot.conf
 import coil_studies.conf
 
-PROJECT = ("coil_rl.", "coil_paper.", "coil_robot.", "coil_studies.")
+PROJECT = ("coil_rl.", "coil_fmu.", "coil_paper.", "coil_robot.", "coil_studies.")
 # Folders in which a file changes the defaults of a class for a method or an experiment.
 VARIATION_FOLDERS = ("experiment", "method", "preset", "paper/experiment", "studies/method")
 # Other deliberate variations, by file. A key stands for all keys that begin with it.
@@ -31,6 +32,11 @@ VARIATIONS = {
         "env.controllers",
         "env.workers",
     ],  # None in the constructor: no options, no controllers; from Python processes are asked for
+    # None in the constructor: nothing, and a reward for setpoints that a command line may change.
+    "fmu/env/fmu.yaml": [
+        *(f"env.{name}" for name in ("setpoints", "parameters", "start", "bounds", "controllers")),
+        *("env.reward", "env.workers"),
+    ],
     "env/torchrl.yaml": ["env.max_steps"],
     "robot/env/mcap_replay.yaml": ["evaluation.env."],  # two laps of robots that start alike
     "task/cones_noisy_view.yaml": ["method.transforms.view.sigma"],
@@ -47,6 +53,7 @@ VARIATIONS = {
 }
 FOLDERS = {
     "": CONF,
+    "fmu/": Path(coil_fmu.conf.__path__[0]),
     "paper/": Path(coil_paper.conf.__path__[0]),
     "robot/": Path(coil_robot.conf.__path__[0]),
     "studies/": Path(coil_studies.conf.__path__[0]),

@@ -23,6 +23,7 @@ import hydra.utils
 import pytest
 from programs import CONF, ROOT
 
+import coil_fmu
 import coil_paper
 import coil_rl
 import coil_robot
@@ -30,13 +31,13 @@ import coil_studies
 
 MODULES = [
     module.name
-    for package in (coil_rl, coil_paper, coil_robot, coil_studies)
+    for package in (coil_rl, coil_fmu, coil_paper, coil_robot, coil_studies)
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
     if ">>>" in (importlib.util.find_spec(module.name).loader.get_source(module.name) or "")
 ]
 API = (coil_rl, coil_rl.envs, coil_rl.transforms, coil_rl.guides, coil_rl.learners)
-FOLDERS = ("coil_rl", "envs", "transforms", "paper", "studies", "benchmarks", "docs")
-TARGET = re.compile(r"_target_: *(coil_(?:rl|studies)\.[\w.]+)")
+FOLDERS = ("coil_rl", "envs", "transforms", "fmu", "paper", "studies", "benchmarks", "docs")
+TARGET = re.compile(r"_target_: *(coil_(?:fmu|rl|studies)\.[\w.]+)")
 NAME = re.compile(r"    (\*{0,2}\w[\w, *]*):")
 
 Public = Callable[..., Any]

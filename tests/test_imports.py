@@ -16,6 +16,7 @@ LINKED = {
     "envs": "coil_rl.envs",
     "transforms": "coil_rl.transforms",
     "conf": "coil_rl.conf",
+    "fmu": "coil_fmu",
     "paper": "coil_paper",
     "studies": "coil_studies",
     "robot": "coil_robot",
@@ -24,6 +25,7 @@ TENSOR_LIBRARIES = {"torch", "tensordict", "torchrl"}
 
 # Packages whose `__init__.py` says what is public: `from coil_rl.envs import Track as Track`.
 PUBLIC = [
+    "coil_fmu",
     "coil_rl.cones",
     "coil_rl.envs",
     "coil_rl.envs.recordings",
@@ -72,17 +74,18 @@ def package_of(path: Path) -> list[str]:
 
 
 @functools.cache
-def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
+def imported_modules(path: Path) -> list[str]:
+    """Return the absolute names of all imported modules of a file."""
+    return list(modules_of(ast.parse(path.read_text(encoding="utf-8")), path))
 
 
-def imported_modules(path: Path, tree: ast.Module | None = None) -> Iterator[str]:
-    """Yield the absolute names of all imported modules of a file, or of a part of it.
+def modules_of(tree: ast.Module, path: Path) -> Iterator[str]:
+    """Yield the absolute names of the imported modules of a tree.
 
     `from a import b` gives `a.b`, because b may be a module.
     """
     package = package_of(path)
-    for node in ast.walk(tree or tree_of(path)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -132,7 +135,7 @@ def public_names():
     return names
 
 
-@pytest.mark.parametrize("guest", ["paper", "robot"])
+@pytest.mark.parametrize("guest", ["fmu", "paper", "robot"])
 def test_guest_imports_only_what_is_public(guest: str) -> None:
     public = public_names()
     own = (LINKED[guest], *MODULES)
@@ -146,7 +149,7 @@ def test_guest_imports_only_what_is_public(guest: str) -> None:
     assert not wrong, "a guest is written as a stranger's package; use, or make, public names"
 
 
-@pytest.mark.parametrize("guest", ["coil_paper", "coil_robot", "coil_studies"])
+@pytest.mark.parametrize("guest", ["coil_fmu", "coil_paper", "coil_robot", "coil_studies"])
 def test_library_does_not_name_its_guests(guest: str) -> None:
     folders = ["coil_rl", "envs", "transforms", "conf"]
     files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
@@ -157,7 +160,7 @@ def test_library_does_not_name_its_guests(guest: str) -> None:
 
 
 def test_only_modules_of_that_name_import_gymnasium() -> None:
-    found = {path.stem: list(imported_modules(path)) for path in source_files("envs")}
+    found = {path.stem: imported_modules(path) for path in source_files("envs")}
     users = [
         stem for stem, names in found.items() if any(is_inside(name, "gymnasium") for name in names)
     ]
@@ -224,7 +227,7 @@ def test_no_files_import_each_other() -> None:
     graph, known = {}, {*modules.values()}
     for path, module in modules.items():
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        found = imported_modules(path, WithoutTypes().visit(tree))
+        found = modules_of(WithoutTypes().visit(tree), path)
         names = {name if name in known else name.rpartition(".")[0] for name in found}
         graph[module] = names - {module}
     graphlib.TopologicalSorter(graph).prepare()  # a circle is a CycleError

@@ -19,6 +19,7 @@ LINKS = {
     "coil_rl/envs": "../envs",
     "coil_rl/transforms": "../transforms",
     "coil_rl/conf": "../conf",
+    "coil_fmu": "fmu",
     "coil_paper": "paper",
     "coil_studies": "studies",
     "coil_robot": "robot",
@@ -99,9 +100,10 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
         "envs": ["*.py", "*.json", "tracks/**/*.csv"],
     }
     patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"], "paper": ["*.py", "*.yaml"]}
-    patterns["studies"] = ["*.py", "*.yaml"]
+    patterns |= {"studies": ["*.py", "*.yaml"], "fmu": ["*.py", "*.yaml"]}
     patterns["robot"] = ["*.py", "*.yaml", "*.json"]
     installed_as = {
+        "fmu": "coil_fmu",
         "coil_rl": "coil_rl",
         "paper": "coil_paper",
         "robot": "coil_robot",
@@ -128,6 +130,7 @@ def test_wheel_has_three_import_names(wheel: Path) -> None:
     top = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
     assert {name for name in top if not name.endswith(".dist-info")} == {
         "coil_rl",
+        "coil_fmu",
         "coil_paper",
         "coil_studies",
         "coil_robot",
@@ -147,6 +150,7 @@ def test_sdist_contains_everything_that_its_tests_need(tree: Path) -> None:
         "docs",
         "envs",
         "examples",
+        "fmu",
         "paper",
         "robot",
         "tests",

@@ -1,26 +1,29 @@
-"""docs/your_env.md: its commands and Python blocks run, at toy size.
+"""docs/your_env.md and its reference: their commands and Python blocks run, at toy size.
 
-Its other code is that of the package, but for the file at its beginning.
+The other code of the reference is that of the package.
 """
 
 import math
 import re
 import shlex
+import sys
 from pathlib import Path
 
 import pytest
 from outside_package.install import PROXY, SOURCE, TINY, install
 from programs import ROOT, called
 
-PAGE = (ROOT / "docs" / "your_env.md").read_text()
-ALL_BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
-PLANT, IN_ONE_FILE = (block for _, block in ALL_BLOCKS if "Tank" in block)
-BLOCKS = [
-    (language, block)
-    for language, block in ALL_BLOCKS
-    if "vmas" not in block and "Tank" not in block
-]
+
+def blocks_of(page):
+    text = (ROOT / "docs" / page).read_text()
+    return re.findall(r"^```(\w*)\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
+
+
+PLANT, PATH, FROM_PYTHON = (block for _, block in blocks_of("your_env.md"))
+PAGE = (ROOT / "docs" / "your_env_reference.md").read_text()
+ALL_BLOCKS = blocks_of("your_env_reference.md")
 (SEVERAL_AGENTS,) = (block for _, block in ALL_BLOCKS if "vmas" in block)
+BLOCKS = [(language, block) for language, block in ALL_BLOCKS if block != SEVERAL_AGENTS]
 PROGRAMS = [block for language, block in BLOCKS if language == "python" and "import" in block]
 EXCERPTS = [block for language, block in BLOCKS if language and block not in PROGRAMS]
 SHELL = "".join(block for language, block in BLOCKS if not language)
@@ -31,7 +34,9 @@ TOY = {
     "coil-listen": ["evaluation.repeats=1", "donors=2"],
     "coil-report": [],
     "coil-distill": PROXY,
+    "coil-export": ["observations=50"],
 }
+TINY_TUNING = ["budget.frames=2048", "evaluation.cases=2", "evaluation.curve.num_envs=2"]
 
 
 @pytest.fixture(scope="module")
@@ -43,16 +48,37 @@ def folder(tmp_path_factory):
         yield folder / "source"
 
 
-@pytest.mark.slow
-def test_env_and_controller_in_one_file_are_enough(tmp_path, monkeypatch):
+@pytest.fixture
+def plant(tmp_path, monkeypatch):
+    """Change to a folder with the plant of the page."""
     (tmp_path / "plant.py").write_text(PLANT)
+    monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    path, *commands = IN_ONE_FILE.splitlines()
-    assert path == "export PYTHONPATH=."
-    for name, *arguments in map(shlex.split, commands):
-        called(name.removeprefix("coil-"), *arguments, *TOY[name], cwd=tmp_path)
-    rows = (tmp_path / "outputs" / "tank" / "evaluation.csv").read_text().splitlines()
+    monkeypatch.delitem(sys.modules, "plant", raising=False)
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_path_is_measure_tune_train_export(plant):
+    lines = [shlex.split(line, comments=True) for line in PATH.splitlines()]
+    first, measure, *commands = filter(None, lines)
+    assert first == ["export", "PYTHONPATH=."]
+    assert measure[0] == "coil-compare", "tests/coil_rl/comparison runs it"
+    assert commands[0][2:6] == measure[1:5], "the same env and controller"
+    for name, *arguments in commands:
+        toy = TINY_TUNING if "method=tune" in arguments else TOY[name]
+        called(name.removeprefix("coil-"), *arguments, *toy, cwd=plant)
+    rows = (plant / "outputs" / "tank" / "evaluation.csv").read_text().splitlines()
     assert {row.split(",")[0] for row in rows[1:]} == {"guide", "coil_anchored"}
+    assert (plant / "outputs" / "file" / "policy.onnx").is_file()
+
+
+@pytest.mark.slow
+def test_python_of_the_ten_minutes_runs(plant):
+    program = FROM_PYTHON.replace("20_000", "2048").replace("cases=100", "cases=2")
+    found: dict = {}
+    exec(compile(program, "your_env.md", "exec"), found)
+    assert 0 <= found["flow"][0] <= 20
 
 
 @pytest.mark.parametrize(
@@ -97,10 +123,9 @@ def test_several_agents_learn_as_printed():
 
 @pytest.mark.slow
 def test_commands_run_in_the_order_of_the_page(folder):
-    assert len(COMMANDS) == 15
+    assert len(COMMANDS) == 13
     for name, *arguments in COMMANDS:
-        toy = [] if any(argument.startswith("resume=") for argument in arguments) else TOY[name]
-        called(name.removeprefix("coil-"), *arguments, *toy, cwd=folder)
+        called(name.removeprefix("coil-"), *arguments, *TOY[name], cwd=folder)
     outputs = folder / "outputs"
     assert {path.parent.relative_to(outputs).parts[0] for path in outputs.rglob("*.md")} >= {
         "room",

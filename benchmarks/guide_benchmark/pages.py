@@ -163,7 +163,7 @@ def _guided(arms: Mapping[tuple[str, str], Any]) -> list[Run]:
 
 def write_all(folder: Path, rows: Sequence[Row]) -> str:
     """Write the page that holds all tasks, with its picture, and return its text."""
-    lines = ["# Guide benchmark"]
+    lines = ["# All tasks of the guide benchmark"]
     if all(row["effort"] == "smoke" for row in rows):
         lines.append(SMOKE)
     summary = summarised(rows)

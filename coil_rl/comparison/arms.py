@@ -11,9 +11,8 @@ from coil_rl.config.python import Named
 from coil_rl.errors import UserError
 
 GUIDE, OPPOSITE, ZERO, RANDOM, NETWORK = "guide", "opposite", "zero", "random", "first network"
-PPO, ANCHORED, RESIDUAL, SAC, TUNE = "ppo", "coil_anchored", "residual", "sac", "tune"
-SLOW_STEP = 1e-3  # s of an env step, from which SAC, which needs fewer steps, is tried too
-SAC_UPDATE = 5e-3  # s, about; SAC takes an update in each step
+PPO, SAC, TUNE = "ppo", "sac", "tune"
+ANCHORED, ANCHORED_SAC = "coil_anchored", "coil_anchored_sac"
 SHARE = 0.1  # of the budget, for each job
 POINTS = 4  # kept policies of a training, besides the first one
 MOST_CURVE_CASES = 8
@@ -46,35 +45,36 @@ class Arm:
         name: label of its runs.
         words: of `coil-train`, that choose it.
         asks: whether it asks the guide in each step.
+        learner: name of what learns alone as it does; TUNE: nothing learns.
     """
 
     name: str
     words: tuple[str, ...]
     asks: bool
+    learner: str
 
 
 ARMS = {
-    TUNE: Arm(TUNE, ("method=tune",), asks=True),
-    PPO: Arm(PPO, ("method=ppo",), asks=False),
-    ANCHORED: Arm(ANCHORED, ("method=coil_anchored",), asks=True),
-    RESIDUAL: Arm(RESIDUAL, ("method=residual",), asks=True),
-    SAC: Arm(SAC, ("method=ppo", "learner=sac"), asks=False),
+    TUNE: Arm(TUNE, ("method=tune",), asks=True, learner=TUNE),
+    PPO: Arm(PPO, ("method=ppo",), asks=False, learner=PPO),
+    ANCHORED: Arm(ANCHORED, ("method=coil_anchored",), asks=True, learner=PPO),
+    SAC: Arm(SAC, ("method=ppo", "learner=sac"), asks=False, learner=SAC),
+    ANCHORED_SAC: Arm(
+        ANCHORED_SAC, ("method=coil_anchored", "learner=sac"), asks=True, learner=SAC
+    ),
 }
 
 
-def arms_for(env: EnvBase, step: float, *, tunes: bool) -> list[Arm]:
-    """Return the arms that fit an env.
+def arms_for(env: EnvBase, *, tunes: bool) -> list[Arm]:
+    """Return the arms that fit an env: SAC where actions are numbers.
 
     Args:
-        step: seconds of a step of one row.
         tunes: whether numbers of the guide are to be tuned.
     """
     names = [TUNE] if tunes else []
     names += [PPO, ANCHORED]
     if env.full_action_spec[env.action_key].dtype.is_floating_point:
-        names.append(RESIDUAL)
-        if step > SLOW_STEP:
-            names.append(SAC)
+        names += [SAC, ANCHORED_SAC]
     return [ARMS[name] for name in names]
 
 

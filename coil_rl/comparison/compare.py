@@ -18,7 +18,9 @@ from coil_rl.comparison.arms import (
     ARMS,
     PPO,
     RANDOM,
+    SAC,
     TUNE,
+    Arm,
     arms_for,
     check_words,
     job_of,
@@ -79,7 +81,7 @@ def compare(
     env: Any,
     *,
     guide: Any,
-    tune: Mapping[str, Any] | None = None,
+    tune: Mapping[str, Any] | str | None = None,
     minutes: float = 2.0,
     frames: int | None = None,
     seed: int = 0,
@@ -92,7 +94,7 @@ def compare(
         env: as for `train`.
         guide: as for `train`.
         tune: bounds of numbers of the guide by name, which are tuned too: [low, high] or [low,
-            high, "log"].
+            high, "log"]; "auto" for those that the guide knows.
         minutes: that it may take, about; it takes longer where an env or a guide is too slow.
         frames: of a whole training, of which each job here gets a tenth at most; by default those
             of the env's file.
@@ -115,7 +117,7 @@ def compare(
     if frames is not None:
         words.append(f"budget.frames={frames}")
     if tune is not None:
-        given.nodes["tune"] = dict(tune)
+        given.nodes["tune"] = tune if isinstance(tune, str) else dict(tune)
     return Comparison(Named(words, given.nodes), place, minutes=minutes, seed=seed).run()
 
 
@@ -159,17 +161,17 @@ class Comparison:
             UserError: for a mistake in what was given, for a folder that holds something else, and
                 if another process uses the folder.
         """
-        start = time.perf_counter()
+        start = time.process_time()
         config = self._checked()
-        self.overhead = time.perf_counter() - start
+        self.overhead = time.process_time() - start
         with self._new_or_kept():
             (self.folder / FAILED_JOBS).unlink(missing_ok=True)
             plan = self._plan(config)
             short = short_words(self.given.words, config, plan.cases)
             with quietly():
-                base = self._config(ANCHORED, plan.frames, short)
+                base = self._config(ANCHORED, plan.frames[ANCHORED], short)
                 measure_baselines(base, self.folder)
-            failed = run_jobs(self._jobs(plan, short), self.folder, plan.frames)
+            failed = run_jobs(self._jobs(plan, short), self.folder)
             return self._judge(plan, base, failed)
 
     @contextmanager
@@ -234,20 +236,37 @@ class Comparison:
             say(f"if this is stopped, go on with: {self.command}", error=True)
         say("coil-compare: timing the env and the guide", error=True)
         with quietly():
-            pace = timing.measure(config, self.overhead)
-            env = env_maker(config).bare(1, TEST, None)
-        arms = arms_for(env, pace.step, tunes=self.tunes)
-        plan = timing.plan(config, pace, arms, self.minutes)
+            arms = self._able(arms_for(env_maker(config).bare(1, TEST, None), tunes=self.tunes))
+            plain = {arm.name: self._timed(arm) for arm in arms if arm.name in (PPO, SAC)}
+            pace = timing.measure(plain, self.overhead)
+        plan = timing.plan(plain, pace, arms, self.minutes)
         keep_plan(self.folder, identity, plan)
         say(f"{pace.sentence}\n{plan.described(self.minutes)}", error=True)
         return plan
+
+    def _able(self, arms: Sequence[Arm]) -> list[Arm]:
+        """Return the arms that can learn with what was given; say why others cannot."""
+        able = []
+        for arm in arms:
+            try:
+                if arm.learner == SAC:  # the others are checked already
+                    check(self._config(arm.name))
+            except UserError as error:
+                say(f"coil-compare: {arm.name} is left out: {error}", error=True)
+            else:
+                able.append(arm)
+        return able
+
+    def _timed(self, arm: Arm) -> DictConfig:
+        """Return the configuration of an arm whose first update is as long as others."""
+        return self._config(arm.name, short=["learner.starts=1"] if arm.name == SAC else [])
 
     def _jobs(self, plan: Plan, short: Sequence[str]) -> dict[str, Named]:
         """Return what each training consists of, by its name; each seed of all arms in turn."""
         jobs = {}
         for seed in range(self.seed, self.seed + plan.seeds):
-            for name in plan.arms:
-                job = job_of(self.given, ARMS[name], seed, plan.frames, short)
+            for name, frames in plan.frames.items():
+                job = job_of(self.given, ARMS[name], seed, frames, short)
                 jobs[job_name(name, seed)] = job
         return jobs
 

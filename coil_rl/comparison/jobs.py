@@ -12,20 +12,22 @@ from coil_rl.output import decoration, progress, quietly, say
 from coil_rl.run.folder import is_evaluated
 from coil_rl.run.run import Run
 
+BAR = "compare, {desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"  # in trainings
+
 
 def job_name(arm: str, seed: int) -> str:
     """Return the name of a training, and of its folder."""
     return f"{arm}_seed{seed}"
 
 
-def run_jobs(jobs: Mapping[str, Named], folder: Path, frames: int) -> dict[str, str]:
+def run_jobs(jobs: Mapping[str, Named], folder: Path) -> dict[str, str]:
     """Do the trainings that are missing; return why each of some failed, by its name.
 
     Args:
         jobs: what each training consists of, by its name.
     """
     failed: dict[str, str] = {}
-    with progress(total=len(jobs) * frames, unit="frame", unit_scale=True, desc="compare") as bar:
+    with progress(total=len(jobs), bar_format=BAR) as bar:
         for number, (name, job) in enumerate(jobs.items(), 1):
             bar.set_description(f"{number} of {len(jobs)}, {name}")
             reason = _run_job(job, folder / name, bar)
@@ -33,7 +35,7 @@ def run_jobs(jobs: Mapping[str, Named], folder: Path, frames: int) -> dict[str, 
                 failed[name] = reason
                 with (folder / FAILED_JOBS).open("a", encoding="utf-8") as file:
                     file.write(f"job {name}: {reason}\n")
-            bar.update(max(number * frames - bar.n, 0))
+            bar.update(max(number - bar.n, 0))
     return failed
 
 
@@ -58,24 +60,22 @@ def _show(run: Run, bar: Any) -> None:
     others = run.callbacks
 
     def callbacks(learner: Learner) -> list[Callback]:
-        return [*others(learner), Tick(bar, run.budget.frames)]
+        return [*others(learner), Tick(bar)]
 
     run.callbacks = callbacks
 
 
 class Tick:
-    """Tells a progress bar of the frames of a training; a `Callback`.
+    """Tells a progress bar of the share of a training that is done; a `Callback`.
 
     Args:
         bar: of all trainings.
-        frames: of this one.
     """
 
     names: Sequence[str] = ()
 
-    def __init__(self, bar: Any, frames: int) -> None:
-        self.bar, self.frames = bar, frames
-        self.done, self.share = 0, 0.0
+    def __init__(self, bar: Any) -> None:
+        self.bar, self.share, self.shown = bar, 0.0, 0.0
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
         """Return whether an update is over, and note how much of the training that is."""
@@ -83,9 +83,8 @@ class Tick:
         return bool(row)
 
     def after_update(self, update: int) -> dict[str, float]:
-        """Show the new frames."""
-        done = int(self.frames * self.share)
+        """Show the new share."""
         with decoration("the progress bar"):
-            self.bar.update(done - self.done)
-        self.done = done
+            self.bar.update(self.share - self.shown)
+        self.shown = self.share
         return {}

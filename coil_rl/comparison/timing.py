@@ -1,8 +1,9 @@
 """How long a comparison takes: a step of the env and of the guide, a batch of training, a plan."""
 
 import itertools
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,17 +11,19 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.comparison.arms import POINTS, SAC, SAC_UPDATE, SHARE, TUNE, Arm, curve_cases
+from coil_rl.comparison.arms import POINTS, PPO, SAC, SHARE, Arm, curve_cases
 from coil_rl.comparison.baselines import Acting
 from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.run.evaluation import episodes
-from coil_rl.run.parts import TEST, EnvMaker
+from coil_rl.run.parts import TEST
 from coil_rl.run.rollout import Rollout
 
 EPISODES = 2  # whose length is measured
 LONGEST = 1000  # steps of these
 ROWS, STEPS = 16, 32  # of the env in which a step is timed: many rows share what a step costs
+TIMED = 128  # frames of training, at least
 LEAST_BATCHES = 4  # of a training: with fewer there is nothing to compare
+LEAST_FRAMES = 2_000  # of a training with replay, whose batches are small
 LEAST_CASES = 5
 MEASURING = 0.4  # share of the time that the evaluations may take
 SEEDS = 2
@@ -33,24 +36,27 @@ class Pace:
     Args:
         step: of a step of one row of the env.
         guide: of one action of the guide.
-        learning: of a frame of plain training: step, policy and update.
+        learning: of a frame of plain training, by learner: step, policy and update.
         length: steps of an episode, of the guide or of random actions, whichever is longer.
         overhead: to prepare a training.
     """
 
     step: float
     guide: float
-    learning: float
+    learning: Mapping[str, float]
     length: float
     overhead: float
 
     @property
     def sentence(self) -> str:
         """What was measured, for people."""
+        frames = " and ".join(
+            f"{1000 * seconds:.2f} ms with {name}" for name, seconds in self.learning.items()
+        )
         return (
             f"A step of the env takes {1000 * self.step:.2f} ms, an action of the guide "
-            f"{1000 * self.guide:.2f} ms, a frame of training {1000 * self.learning:.2f} ms; an "
-            f"episode has about {self.length:.0f} steps."
+            f"{1000 * self.guide:.2f} ms, a frame of training {frames}; an episode has about "
+            f"{self.length:.0f} steps."
         )
 
 
@@ -59,23 +65,26 @@ class Plan:
     """What a comparison is going to do.
 
     Args:
-        frames: of each job.
+        frames: of each job of an arm, by its name.
         cases: of the table; None for those of the env's file.
-        arms: names of what learns.
         seeds: number of trainings of each.
         seconds: that it takes, about.
     """
 
-    frames: int
+    frames: Mapping[str, int]
     cases: int | None
-    arms: Sequence[str]
     seeds: int
     seconds: float
 
     @property
+    def arms(self) -> list[str]:
+        """Names of what learns."""
+        return list(self.frames)
+
+    @property
     def jobs(self) -> int:
         """Number of trainings."""
-        return len(self.arms) * self.seeds
+        return len(self.frames) * self.seeds
 
     def described(self, minutes: float) -> str:
         """Return what is going to be done, for people.
@@ -86,10 +95,10 @@ class Plan:
         more = ""
         if self.seconds > 1.3 * 60 * minutes:
             more = f" (minutes={minutes:g} is not enough: each training needs a few batches)"
+        frames = ", ".join(f"{name} {frames:,}" for name, frames in self.frames.items())
         return (
-            f"It runs {self.jobs} trainings of {self.frames:,} frames each "
-            f"({', '.join(self.arms)}; {self.seeds} seeds), beside the guide, its opposite, zero, "
-            "random actions and the first network, and takes about "
+            f"It runs {self.jobs} trainings (frames: {frames}; {self.seeds} seeds), beside the "
+            "guide, its opposite, zero, random actions and the first network, and takes about "
             f"{_duration(self.seconds)}{more}."
         )
 
@@ -101,25 +110,26 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.1f} min"
 
 
-def measure(config: DictConfig, overhead: float) -> Pace:
-    """Time a step of the env and of the guide, and a batch of training.
+def measure(plain: Mapping[str, DictConfig], overhead: float) -> Pace:
+    """Time a step of the env and of the guide, and batches of training.
 
     Args:
-        config: of a training with plain PPO, with a guide.
+        plain: configurations of trainings that do not ask the guide, by learner.
         overhead: seconds to prepare a training.
     """
-    make_env = env_maker(config)
+    make_env = env_maker(next(iter(plain.values())))
     with torch.random.fork_rng():
         env, follow = make_env.guided(EPISODES, TEST)
         length = _length(env, follow)
         env = make_env.plain(EPISODES, TEST)
         length = max(length, _length(env, Acting.random(env)))
-        guided = _step(*make_env.guided(ROWS, TEST))
+        guided = _stepped(*make_env.guided(ROWS, TEST))
         env = make_env.plain(ROWS, TEST)
-        plain = _step(env, Acting.random(env))
-        learning = _batch(config, make_env)
-    guide = max(guided - plain, 0.0)
-    return Pace(plain, guide, max(learning, plain), length, overhead)
+        clock = _stepped(env, Acting.random(env))
+        step = clock.seconds / ROWS
+        learning = {name: _frame(config) + clock.waiting / ROWS for name, config in plain.items()}
+    learning = {name: max(frame, step) for name, frame in learning.items()}
+    return Pace(step, max(guided.seconds / ROWS - step, 0.0), learning, length, overhead)
 
 
 def _length(env: EnvBase, policy: TensorDictModuleBase) -> float:
@@ -131,50 +141,91 @@ def _length(env: EnvBase, policy: TensorDictModuleBase) -> float:
     return float(steps.mean())
 
 
-def _step(env: EnvBase, policy: TensorDictModuleBase) -> float:
-    """Return the seconds of a step of one row; the first step may prepare something."""
+class Clock:
+    """Time of pieces of work that does not depend on what else the machine does.
+
+    It is the processor's time of this process, and what even the fastest piece waited besides, such
+    as for a process or a device.
+    """
+
+    def __init__(self) -> None:
+        self.laps: list[tuple[float, float]] = []  # on the wall, and of the processor
+        self.begun = time.perf_counter(), time.process_time()
+
+    def lap(self) -> None:
+        """End a piece."""
+        now = time.perf_counter(), time.process_time()
+        self.laps.append((now[0] - self.begun[0], now[1] - self.begun[1]))
+        self.begun = now
+
+    @property
+    def waiting(self) -> float:
+        """Seconds that a piece waits."""
+        return max(min((wall - own for wall, own in self.laps), default=0.0), 0.0)
+
+    @property
+    def seconds(self) -> float:
+        """Mean seconds of a piece."""
+        return sum(own for _, own in self.laps) / max(len(self.laps), 1) + self.waiting
+
+
+def _stepped(env: EnvBase, policy: TensorDictModuleBase) -> Clock:
+    """Return the clock of some steps of all rows; the first step may prepare something."""
     steps = itertools.islice(episodes(env, policy), STEPS + 1)
     next(steps)
-    start = time.perf_counter()
-    count = sum(1 for _ in steps)
-    return (time.perf_counter() - start) / (max(count, 1) * env.batch_size.numel())
+    clock = Clock()
+    for _ in steps:
+        clock.lap()
+    return clock
 
 
-def _batch(config: DictConfig, make_env: EnvMaker) -> float:
-    """Return the seconds of a frame of training, with its share of the update."""
-    env = make_env()
-    learner = build_learner(config, env)
+def _frame(config: DictConfig) -> float:
+    """Return the processor's seconds of a frame of training, with its share of the update."""
+    learner = build_learner(config, env := env_maker(config)())
     keys = [*learner.keys, ("next", "done"), ("next", "reward"), ("next", "episode_reward")]
     rollout = Rollout(env, learner.policy, config.budget.steps, keys)
-    start = time.perf_counter()
-    learner.update(rollout.collect(), 0.0)
-    return (time.perf_counter() - start) / rollout.frames
+    start, frames = time.process_time(), 0
+    while frames < TIMED:
+        learner.update(rollout.collect(), 0.0)
+        frames += rollout.frames
+    return (time.process_time() - start) / frames
 
 
-def plan(config: DictConfig, pace: Pace, arms: Sequence[Arm], minutes: float) -> Plan:
+def plan(
+    configs: Mapping[str, DictConfig], pace: Pace, arms: Sequence[Arm], minutes: float
+) -> Plan:
     """Return how many frames each job gets, and how long everything takes.
 
-    A job gets a tenth of the budget, or what the minutes allow, in whole batches of PPO, but at
-    least a few of them.
+    All jobs get the same time, and so the more frames the less one of theirs takes: at most a tenth
+    of the budget, and at least a few batches, in whole batches.
 
     Args:
+        configs: of trainings that do not ask the guide, by learner; PPO's is among them.
         minutes: that it may take.
     """
+    config = configs[PPO]
     cases = _cases(config, pace, arms, minutes)
-    fixed = _measuring(config, pace, arms, cases)
-    other = {TUNE: pace.step, SAC: pace.step + SAC_UPDATE}
-    each = [other.get(arm.name, pace.learning) for arm in arms]
-    a_frame = SEEDS * sum(
-        cost + pace.guide * arm.asks for cost, arm in zip(each, arms, strict=True)
-    )
-    batch = config.budget.num_envs * config.budget.steps
-    tenth = max(round(SHARE * config.budget.frames / batch), LEAST_BATCHES)
-    affordable = int((60 * minutes - fixed) / a_frame / batch)
-    batches = min(max(affordable, LEAST_BATCHES), tenth)
-    frames = min(batches * batch, config.budget.frames)
+    left = 60 * minutes - _measuring(config, pace, arms, cases)
+    frames, seconds = dict[str, int](), 60 * minutes - left
+    # What those that need little time leave is for the others.
+    costs = {
+        arm.name: pace.learning.get(arm.learner, pace.step) + pace.guide * arm.asks for arm in arms
+    }
+    for arm in sorted(arms, key=lambda arm: costs[arm.name]):
+        share = max(left, 0.0) / (SEEDS * (len(arms) - len(frames)))
+        frames[arm.name] = _frames(configs.get(arm.learner, config), arm, share / costs[arm.name])
+        taken = SEEDS * frames[arm.name] * costs[arm.name]
+        left, seconds = left - taken, seconds + taken
     number = cases if isinstance(config.evaluation.cases, int) else None
-    names = [arm.name for arm in arms]
-    return Plan(frames, number, names, SEEDS, fixed + frames * a_frame)
+    return Plan({arm.name: frames[arm.name] for arm in arms}, number, SEEDS, seconds)
+
+
+def _frames(config: DictConfig, arm: Arm, affordable: float) -> int:
+    """Return the frames of a training of an arm, of which some are affordable."""
+    batch, budget = config.budget.num_envs * config.budget.steps, config.budget.frames
+    least = math.ceil(LEAST_FRAMES / batch) if arm.learner == SAC else LEAST_BATCHES
+    tenth = max(round(SHARE * budget / batch), least)
+    return min(min(max(int(affordable / batch), least), tenth) * batch, budget)
 
 
 def _cases(config: DictConfig, pace: Pace, arms: Sequence[Arm], minutes: float) -> int:

@@ -247,12 +247,12 @@ def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
         _check_curve(config, make_env)
         make_env()
         return
-    if not parts.observed_keys(config):
+    env = make_env()
+    if not parts.observed_keys(config, env):
         raise UserError(
             "observes=[]: the agent has no observations; give the entries of the env that it "
-            "observes"
+            "observes, or null for all"
         )
-    env = make_env()
     trains = parts.trains_guides(config)
     if trains and config.degrade:
         raise UserError(

@@ -10,7 +10,7 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from coil_rl.config.nodes import build, build_all, find_target
 from coil_rl.config.own_run import own_run
@@ -28,6 +28,7 @@ from coil_rl.transforms.action_space import nested_key
 
 # Parts of a configuration that name entries of the env of a method; its guides are parts of
 # `method.transforms`.
+NOT_OBSERVED = ("info", "controller")  # of an env: for evaluation, and of what acts beside it
 READERS = ["observes", "method", "watch", "learner", "degrade", "action", "evaluation"]
 
 
@@ -240,14 +241,25 @@ def build_learner(
     `guides` are for a learner that trains guides.
     """
     arguments: dict[str, Any] = {"guides": dict(guides or {})} if trains_guides(config) else {}
-    keys = observed_keys(config)
+    keys = observed_keys(config, env)
     learner: Learner = build(config.learner, "learner", Learner, env=env, in_keys=keys, **arguments)
     return learner
 
 
-def observed_keys(config: DictConfig) -> list[NestedKey]:
-    """Return the keys of the entries that the agent of a configuration observes."""
-    return [nested_key(key) for key in (*config.observes, *(config.method.observes or ()))]
+def observed_keys(config: DictConfig, env: EnvBase) -> list[NestedKey]:
+    """Return the keys of the entries that the agent of a configuration observes in an env.
+
+    Of `observes=null` they are all that the env itself writes, but for what is no observation.
+    """
+    own = config.observes
+    if own is None:
+        base = env.base_env if isinstance(env, TransformedEnv) else env
+        own = [
+            key
+            for key in base.observation_spec.keys(True, True)
+            if isinstance(key, str) or key[0] not in NOT_OBSERVED
+        ]
+    return [nested_key(key) for key in (*own, *(config.method.observes or ()))]
 
 
 def learner_kind(config: DictConfig) -> str:

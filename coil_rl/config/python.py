@@ -41,7 +41,7 @@ def train(
     frames: int | None = None,
     seed: int = 0,
     folder: str | Path | None = None,
-    tune: Mapping[str, Any] | None = None,
+    tune: Mapping[str, Any] | str | None = None,
     overrides: Sequence[str] = (),
 ) -> Run:
     """Train a policy, evaluate it beside its guide, and return the run.
@@ -60,7 +60,7 @@ def train(
         seed: of everything.
         folder: for everything that the run writes; by default a new one in outputs/train.
         tune: of method="tune": bounds of numbers of the guide by name, [low, high] or [low, high,
-            "log"].
+            "log"]; "auto" for those that the guide knows.
         overrides: further words of the command line, such as "learner.gamma=0.98".
 
     Raises:
@@ -112,7 +112,7 @@ def prepare(
     frames: int | None = None,
     seed: int = 0,
     folder: str | Path,
-    tune: Mapping[str, Any] | None = None,
+    tune: Mapping[str, Any] | str | None = None,
     overrides: Sequence[str] = (),
 ) -> Run:
     """Return a run that is checked and ready to train.
@@ -137,7 +137,7 @@ def prepare(
     if frames is not None:
         words.append(f"budget.frames={frames}")
     if tune is not None:
-        given.nodes["tune"] = dict(tune)
+        given.nodes["tune"] = tune if isinstance(tune, str) else dict(tune)
     words += [f"seed={seed}", *overrides]
     run = prepared(Named(words, given.nodes), folder)
     run.in_python = True
@@ -241,7 +241,7 @@ def _env(env: Any, name: str) -> Words:
         return words, {} if path is not None else {"env.of": keep(name, env)}
     raise UserError(
         f"env makes {type(made).__name__}; give a maker of a Gymnasium env, or of a TorchRL env "
-        "without batch (a batched one of your own needs a file, see docs/your_env.md)"
+        "without batch (a batched one of your own needs a file, see docs/your_env_reference.md)"
     )
 
 

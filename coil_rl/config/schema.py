@@ -187,7 +187,8 @@ class DrivingConfig(ProgramConfig):
     disturb: dict[str, Any] = field(default_factory=dict)
     degrade: dict[str, Any] = field(default_factory=dict)
     method: MethodConfig = field(default_factory=MethodConfig)
-    observes: list[Any] = field(default_factory=lambda: ["observation"])
+    # None: all that the env writes
+    observes: list[Any] | None = field(default_factory=lambda: ["observation"])
     action: dict[str, Any] = field(default_factory=dict)
     budget: BudgetConfig = field(default_factory=BudgetConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)

@@ -23,6 +23,7 @@ from coil_rl.config.given import PLACES, kept_objects
 from coil_rl.config.trust import import_paths
 from coil_rl.errors import UserError
 from coil_rl.foreign.host import is_of_user
+from coil_rl.plain_yaml import entries
 
 # Parts of a configuration on which the numbers of a run depend, besides its evaluation.
 PARTS = ["env", "training", "guide", "method", "learner", "degrade", "disturb", "action"]
@@ -78,13 +79,15 @@ def code_of_user(config: DictConfig, keys: Iterable[str]) -> list[str]:
     """
     parts = OmegaConf.masked_copy(config, list(keys))
     named = [*map(_named, sorted(import_paths(parts))), _registered(config.env.get("id"))]
-    return [identity_of(each) for each in named if each is not None and is_of_user(each)]
+    found = [identity_of(each) for each in named if each is not None and is_of_user(each)]
+    return [*found, *_files_of(parts).values()]
 
 
 def code_of_run(config: DictConfig) -> dict[str, str]:
     """Return the SHA-256 of each file of the user that a run depends on, by its module.
 
-    They are those that define its parts, and what these use of other files of the user.
+    They are those that define its parts, what these use of other files of the user, and what its
+    configuration names as a `file`, by its name.
 
     Args:
         config: of the run.
@@ -108,7 +111,18 @@ def code_of_run(config: DictConfig) -> dict[str, str]:
         with suppress(OSError):  # it is gone
             found[name] = hashlib.sha256(Path(file).read_bytes()).hexdigest()
             waiting += [each for value in vars(module).values() for each in _modules_of(value)]
-    return dict(sorted(found.items()))
+    return dict(sorted((found | _files_of(parts)).items()))
+
+
+def _files_of(parts: DictConfig) -> dict[str, str]:
+    """Return the SHA-256 of each `file` that a configuration names, by its name."""
+    named = entries(OmegaConf.to_container(parts), lists=True)
+    paths = {Path(value) for _, key, value in named if key == "file" and isinstance(value, str)}
+    found = {}
+    for path in paths:
+        with suppress(OSError):  # what is missing is said where it is read
+            found[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
 
 
 def _modules_of(thing: Any) -> list[str]:

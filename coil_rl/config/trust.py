@@ -7,7 +7,7 @@ controller and the `id` of a Gymnasium env name as `MODULE:NAME`. So each of the
 of full names before anything is imported:
 
 - what the shipped configuration names in the groups of a run, also as an alternative in a comment:
-  a part that has its YAML file is on the list;
+  a part that has its YAML file is on the list, unless its line says that it needs `trust=`;
 - some transforms of TorchRL, none of which writes a file where the folder says;
 - what the configuration of the command itself names, because the command uses it anyway;
 - anything that is defined in a package that the user trusts.
@@ -77,6 +77,7 @@ PACKAGES = {
     "TrackioLogger": "trackio",
     "WandbLogger": "wandb",
 }
+CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.-]*")  # MODULE:NAME, wherever it is
 PLAIN = r"[\w-]+"  # a name that is no path, no address and no reference
 
 
@@ -181,8 +182,10 @@ def _import_path(name: str, key: Any, value: Any) -> Any:
     """Return what an entry names to be imported, written with points only, else None."""
     if key == "_target_":
         return value
-    names_code = key == "of" or (key == "id" and ":" in str(value))
-    return value.replace(":", ".", 1) if names_code and isinstance(value, str) else None
+    if not isinstance(value, str):
+        return None
+    names_code = key == "of" or (key == "id" and ":" in value) or CODE.fullmatch(value)
+    return value.replace(":", ".", 1) if names_code else None
 
 
 class _Entry(NamedTuple):
@@ -238,7 +241,8 @@ def _check_origin(entry: _Entry, package: str) -> None:
 def _shipped_targets() -> frozenset[str]:
     """Return all targets that the files of coil-rl and of its guests name in their groups.
 
-    Loggers are not among them, because what they write and where is up to their arguments.
+    Loggers are not among them, because what they write and where is up to their arguments, nor
+    what a comment on its line says needs `trust=`: it runs a file that the folder names.
     """
     found: set[str] = set()
     for package in packages():
@@ -248,7 +252,7 @@ def _shipped_targets() -> frozenset[str]:
             for file in group.iterdir():
                 if ".yaml" in file.name:
                     text = file.read_text(encoding="utf-8")
-                    found |= set(re.findall(r"_target_: ([\w.]+)", text))
+                    found |= set(re.findall(r"_target_: ([\w.]+)(?!.*trust=)", text))
     return frozenset(found)
 
 

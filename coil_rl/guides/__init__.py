@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from coil_rl.cones.spline_memory import SplineMemoryGuide as SplineMemoryGuide
     from coil_rl.foreign.controllers import ControllerGuide as ControllerGuide
     from coil_rl.foreign.controllers import PerRow as PerRow
+    from coil_rl.guides.pid import PID as PID
     from coil_rl.guides.recorded import RecordedGuide as RecordedGuide
     from coil_rl.guides.simple import ConstantGuide as ConstantGuide
     from coil_rl.guides.simple import EntryGuide as EntryGuide

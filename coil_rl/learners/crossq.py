@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.policy import Entries, next_of
-from coil_rl.learners.sac import SAC, SACSettings
+from coil_rl.learners.sac import SAC, CrossQSettings
 from coil_rl.ranges import checked
 
 
@@ -30,8 +30,9 @@ class CrossQ(SAC):
     Args:
         env: the env, with continuous actions.
         in_keys: entries that policy and critics observe.
-        settings: of `SAC`; `tau` and `critic_layer_norm` have no effect, so they are a
-            `ValueError`.
+        critic_layer_norm: None, as it normalises batches; another value is a `ValueError`.
+        tau: None, as it has no target networks; another value is a `ValueError`.
+        settings: further ones of `SAC`.
     """
 
     betas = (0.5, 0.999)
@@ -41,11 +42,16 @@ class CrossQ(SAC):
         self,
         env: EnvBase,
         in_keys: Sequence[NestedKey] = ("observation",),
-        **settings: Unpack[SACSettings],
+        *,
+        critic_layer_norm: None = None,
+        tau: None = None,
+        **settings: Unpack[CrossQSettings],
     ) -> None:
-        for name in ("tau", "critic_layer_norm"):
-            if name in settings:
-                raise ValueError(f"{name}: CrossQ has no target networks and normalises batches")
+        if critic_layer_norm is not None or tau is not None:
+            raise ValueError(
+                f"critic_layer_norm={critic_layer_norm} and tau={tau} must be None: CrossQ "
+                "normalises batches and has no target networks"
+            )
         super().__init__(env, in_keys, **settings)
 
     def after_update(self) -> None:

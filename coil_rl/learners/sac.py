@@ -40,8 +40,8 @@ from coil_rl.schedules import Schedule
 from coil_rl.transforms.action_space import ChoicesError, nested_key
 
 
-class SACSettings(ReplaySettings, total=False):
-    """All settings of `SAC`."""
+class CrossQSettings(ReplaySettings, total=False):
+    """Settings of `SAC` that `CrossQ` has too."""
 
     hidden: Sequence[int]
     network: Mlp | None
@@ -51,14 +51,19 @@ class SACSettings(ReplaySettings, total=False):
     target_entropy: float | None
     critics: Annotated[int, Interval(ge=2, le=1_000)]
     target_critics: int | None
-    critic_layer_norm: bool
     dropout: Share
     uncertainty: bool
-    tau: Share
     updates_per_step: UpdatesPerStep
     learning_rate: NonNegative | Schedule
     max_grad_norm: Positive | None
     auxiliary: Sequence[Extension]
+
+
+class SACSettings(CrossQSettings, total=False):
+    """All settings of `SAC`."""
+
+    critic_layer_norm: bool
+    tau: Share
 
 
 @checked

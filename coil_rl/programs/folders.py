@@ -21,10 +21,10 @@ KEYS = (
     "run_dir",
     "init",
     "guide.learned.run",
-    "guide.exported.file",
     "proxy.folder",
 )
-KEPT = ("init", "guide.learned.run", "guide.exported.file")  # in the configuration of a run
+KEPT = ("init", "guide.learned.run")  # in the configuration of a run
+FILE = ".file"  # the end of a key that holds a file, which is kept too
 
 
 def spelled(argument: str) -> str:
@@ -36,12 +36,14 @@ def spelled(argument: str) -> str:
         argument: as the shell passed it on; it may be anything.
     """
     key, equals, text = argument.partition("=")
-    if not equals or key.lstrip("+") not in KEYS:
+    name = key.lstrip("+")
+    if not equals or not (name in KEYS or name.endswith(FILE)):
         return argument
     if not _exists(text) and _as_hydra(text) is not None:
         return argument
     path = _path(text)
-    return f"{key}={quoted(str(path.absolute() if key.lstrip('+') in KEPT else path))}"
+    kept = name in KEPT or name.endswith(FILE)
+    return f"{key}={quoted(str(path.absolute() if kept else path))}"
 
 
 def folder(text: str) -> Path:

@@ -131,14 +131,9 @@ def report(config: DictConfig) -> None:
         )
     parts, envs = _parts(finished, ACTIONS[config.actions], config.against)
     against = parts[0].against
-    strokes = style.strong_strokes(
-        dict.fromkeys(
-            group.name
-            for part in parts
-            for comparison in part.compared.values()
-            for group in comparison.agents or comparison.guides
-        )
-    )
+    compared = [comparison for part in parts for comparison in part.compared.values()]
+    drawn = [group for comparison in compared for group in comparison.agents or comparison.guides]
+    strokes = style.strong_strokes(dict.fromkeys(group.name for group in drawn))
     folder = folders[0]
     first = {part.env: next(iter(part.tables().values())) for part in parts}
     overview = [*page.summary(first, against), *page.what_differs(envs, "env")]
@@ -212,12 +207,11 @@ def _rows(
     parts: Sequence[EnvPart], tables: Callable[[EnvPart], dict[str, list[dict[str, Any]]]]
 ) -> list[dict[str, Any]]:
     """Return the rows of the tables of all envs and kinds of actions as one table."""
-    return [
-        {"env": part.env, "actions": kind, **row}
-        for part in parts
-        for kind, table in tables(part).items()
-        for row in table
-    ]
+    rows = []
+    for part in parts:
+        for kind, table in tables(part).items():
+            rows += [{"env": part.env, "actions": kind, **row} for row in table]
+    return rows
 
 
 def _against(given: str | None, compared: Sequence[Comparison]) -> str | None:

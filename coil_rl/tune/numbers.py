@@ -26,6 +26,7 @@ from coil_rl.tune.search import Number
 
 # Arguments of the parts of this project that are no numbers of a controller.
 OTHERS = ("seed", "size")
+AUTO = "auto"  # of `tune`: the bounds that the guide knows
 # Words of the annotation of a whole number, or of a list of such, besides int.
 AROUND_INT = frozenset(
     ["None", "Annotated", "Optional", "Union", "Sequence", "list", "List", "tuple", "Tuple"],
@@ -63,6 +64,8 @@ def numbers_to_tune(config: DictConfig) -> list[Number]:
     values = config.tune
     if OmegaConf.is_config(values):
         values = OmegaConf.to_container(values, resolve=True)
+    if values == AUTO:
+        values = _own_bounds(node, f"guide.{name}")
     if values and not isinstance(values, Mapping):
         raise UserError(
             f"tune={yaml_text(values)} must be the bounds by name, such as tune='{{kp: [0.1, 10, "
@@ -81,6 +84,17 @@ def numbers_to_tune(config: DictConfig) -> list[Number]:
                 f"{did_you_mean(key, known)}"
             )
     return [_number(key, bounds, *known[key]) for key, bounds in wanted.items()]
+
+
+def _own_bounds(node: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return the bounds that the class of a guide knows itself, by its method `tunable`."""
+    target, arguments = _arguments(node, name)
+    if not hasattr(target, "tunable"):
+        raise UserError(
+            f"tune={AUTO}: {name} knows no bounds; give them, such as tune='{{kp: [0.1, 10, log]}}'"
+        )
+    bounds: dict[str, Any] = target.tunable(arguments)
+    return bounds
 
 
 def _number(name: str, bounds: Any, own: float, whole: bool) -> Number:

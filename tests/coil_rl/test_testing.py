@@ -57,12 +57,6 @@ def with_action(change):
     return guide
 
 
-class SeesAllRows(Guide):
-    def forward(self, tensordict):
-        super().forward(tensordict)
-        return tensordict.set("action", tensordict["action"] + tensordict["is_init"].any() / 10)
-
-
 class Hidden(TensorDictModuleBase):
     """Remembers in an attribute, which no reset reaches."""
 

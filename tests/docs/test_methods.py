@@ -55,7 +55,7 @@ def composed(command):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose(program.removeprefix("coil-"), overrides)
     if "method" in config:
-        assert INDEX[config.method.name][2].startswith("yes" if config.method.needs_guide else "no")
+        assert INDEX[config.method.name][1].startswith("yes" if config.method.needs_guide else "no")
     return config
 
 

@@ -11,7 +11,7 @@ from coil_rl.envs import Track, random_tracks, shipped_tracks
 from coil_rl.envs.track_map import TrackMap
 
 Array = NDArray[np.float64]
-POSES = 2000
+POSES = 500
 
 
 @cache

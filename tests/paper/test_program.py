@@ -163,6 +163,7 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
     assert command == [*words, "hydra/launcher=basic"]
 
 
+@pytest.mark.fast(5)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -94,7 +94,7 @@ def test_commands_are_those_of_the_closed_loop(name):
     live = driver(controller, fewest_returns=0.0, blind=1e6, still=0.0)
     base, state = env.base_env, env.eval().reset()
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        for index in range(150):
+        for index in range(60):
             scan = Scan(index / RATE, base.scan[0].numpy().copy(), base.lidar.angles.numpy())
             command = live.scan(scan, (index + 1) / RATE)
             step = env.step(policy(state))
@@ -233,7 +233,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.fast(5)
+@pytest.mark.fast(3)
 @pytest.mark.parametrize("name", FAULTS)
 def test_faults_stop_the_car_until_the_stop_is_lifted(name):
     options, reason, within = FAULTS[name]
@@ -267,6 +267,7 @@ def test_a_policy_that_fails_stops_the_car(controller, reason):
     assert [each for _, each in result.stops] == [reason]
 
 
+@pytest.mark.slow
 def test_a_healthy_robot_drives_and_survives_a_single_lost_scan():
     def one_lost(index, scan, now):
         return (None if index == FAULT else scan), now

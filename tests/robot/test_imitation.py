@@ -134,7 +134,8 @@ def test_forest_that_imitates_is_a_controller_and_no_export(folder, monkeypatch)
         export_policy(run, "forest_file", observations=9)
 
 
-@pytest.mark.parametrize("learner", ["linear", pytest.param("network", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("learner", ["linear", "network"])
 def test_imitated_policy_is_a_controller_a_guide_an_export_and_drives(learner, folder, monkeypatch):
     monkeypatch.chdir(folder)
     words = [*SHORT[2:], f"learner={learner}", "recording=[a.mcap,b.mcap]"]

@@ -90,6 +90,7 @@ def test_imitator_learns_from_the_guide_alone_and_tells_what_it_can_predict():
     )
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("options", [{}, {"normalise": True}, {"squash": False}])
 def test_state_contains_everything_the_next_update_depends_on(options):
     first, rollout = make(**options)

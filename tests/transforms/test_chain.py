@@ -72,7 +72,7 @@ CASES = {
 }
 
 
-@pytest.mark.fast(6)
+@pytest.mark.fast(3)
 @pytest.mark.parametrize("guide", [SplineGuide, SplineMemoryGuide])
 @pytest.mark.parametrize("case", CASES)
 def test_chain_executes_what_the_env_executes(case, guide):

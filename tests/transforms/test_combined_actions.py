@@ -154,7 +154,7 @@ COMBINED = {
 }
 
 
-@pytest.mark.fast(5)
+@pytest.mark.fast(3)
 @pytest.mark.parametrize("name", COMBINED)
 @pytest.mark.parametrize("training", [True, False], ids=["training", "evaluation"])
 def test_executed_action_is_the_one_the_env_was_given(name, training):

@@ -55,7 +55,7 @@ FOR_NUMBERS = {
 }
 
 
-@pytest.mark.fast(4)
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("name", TRANSFORMS)
 def test_specs_hold_in_every_env(name):
     for world in (worlds.cones, worlds.pendulum, worlds.carts):
@@ -81,6 +81,7 @@ def test_specs_hold_with_several_guides_and_another_key():
     assert env.reset()[key].eq(0).all()
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     "transforms",
     [
@@ -94,6 +95,7 @@ def test_specs_hold_with_discrete_actions(transforms):
     check_transform(ConeTrackEnv(shipped_tracks("test"), 3), DiscreteActions(7))
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize(
     "transform",
     [

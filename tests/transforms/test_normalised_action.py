@@ -109,13 +109,13 @@ def test_an_action_between_minus_one_and_one_is_left_alone():
     assert normalising(GymnasiumEnv(lambda: Seen(Discrete(3)))) == []
 
 
-@pytest.mark.parametrize(("low", "high"), [(200, 1000), (0, 4), (-1, 1), (0, 2000)])
+@pytest.mark.parametrize(("low", "high"), [(200, 1000), (-1, 1)])
 def test_random_guide_is_uniform_in_a_box(low, high):
-    got = followed(advised(box([low, -1], [high, 3]), RandomGuide(), rows=200), 10)
+    got = followed(advised(box([low, -1], [high, 3]), RandomGuide(), rows=50), 10)
     for numbers, bottom, top in zip(got.T, (low, -1), (high, 3), strict=True):
         counts, _ = np.histogram(numbers, 10, (bottom, top))
-        assert counts.sum() == 2000  # none beyond the bounds
-        assert np.square(counts - 200).sum() / 200 < 27.9  # chi-square, 9 degrees, 0.1 %
+        assert counts.sum() == 500  # none beyond the bounds
+        assert np.square(counts - 50).sum() / 50 < 27.9  # chi-square, 9 degrees, 0.1 %
 
 
 @pytest.mark.parametrize(
@@ -125,13 +125,11 @@ def test_random_guide_is_uniform_in_a_box(low, high):
 )
 @pytest.mark.parametrize("degraded", [False, True], ids=["guide", "degraded"])
 def test_random_guide_is_uniform_among_choices(space, actions, degraded):
-    env = advised(space, RandomGuide(), rows=120)
-    if degraded:
-        env = advised(space, ZeroGuide(), RandomAdvice(), rows=120)
-    got = followed(env, 10).reshape(1200, -1)
+    parts = [ZeroGuide(), RandomAdvice()] if degraded else [RandomGuide()]
+    got = followed(advised(space, *parts, rows=30), 10).reshape(300, -1)
     values, counts = np.unique(got, axis=0, return_counts=True)
     assert len(values) == actions
-    expected = 1200 / actions
+    expected = 300 / actions
     assert np.square(counts - expected).sum() / expected < 20.5  # chi-square, 5 degrees, 0.1 %
 
 

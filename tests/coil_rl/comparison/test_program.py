@@ -18,7 +18,7 @@ from coil_rl.report.runs import read_runs
 from coil_rl.run.folder import locked
 
 pytest.importorskip("gymnasium.envs.classic_control")
-SMALL = ["env.max_steps=20", "budget={frames: 2000, num_envs: 2, steps: 16, minibatches: 2}"]
+SMALL = ["env.max_steps=20", "budget={frames: 200, num_envs: 2, steps: 16, minibatches: 2}"]
 SMALL += ["evaluation.cases=3", "evaluation.curve.num_envs=2", "evaluation.curve.points=2"]
 PENDULUM = ["env=pendulum", *SMALL, "minutes=0.01"]
 
@@ -40,19 +40,19 @@ def test_table_has_everything_that_acts(compared):
     folder, _ = compared
     rows = {row["policy"]: row for row in rows_of(folder / "compare.csv")}
     without = ["guide", "opposite", "zero", "random", "first network"]
-    learned = ["tune", "ppo", "coil_anchored", "residual"]
-    assert [name for name in rows if name != "sac"] == [*without, *learned]
+    learned = ["tune", "ppo", "coil_anchored", "sac", "coil_anchored_sac"]
+    assert list(rows) == [*without, *learned]
     assert all(rows[name]["seeds"] == "2" for name in learned)
     assert all(float(rows[name]["frames"]) == 0 for name in without)
-    assert [float(rows[name]["frames"]) for name in ("ppo", "residual")] == [128, 128]
-    assert float(rows["ppo"]["calls"]) == 0 < float(rows["residual"]["calls"])
+    assert [float(rows[name]["frames"]) for name in ("ppo", "sac")] == [128, 200]
+    assert float(rows["ppo"]["calls"]) == 0 < float(rows["coil_anchored_sac"]["calls"])
     assert float(rows["guide"]["worst"]) <= float(rows["guide"]["return"])
 
 
 @pytest.mark.slow
 def test_it_says_before_what_it_runs_and_how_to_go_on(compared):
     folder, done = compared
-    assert "trainings of 128 frames each" in done.stderr
+    assert "ppo 128, coil_anchored 128, sac 200" in done.stderr
     assert "go on with: coil-compare env=pendulum" in done.stderr
     assert "minutes=0.01 is not enough" in done.stderr
     assert shlex.quote(f"folder={folder}") in done.stderr
@@ -86,7 +86,7 @@ def test_folder_is_one_for_reports_by_the_printed_command(compared):
     folder, done = compared
     assert (folder / "compare.png").stat().st_size > 10_000
     labels = {run.label for run in read_runs([folder]) if run.finished}
-    assert {"tune", "ppo", "coil_anchored", "residual"} <= labels
+    assert {"tune", "ppo", "coil_anchored", "sac", "coil_anchored_sac"} <= labels
     program, *words = shlex.split(done.stdout.rpartition("; ")[2].removesuffix(" has more.\n"))
     assert program == "coil-report"
     page = called("report", *words, cwd=folder.parent).stdout
@@ -133,8 +133,8 @@ def test_comparison_that_was_stopped_ends_with_the_same_table(compared, tmp_path
     called("compare", *words)
     first, second = (rows_of(each / "compare.csv") for each in (folder, tmp_path / "it"))
     same = ("policy", "return", "worst", "frames", "calls")
-    assert [[row[key] for key in same] for row in first if row["policy"] != "sac"] == [
-        [row[key] for key in same] for row in second if row["policy"] != "sac"
+    assert [[row[key] for key in same] for row in first] == [
+        [row[key] for key in same] for row in second
     ]
 
 
@@ -178,12 +178,12 @@ class Away:
 
 
 @pytest.mark.slow
-def test_choices_have_no_residual_and_a_python_object_is_a_guide(tmp_path):
+def test_choices_have_no_sac_and_a_python_object_is_a_guide(tmp_path):
     found = coil_rl.compare(
         "CartPole-v1", guide=Lean(), minutes=0.01, folder=tmp_path / "it", overrides=SMALL
     )
     assert {"ppo", "coil_anchored"} <= set(found.table["policy"])
-    assert not {"residual", "sac"} & set(found.table["policy"])
+    assert not {"sac", "coil_anchored_sac"} & set(found.table["policy"])
     assert found.command == "" or found.command.startswith("coil_rl.train(env, guide=guide, ")
 
 
@@ -228,7 +228,7 @@ def test_failed_training_is_one_failed_training(tmp_path):
     rows = {row["policy"]: row for row in rows_of(tmp_path / "it" / "compare.csv")}
     assert rows["ppo"]["seeds"] == "2"
     assert "no more" in done.stderr
-    assert "failed: " in rows["residual"]["note"] or "failed: " in rows["coil_anchored"]["note"]
+    assert "failed: " in rows["coil_anchored_sac"]["note"]
     assert "no more" in (tmp_path / "it" / "failed_jobs.txt").read_text()
 
 

@@ -12,7 +12,7 @@ from coil_rl.comparison.timing import Plan
 from coil_rl.config.python import Named, composed, named
 from coil_rl.errors import UserError
 
-PLAN = Plan(frames=128, cases=5, arms=["ppo"], seeds=2, seconds=1.0)
+PLAN = Plan(frames={"ppo": 128}, cases=5, seeds=2, seconds=1.0)
 
 
 class Local:

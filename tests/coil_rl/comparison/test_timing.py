@@ -3,8 +3,8 @@
 import pytest
 from omegaconf import OmegaConf
 
-from coil_rl.comparison.arms import ANCHORED, ARMS, PPO
-from coil_rl.comparison.timing import LEAST_BATCHES, Pace, plan
+from coil_rl.comparison.arms import ANCHORED, ARMS, PPO, SAC
+from coil_rl.comparison.timing import LEAST_BATCHES, LEAST_FRAMES, Clock, Pace, plan
 
 BATCH = 8 * 256
 CONFIG = OmegaConf.create(
@@ -13,29 +13,30 @@ CONFIG = OmegaConf.create(
         "evaluation": {"cases": 20, "curve": {"num_envs": 20, "count_key": "cases"}},
     }
 )
+REPLAY = OmegaConf.merge(CONFIG, {"budget": {"steps": 4}})
 ARMS_HERE = [ARMS[PPO], ARMS[ANCHORED]]
 
 
 def planned(minutes, guide=0.0, step=1e-4, config=CONFIG):
-    return plan(config, Pace(step, guide, 2 * step, 200, 1.0), ARMS_HERE, minutes)
+    return plan({PPO: config}, Pace(step, guide, {PPO: 2 * step}, 200, 1.0), ARMS_HERE, minutes)
 
 
 def test_training_gets_a_tenth_of_the_budget_in_whole_batches_where_time_allows():
     found = planned(minutes=100)
-    assert found.frames == round(100_000 / BATCH) * BATCH
+    assert found.frames == dict.fromkeys((PPO, ANCHORED), round(100_000 / BATCH) * BATCH)
     assert (found.cases, found.seeds, found.jobs) == (20, 2, 4)
 
 
 def test_training_gets_what_the_minutes_allow():
     found = planned(minutes=0.5)
-    assert LEAST_BATCHES * BATCH < found.frames < 100_000
-    assert found.frames % BATCH == 0
+    assert LEAST_BATCHES * BATCH < found.frames[PPO] < 100_000
+    assert found.frames[PPO] % BATCH == 0
     assert found.seconds <= 30
 
 
 def test_slow_guide_leaves_a_few_batches_and_fewer_cases_and_it_is_said():
     found = planned(minutes=2, guide=5e-3)
-    assert found.frames == LEAST_BATCHES * BATCH
+    assert found.frames[ANCHORED] == LEAST_BATCHES * BATCH < found.frames[PPO]
     assert found.cases == 5
     assert found.seconds > 120
     assert "minutes=2 is not enough" in found.described(2)
@@ -45,4 +46,27 @@ def test_slow_guide_leaves_a_few_batches_and_fewer_cases_and_it_is_said():
 @pytest.mark.parametrize("frames", [100, 5000])
 def test_training_is_never_longer_than_the_whole_budget(frames):
     config = OmegaConf.merge(CONFIG, {"budget": {"frames": frames}})
-    assert planned(minutes=10, config=config).frames <= frames
+    assert max(planned(minutes=10, config=config).frames.values()) <= frames
+
+
+def test_all_learners_get_the_same_time():
+    pace = Pace(1e-4, 0.0, {PPO: 2e-4, SAC: 3e-3}, 200, 1.0)
+    found = plan({PPO: CONFIG, SAC: REPLAY}, pace, [ARMS[PPO], ARMS[SAC]], minutes=2)
+    seconds = [frames * pace.learning[name] for name, frames in found.frames.items()]
+    assert seconds[0] == pytest.approx(100_352 * 2e-4)  # a tenth of the budget
+    assert seconds[1] == pytest.approx((120 - found.seconds) / 2 + seconds[1], abs=0.1)
+    assert found.frames[SAC] > LEAST_FRAMES
+
+
+def test_learner_with_replay_has_enough_frames_to_learn_on_a_slow_env():
+    pace = Pace(0.01, 0.0, {PPO: 0.01, SAC: 0.013}, 200, 1.0)
+    found = plan({PPO: CONFIG, SAC: REPLAY}, pace, [ARMS[PPO], ARMS[SAC]], minutes=2)
+    assert found.frames == {PPO: LEAST_BATCHES * BATCH, SAC: 2016}
+
+
+def test_clock_counts_the_processor_and_what_each_piece_waits():
+    busy, waits = Clock(), Clock()
+    busy.laps = [(0.010, 0.001), (0.0010, 0.001), (0.030, 0.004)]  # beside other programs
+    waits.laps = [(0.006, 0.001), (0.020, 0.001)]
+    assert (busy.waiting, busy.seconds) == (0, pytest.approx(0.002))
+    assert (waits.waiting, waits.seconds) == (pytest.approx(0.005), pytest.approx(0.006))

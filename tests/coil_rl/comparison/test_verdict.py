@@ -199,7 +199,7 @@ def test_guide_that_is_not_clearly_better_than_random_gives_way_to_a_policy_that
 def test_only_what_is_clearly_better_than_random_is_recommended():
     generator = np.random.default_rng(0)
     names = ("guide", "opposite", "zero", "tune", "ppo", "coil_anchored", "residual")
-    for _ in range(300):
+    for _ in range(100):
         means = {name: list(generator.normal(0, 50, 2)) for name in names}
         made = entries(**means)
         for name in names:

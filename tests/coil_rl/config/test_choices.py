@@ -44,7 +44,7 @@ def checked(method, tmp_path, *words):
     check(config)
 
 
-@pytest.mark.fast(3)
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("method", sorted({*METHODS} - {*OTHERS}))
 def test_method_takes_choices_or_is_refused_with_those_that_do(method, tmp_path):
     if method in WITH_CHOICES:

@@ -69,7 +69,7 @@ def kept(result, written):
     return [key for key, value in written.items() if found.get(key) != value]
 
 
-@pytest.mark.fast(2)
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("group", GLOBAL)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_value_of_a_users_file_survives_the_composition(group, method, tmp_path):
@@ -89,7 +89,7 @@ def test_every_value_of_a_users_file_survives_the_composition(group, method, tmp
     assert kept(result, written) == []
 
 
-@pytest.mark.fast(3)
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("group", OWN)
 @pytest.mark.parametrize("method", FAST)
 def test_every_value_of_a_users_part_survives_the_composition(group, method, tmp_path):

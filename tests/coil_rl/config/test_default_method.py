@@ -3,6 +3,7 @@ import pytest
 from coil_rl.config.compose import compose_train
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize(
     ("words", "method"),
     [

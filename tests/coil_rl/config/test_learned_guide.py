@@ -58,7 +58,7 @@ def test_guide_drives_as_the_policy_in_its_own_env(run):
     assert [row["reward"] for row in learned.episodes] == [row["reward"] for row in policy.episodes]
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 def test_guide_is_deterministic_and_advises_another_agent(run):
     env = env_maker(composed(*TINY, "method=ppo", "run_dir=unused"))()
     data, guide = env.rollout(5, break_when_any_done=False)[:, -1], LearnedGuide(str(run))
@@ -134,6 +134,7 @@ def test_run_that_is_its_own_guide_is_refused(length, tmp_path):
             LearnedGuide(str(tmp_path / "0"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "MountainCarContinuous-v0"])
 def test_policy_that_observes_its_last_actions_acts_as_in_its_own_env(env_id, tmp_path):
     words = ["env=gym", f"env.id={env_id}", "env.max_steps=6"]

@@ -9,7 +9,6 @@ import pytest
 import torch
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
-from programs import called
 
 from coil_rl.config.check import check
 from coil_rl.config.compose import compose_train
@@ -132,12 +131,3 @@ def test_env_is_given_the_action_of_its_guide_in_its_own_numbers(space, of, give
     with torch.no_grad():
         env.rollout(3, policy)
     assert seen == [given] * 3
-
-
-@pytest.mark.parametrize(("words", "expected"), [WORDS[0], WORDS[7], WORDS[18], WORDS[24]])
-def test_program_ends_with_the_sentence_and_exit_code_2(words, expected, tmp_path):
-    plain = ["env=gym", "env.id=odd_parts:Plain", "method=ppo", *SMALL]
-    refused = called("train", *plain, *words.split(), cwd=tmp_path, code=2).stderr
-    assert expected in refused
-    assert len(refused.splitlines()) == 1
-    assert not list(tmp_path.iterdir())

@@ -37,7 +37,7 @@ def composed(*overrides, name="train"):
         return compose(name, [*SMALL, *overrides])
 
 
-@pytest.mark.fast(8)
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(("method", "preset"), [*product(shipped("method"), shipped("preset"))])
 def test_env_of_every_method_passes_check_env(method, preset):
     env = env_maker(composed(f"preset={preset}", f"method={method}"))()
@@ -132,7 +132,7 @@ def test_advice_is_degraded_after_the_transforms_of_the_method():
     torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.25))
 
 
-@pytest.mark.fast(4)
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("learner", shipped("learner"))
 def test_every_learner_is_built(learner):
     config = composed(f"learner={learner}")

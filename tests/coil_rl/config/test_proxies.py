@@ -145,6 +145,7 @@ gymnasium.register("Changing-v0", Plant)
 """
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize(
     "words",
     [
@@ -187,6 +188,7 @@ def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, caps
     assert "distill: made 0, found 1; the lowest mean reward is" in output
 
 
+@pytest.mark.slow
 def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path, capsys):
     whole = next(proxies.glob("constant_*"))
     stopped = tmp_path / whole.name

@@ -142,6 +142,7 @@ def rewards_of_guide(table):
     return list(table[(table["driver"] == "guide") & (table["case"] != "mean")]["reward"])
 
 
+@pytest.mark.slow
 def test_guide_alone_drives_in_as_many_cases_as_are_asked_for(tmp_path):
     words = ["evaluation.cases=2", "evaluation.gif=false", "env.max_steps=5"]
     run = coil_rl.prepare(
@@ -156,6 +157,7 @@ def test_guide_alone_drives_in_as_many_cases_as_are_asked_for(tmp_path):
     assert len(set(more)) == 4
 
 
+@pytest.mark.slow
 def test_rows_of_a_guide_are_those_of_the_object_that_was_handed_over(tmp_path):
     words = ["evaluation.cases=2", "evaluation.gif=false", "env.max_steps=5"]
     folder = tmp_path / "run"
@@ -186,6 +188,7 @@ def test_controller_as_a_guide_is_the_policy_that_was_asked_for(tmp_path):
     assert actions[0] == actions[2] != actions[1]
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("number", [0, -1, 2.5, True, "3"])
 def test_number_that_is_none_is_refused_by_its_name(number, tmp_path):
     run = coil_rl.prepare(ENV, guide=proportional, method="guide", folder=tmp_path / "run")
@@ -355,6 +358,7 @@ def test_run_from_parts_is_trained_resumed_and_reported(tmp_path):
     assert "was made in Python from parts, which no file names" in refused
 
 
+@pytest.mark.slow
 def test_edited_configuration_of_a_finished_run_is_refused(tmp_path):
     run = coil_rl.train(ENV, frames=32, folder=tmp_path / "run", overrides=SHORT)
     file = run.folder / "config.yaml"

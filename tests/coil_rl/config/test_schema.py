@@ -10,6 +10,7 @@ def composed(*overrides, **options):
         return compose("train", list(overrides), **options)
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize(
     ("overrides", "label"),
     [
@@ -34,6 +35,7 @@ def test_learning_rate_is_the_same_for_all_methods(method):
     assert learner.learning_rate.start == 1e-3
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize(
     ("overrides", "correlation"),
     [

@@ -100,6 +100,7 @@ def test_target_outside_the_list_is_refused_before_any_import(target, saved, tmp
     assert set(sys.modules) == modules
 
 
+@pytest.mark.fast(4)
 @pytest.mark.parametrize(
     "path", ["os:system", "posix:system", "os.system", "builtins:eval", "coil_rl.files:os.system"]
 )

@@ -627,14 +627,6 @@ class Draws(Seeds):
         self.state = [self.draw(), 0.0]
 
 
-class DrawsLate(Draws):
-    def begin(self, seed):
-        Drift.begin(self, seed)
-
-    def draw(self):
-        return super().draw() if self.time > 12 else 0.0
-
-
 def actions(env, count=30):
     """Return the entries of steps with given actions."""
     generator, rows = torch.Generator().manual_seed(0), []

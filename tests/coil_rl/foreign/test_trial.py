@@ -119,6 +119,7 @@ def test_controller_that_draws_what_no_seed_reaches_is_found(of):
     assert "reads the clock" in sentence
 
 
+@pytest.mark.fast(6)
 @pytest.mark.parametrize(
     "of",
     [

@@ -43,6 +43,7 @@ def test_lander_is_the_heuristic_of_gymnasium(continuous):
     assert len(np.unique(advice)) > 3  # all actions occur
 
 
+@pytest.mark.slow
 def test_energy_pump_climbs_and_a_brake_does_not():
     assert np.mean(returns("MountainCarContinuous-v0", function("energy_pump"))) == pytest.approx(
         89.4, abs=0.5
@@ -54,6 +55,7 @@ def test_linear_feedback_balances_for_500_steps():
     assert returns("CartPole-v1", function("linear_feedback")) == [500.0] * 4
 
 
+@pytest.mark.slow
 def test_swing_up_ends_upright_from_anywhere():
     env = GymnasiumEnv("Pendulum-v1", 16, first_seed=0, cases=16)
     env = TransformedEnv(env, GuideActions({"guide": function("swing_up")}))

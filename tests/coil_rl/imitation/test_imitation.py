@@ -199,6 +199,7 @@ def test_two_dimensional_actions_and_batches(name):
         assert env.action_spec.is_in(learner.policy(far)["action"])
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("categorical", [True, False])
 def test_discrete_actions_are_learned_from_one_hot_advice(categorical):
     env = worlds.carts(categorical=categorical)

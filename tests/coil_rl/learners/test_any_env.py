@@ -196,6 +196,7 @@ def test_entries_of_all_kinds_are_read():
     trained(learner, env)
 
 
+@pytest.mark.slow
 def test_ppo_trains_the_joint_action_of_several_agents_for_the_sum_of_their_rewards():
     torch.manual_seed(0)
     env = AnyEnv(

@@ -136,6 +136,7 @@ ACTIONS = {
 }
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(
     ("action", "options", "dtype"),
     [

@@ -64,6 +64,7 @@ def test_normalised_numbers_are_the_same_in_any_unit(unit):
     )
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_statistics_are_those_of_all_collected_observations_and_part_of_the_policy(kind):
     torch.manual_seed(0)

@@ -219,6 +219,7 @@ def make(kind, seed=0, **changes):
     return learner, Rollout(env, learner.policy, 4, learner.keys)
 
 
+@pytest.mark.fast("buffer full-DQN", "buffer full-TQC")
 @pytest.mark.parametrize("kind", [DQN, SAC, CrossQ, TQC])
 @pytest.mark.parametrize("updates", [1, 4], ids=["buffer not full", "buffer full"])
 def test_state_contains_everything_the_next_update_depends_on(kind, updates):

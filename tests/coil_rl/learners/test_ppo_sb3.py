@@ -47,6 +47,7 @@ def test_env_executes_the_clipped_sample_whose_probability_is_that_of_the_unclip
     assert torch.equal(batch["action"], batch["unclipped_action"].clamp(-1, 1))
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("kind", [PPO, A2C, TRPO, Reinforce])
 def test_learners_learn_from_the_unclipped_sample(kind):
     torch.manual_seed(0)
@@ -127,9 +128,9 @@ def test_update_gives_the_weights_of_stable_baselines3(env, gym_env):
     )
 
     # One minibatch, as their order is drawn in another way.
-    model = stable_baselines3(gym_env(), n_steps=512, batch_size=512)
-    _, callback = model._setup_learn(512)
-    model.collect_rollouts(model.env, callback, model.rollout_buffer, 512)
+    model = stable_baselines3(gym_env(), n_steps=256, batch_size=256)
+    _, callback = model._setup_learn(256)
+    model.collect_rollouts(model.env, callback, model.rollout_buffer, 256)
     ours, theirs = PPO(env(), **OPTIONS | {"minibatches": 1}), model.policy
     extractor = theirs.mlp_extractor
     their_layers = linears(

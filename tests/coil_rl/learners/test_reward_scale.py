@@ -109,6 +109,7 @@ def test_rewards_that_are_0_stay_and_equal_returns_are_divided_by_their_size():
     assert scale.scale == 7
 
 
+@pytest.mark.fast(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_batch_keeps_the_rewards_of_the_env_and_a_resumed_learner_goes_on(kind):
     learner, rollout = learner_in(kind, 1000.0, scale_rewards=True)

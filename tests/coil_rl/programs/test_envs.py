@@ -33,8 +33,6 @@ TINY = shlex.split(
     "evaluation.repeats=1 logger=none checkpoint_every=1 "
     "budget.frames=256 budget.num_envs=4 budget.steps=16"
 )
-# What a guide alone does not read.
-OF_LEARNING = ("budget", "checkpoint_every", "logger", "evaluation.repeats", "evaluation.curve")
 SHORT = shlex.split("env.laps=1 env.time_limit=1 evaluation.curve.env.time_limit=1")
 OWN = dict.fromkeys(TRACKED, SHORT)
 OWN |= {env: [*overrides, *SMALL_CASES] for env, overrides in OTHERS.items()}
@@ -42,17 +40,8 @@ PPO = ["learner.epochs=2", "learner.minibatches=2"]
 REPLAY = shlex.split(
     "learner.capacity=1000 learner.starts=64 learner.batch_size=32 learner.updates_per_step=0.03125"
 )
-PROXY = shlex.split(
-    "proxy.budget.frames=64 proxy.budget.num_envs=2 proxy.budget.steps=16 "
-    "proxy.learner.regressor.epochs=1"
-)
-FOREST = shlex.split("learner=forest learner.regressor.n_estimators=5 learner.validate=false")
 LEARNERS = {
     "ppo": ["method=ppo", *PPO],
-    "guide": ["method=guide"],
-    "forest": ["method=oil", *FOREST],
-    "linear": ["method=dagger", "learner=linear"],
-    "dynamic_coil": ["method=dynamic_coil_sequential", "guide=[spline,constant]", *PPO, *PROXY],
     "dqn": ["method=coil", "learner=dqn", *REPLAY],
     "sac": ["method=coil", "learner=sac", *REPLAY],
     "sac_alone": ["method=ppo", "learner=sac", *REPLAY],
@@ -76,8 +65,6 @@ def kill(folder, overrides, mark):
 def trained(env, learner, folder):
     """Train to the end, evaluate the run again, and return the arguments of the training."""
     overrides = [f"env={env}", *LEARNERS[learner], *TINY, *OWN[env]]
-    if learner == "guide":
-        overrides = [word for word in overrides if not word.startswith(OF_LEARNING)]
     called("train", *overrides, f"hydra.run.dir={folder}", cwd=folder.parent)
     assert (folder / ("lines.gif" if env in TRACKED else "returns.png")).exists()
     again = ["evaluation.repeats=1", "evaluation.gif=false", "trust=[torchrl]"]
@@ -124,11 +111,14 @@ def test_env_without_a_guide_trains_with_replay(env, tmp_path):
     trained(env, "sac_alone", tmp_path / "run")
 
 
-# Every learner in one env, and every env with one learner.
+# Every learner with replay in one env, and every env with PPO; test_methods resumes each method.
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "learner"),
-    [*((TRACKED[0], learner) for learner in LEARNERS), *((env, "ppo") for env in TRACKED[1:])],
+    [
+        *((TRACKED[0], learner) for learner in LEARNERS if learner != "sac_alone"),
+        *((env, "ppo") for env in TRACKED[1:]),
+    ],
 )
 def test_killed_run_of_an_env_ends_like_an_uninterrupted_one(env, learner, tmp_path, monkeypatch):
     monkeypatch.setattr(kill_and_resume, "SMALL", [])
@@ -137,7 +127,7 @@ def test_killed_run_of_an_env_ends_like_an_uninterrupted_one(env, learner, tmp_p
     kill(resumed, overrides, kill_and_resume.marks(whole) // 2)
     called("train", f"resume={resumed}", cwd=tmp_path)
     logs = [name for name in kill_and_resume.LOGS if (whole / name).exists()]
-    assert len(logs) == (2 if learner == "guide" else 4)
+    assert len(logs) == 4
     for name in logs:
         assert (resumed / name).read_bytes() == (whole / name).read_bytes(), name
 
@@ -154,6 +144,7 @@ def test_replay_without_a_recording_is_refused_before_the_training(env, learner,
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [

@@ -140,6 +140,7 @@ def test_fault_ends_a_program_with_one_sentence(program, env, words, message, tm
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_fault_is_one_sentence_in_python(tmp_path):
     words = [word for word in TINY[1:] if not word.startswith(("hydra", "budget.frames"))]
     with pytest.raises(UserError, match=r"^the env NoReward .*: the reward is None"):
@@ -175,6 +176,7 @@ def test_env_that_ignores_its_seed_and_cannot_draw_is_trained_with_warnings(tmp_
     assert (tmp_path / "run" / "evaluation.csv").exists()
 
 
+@pytest.mark.slow
 def test_flag_of_info_says_which_steps_count_and_a_run_is_measured_again(tmp_path):
     words = [*TINY, "method=ppo", "env.id=odd_plants:Told", "env.info=[late]"]
     measure = "evaluation.measures.after"

@@ -63,7 +63,7 @@ def refusal(name, *arguments):
 
 
 # Without the program, which composes the configuration twice.
-@pytest.mark.fast(15)
+@pytest.mark.fast(10)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -247,7 +247,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
     assert not files()
 
 
-@pytest.mark.fast(6)
+@pytest.mark.fast(4)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -383,7 +383,7 @@ def test_evaluation_of_a_run_refuses_what_it_does_not_read(started, run, name, c
     assert sentence == f"{change} has no effect: {reason}; leave it out"
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words", [["degrade=[zeroed]"], ["+degrade@evaluation.advice.zeroed=zeroed"]]
 )

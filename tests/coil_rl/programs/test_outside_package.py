@@ -5,10 +5,8 @@ It has its own envs, controllers and YAML files.
 
 import csv
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -127,7 +125,7 @@ def test_finished_run_is_evaluated_and_listened_to_without_its_yaml_files(
     assert row["section"] == "everywhere"
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("guide", "at_least"),
     [("PI", 80), ("BatchedPI", 80), ("Feedforward", 80), ("proportional", 30), ("KnowsTheDay", 80)],
@@ -201,30 +199,6 @@ def finished(process, code=0):
     output = process.communicate(timeout=300)[0]
     assert process.returncode == code, output
     return output
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("env", ["room", "rooms"])
-def test_killed_run_ends_like_an_uninterrupted_one(env, script, tmp_path):
-    run = [*CONF, f"env={env}", "method=coil", *TINY, "budget.frames=640"]
-    finished(script("coil-train", *run, "hydra.run.dir=whole"))
-    killed, metrics = (
-        script("coil-train", *run, "hydra.run.dir=killed"),
-        tmp_path / "killed" / "metrics.csv",
-    )
-    while killed.poll() is None and not (
-        metrics.exists() and metrics.read_bytes().count(b"\n") > 8
-    ):
-        time.sleep(0.002)
-    killed.kill()
-    assert killed.wait() == -signal.SIGKILL
-    assert not (tmp_path / "killed" / "evaluation.csv").exists()
-    output = finished(script("coil-train", "resume=killed"))
-    assert "new ones begin" not in output
-    for name in FILES:
-        assert (tmp_path / "killed" / name).read_bytes() == (
-            tmp_path / "whole" / name
-        ).read_bytes(), name
 
 
 @pytest.mark.slow

@@ -50,38 +50,37 @@ def report(folder):
     return html_page(f"Report of {folder.name}", [section])
 
 
-@pytest.fixture
-def evil(tmp_path):
-    """Return a folder with a run whose every text is an attack."""
+@pytest.fixture(scope="module")
+def evil(tmp_path_factory):
+    """Return the report of a run whose every text is an attack."""
+    folder = tmp_path_factory.mktemp("evil")
     rows = (
         driven("guide", {EVIL: 1.0})
         + driven(EVIL, {EVIL: 2.0})
         + driven(EVIL, {EVIL: 1.0}, advice=EVIL)
     )
-    folder = make_run(tmp_path / "run", EVIL, 0, rows)
-    (folder / "episode.webp").write_bytes(WEBP + EVIL.encode())
-    return tmp_path
+    run = make_run(folder / "run", EVIL, 0, rows)
+    (run / "episode.webp").write_bytes(WEBP + EVIL.encode())
+    return report(folder)
 
 
 def test_texts_of_run_folders_are_only_texts(evil):
-    text = report(evil)
-    read = Reader(text)
+    read = Reader(evil)
     assert [tag for tag in read.tags if tag in ("script", "img")] == ["img", "script"]
     assert "".join(read.scripts).strip() == SCRIPT.strip()
     assert not [name for name, _ in read.attributes if name.startswith("on")]
     assert not [comment for comment in read.comments if "alert" in comment]
     shown = "".join(read.texts)
     assert shown.count("alert(1)") > 3, "they are shown as they are"
-    assert "Content-Security-Policy" in text
+    assert "Content-Security-Policy" in evil
 
 
 def test_page_needs_nothing_else(evil):
-    text = report(evil)
     assert not re.findall(
-        r"https?:|//[a-z]|@import|url\((?!#)", text.replace("</", "").replace("/>", "")
+        r"https?:|//[a-z]|@import|url\((?!#)", evil.replace("</", "").replace("/>", "")
     )
     addresses = [
-        value for name, value in Reader(text).attributes if name in ("src", "href", "data")
+        value for name, value in Reader(evil).attributes if name in ("src", "href", "data")
     ]
     assert {value[:1] if value.startswith("#") else value[:5] for value in addresses} <= {
         "#",

@@ -45,6 +45,7 @@ def test_all_policies_act_in_the_same_cases_and_each_comparison_has_others():
     assert not torch.isin(cases.returns(learner.policy), first).any()
 
 
+@pytest.mark.slow
 def test_cases_depend_on_the_seed_and_go_on_from_a_saved_state():
     one, learner = built(*SHORT)
     other, _ = built(*SHORT, seed=1)
@@ -192,7 +193,7 @@ def test_sampled_actions_have_the_correlated_noise_of_the_training():
     assert float((noise[1:] * noise[:-1]).mean()) == pytest.approx(0.8, abs=0.15)
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 def test_traced_policy_has_the_noise_of_one_that_is_not(correlation):
     cases, learner = built(*SHORT)
@@ -268,7 +269,9 @@ def test_test_at_the_end_grows_with_what_its_episodes_take():
 
 
 def test_learner_with_replay_learns_from_the_steps_of_the_start_test():
-    cases, learner = built(*SHORT, "learner=sac", "learner.starts=50", "learner.n_step=2")
+    cases, learner = built(
+        *SHORT, "learner=sac", "learner.starts=50", "learner.n_step=2", frames=6000
+    )
     (test,) = learner.callbacks(cases)
     cases.renew(3)
     test.after_update(0)

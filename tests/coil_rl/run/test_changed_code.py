@@ -1,10 +1,10 @@
 """A run folder knows the files of a user that its env and its guide are defined in."""
 
 import importlib
-import subprocess
 import sys
 
 import pytest
+from programs import called
 
 import coil_rl
 from coil_rl import UserError
@@ -35,6 +35,10 @@ TINY = [
     "budget.steps=8",
     "evaluation.cases=2",
     "evaluation.curve.points=1",
+    "evaluation.curve.num_envs=2",
+    "evaluation.gif=false",
+    "logger=none",
+    "env.workers=0",
 ]
 
 
@@ -76,14 +80,7 @@ def test_program_goes_on_where_the_change_is_accepted(place):
     folder = place / "run"
     coil_rl.train("tank_of_mine:Tank", frames=32, folder=folder, overrides=TINY)
     (place / "tank_of_mine.py").write_text(PLANT + "\n# another file\n")
-
-    def resumed(*words):
-        program = "from coil_rl.programs.train import main; main()"
-        command = [sys.executable, "-c", program, f"resume={folder}", "trust=[tank_of_mine]"]
-        given = ["budget.frames=48", "env.workers=0", *words]
-        return subprocess.run([*command, *given], cwd=place, capture_output=True, text=True)
-
-    refused = resumed()
-    assert refused.returncode == 2
+    words = [f"resume={folder}", "trust=[tank_of_mine]", "budget.frames=48"]
+    refused = called("train", *words, cwd=place, code=2)
     assert "begun with another file of tank_of_mine" in refused.stderr
-    assert resumed("changed=accept").returncode == 0
+    called("train", *words, "changed=accept", cwd=place)

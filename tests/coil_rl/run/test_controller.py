@@ -73,7 +73,7 @@ def test_controller_has_the_memory_of_its_policy(method, tmp_path):
     np.testing.assert_allclose(other.act(observations[7]), actions[7], rtol=0, atol=1e-6)
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [["learner.normalise=true"], ["degrade=[delayed]"]])
 def test_controller_has_normaliser_and_degraded_advice_inside(options, tmp_path):
     check_same(learned(tmp_path / "run", "coil", *options))
@@ -96,6 +96,7 @@ def test_controller_is_the_guide_of_another_run(tmp_path):
     np.testing.assert_allclose(sent, actions, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_env_with_several_rows_is_refused(tmp_path):
     run = coil_rl.open_run(learned(tmp_path / "run", "ppo"))
     env = run.make_env(2)

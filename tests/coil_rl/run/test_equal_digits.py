@@ -143,7 +143,7 @@ def check_equal(folder, boxes, method, *overrides):
 
 
 # There is nothing to tune.
-@pytest.mark.fast("coil")
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [name for name in METHODS if name not in ("guide", "tune")])
 def test_every_method_has_equal_digits_in_every_box(method, tmp_path):
     boxes = BOXES
@@ -197,7 +197,7 @@ def test_clipped_actions_have_equal_digits_too(squash, tmp_path):
     check_equal(tmp_path, boxes, "ppo", f"learner.squash={squash}")
 
 
-@pytest.mark.fast(4)
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("box", [*BOXES, *HALF])
 @pytest.mark.parametrize("method", ["residual", "residual_coil", "policy_decorator"])
 def test_residual_policy_is_its_guide_at_first(method, box, tmp_path):

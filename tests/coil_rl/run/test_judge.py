@@ -113,6 +113,7 @@ class Broken(Picture):
         (folder / "drawn").touch()
 
 
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("place", ["watch", "draw"])
 def test_results_are_complete_without_a_picture_that_fails(composed, tmp_path, place):
     config = composed("guide=spline", "evaluation.repeats=1")

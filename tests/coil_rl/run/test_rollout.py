@@ -20,6 +20,7 @@ def rollout(seed=0, steps=6, keys=None):
     return Rollout(env, RandomGuide(-1, 0.2, seed=seed), steps, keys)
 
 
+@pytest.mark.slow
 def test_batches_are_consecutive():
     long, short = rollout(steps=60), rollout(steps=20)
     parts = torch.cat([short.collect() for _ in range(3)], 1)

@@ -50,6 +50,7 @@ def rows_of(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_tuned_guide_is_better_on_cases_that_the_search_did_not_see(run):
     rewards = {
         row["driver"]: float(row["reward"])
@@ -60,6 +61,7 @@ def test_tuned_guide_is_better_on_cases_that_the_search_did_not_see(run):
     assert json.loads((run / "tuned.json").read_text())["gain"] > 0.1
 
 
+@pytest.mark.slow
 def test_every_step_is_a_frame_and_frames_are_bounded(run):
     rows = rows_of(run / "metrics.csv")
     frames = [int(row["frames"]) for row in rows]
@@ -80,6 +82,7 @@ def test_budget_that_is_too_small_for_a_generation_and_its_test_is_said(tmp_path
     assert sentence in (folder / "evaluation.md").read_text()
 
 
+@pytest.mark.slow
 def test_run_is_read_by_reports_with_its_curve(run):
     [found] = read_runs([run])
     assert found.finished
@@ -153,6 +156,7 @@ def test_run_that_is_made_longer_searches_on(run, tmp_path):
     assert frames == sorted(frames)
 
 
+@pytest.mark.slow
 def test_other_numbers_in_the_file_are_refused(run, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     (tmp_path / "run" / "tuned.json").write_text('{"gain": 1000}')
@@ -208,6 +212,7 @@ def test_spline_guide_is_tuned_side_by_side_in_one_env(tmp_path):
     assert json.loads((run / "tuned.json").read_text())["gain"] > 0.3
 
 
+@pytest.mark.slow
 def test_candidates_of_a_generation_act_in_the_same_cases_side_by_side_or_in_turn(run):
     beside, in_turn = (_tuner(open_run(run)) for _ in range(2))
     in_turn.cases.can_copy = lambda: False

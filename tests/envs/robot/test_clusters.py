@@ -70,7 +70,7 @@ def test_clusters_of_generated_scans_are_connected_components(seed):
     assert expect_exact(*scans(seed, 100)) > 300
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=50)
 @given(
     st.lists(st.floats(0.0, 1.2), min_size=1, max_size=60),
     st.floats(-10, 10),

@@ -94,6 +94,7 @@ def test_a_shipped_policy_completes_a_lap_of_the_robot(tmp_path):
     assert "210 scans (driving 210); the robot completed its laps; 1 laps." in done.stdout
 
 
+@pytest.mark.fast(10)
 @pytest.mark.parametrize(
     ("words", "message"),
     [

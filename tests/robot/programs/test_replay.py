@@ -256,7 +256,7 @@ def test_equal_labels_are_distinguished_by_seed_and_then_by_number():
     assert _first_repeated(["a", "b"]) is None
 
 
-@pytest.mark.fast(6)
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

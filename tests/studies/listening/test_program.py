@@ -92,7 +92,7 @@ def test_numbers_are_reproducible(runs, tmp_path):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

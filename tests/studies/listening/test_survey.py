@@ -118,6 +118,7 @@ def test_advice_is_replaced_in_its_section_only():
     assert (advice[:, 2:] == 0.25).all()
 
 
+@pytest.mark.slow
 def test_rows_by_section_add_up_to_the_first_one(found, rows):
     for guide in found.guides:
         everywhere, *parts = [row for row in rows if row["guide"] == guide]

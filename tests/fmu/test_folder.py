@@ -1,0 +1,51 @@
+"""What a run folder says of an FMU: who may open it, and that it is the same one."""
+
+from pathlib import Path
+from typing import Any
+
+import fmus
+import pytest
+from omegaconf import OmegaConf
+
+from coil_rl import UserError, compose_train
+from coil_rl.config import parts, source, trust
+from coil_rl.config.parts import env_maker
+
+
+def config(file: Path, *words: str) -> Any:
+    given = [f"env.file={file}", "env.step=0.01", "env.seconds=0.1", "env.workers=0"]
+    given += ["env.setpoints={speed: 100}", "method=ppo", "run_dir=unused", "budget.num_envs=2"]
+    composed = compose_train(["env=fmu", *given, *words])
+    OmegaConf.resolve(composed)
+    return composed
+
+
+@pytest.fixture(autouse=True)
+def forget():
+    yield
+    trust.trust_packages([])
+
+
+def test_a_received_folder_runs_no_fmu_without_trust() -> None:
+    received = config(fmus.motor(), "logger=none")
+    with pytest.raises(UserError, match=r"env._target_ names .* trust=\[coil_fmu\]"):
+        trust.check_config(received, Path("config.yaml"))
+    trust.trust_packages(["coil_fmu"])
+    trust.check_config(received, Path("config.yaml"))
+    received.env.reward = "os:system"
+    with pytest.raises(UserError, match=r"env\.reward names 'os\.system'"):
+        trust.check_config(received, Path("config.yaml"))
+
+
+def test_another_fmu_of_that_name_is_seen(tmp_path: Path) -> None:
+    other = fmus.edited(fmus.motor(), tmp_path / "motor.fmu", {"of the armature": "of it"})
+    one, two = (source.code_of_run(config(path)) for path in (fmus.motor(), other))
+    assert one.keys() == two.keys() == {"motor.fmu"}
+    assert one != two
+
+
+def test_an_agent_may_observe_all_that_the_env_writes() -> None:
+    composed = config(fmus.motor())
+    env = env_maker(composed).bare(2, "test", None)
+    keys = parts.observed_keys(composed, env)
+    assert keys == ["current", "speed", "speed_setpoint"]
