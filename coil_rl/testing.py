@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs
 
 from coil_rl.foreign.faults import shortened
@@ -192,10 +192,17 @@ def _check_resumed(env: TransformedEnv, unused: Transform, name: str) -> None:
     for step, (one, other) in enumerate(zip(expected, found, strict=True), 1):
         for key, value in one.items(True, True):
             resumed = other.get(key)
-            if resumed is None or not torch.equal(value.nan_to_num(), resumed.nan_to_num()):
+            if not _is_same(value, resumed):
                 raise ValueError(
                     f"{name} gives another {key} in step {step} of a resumed run: {problem}"
                 )
+
+
+def _is_same(one: object, other: object) -> bool:
+    """Return whether two entries hold the same numbers; others than tensors are not compared."""
+    if not isinstance(one, Tensor):
+        return True
+    return isinstance(other, Tensor) and torch.equal(one.nan_to_num(), other.nan_to_num())
 
 
 def _stepped(
