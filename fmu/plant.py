@@ -227,12 +227,9 @@ def action_space(actions: Sequence[Variable], file: str) -> spaces.Box:
                 f"actions: the input {each.name} of {file} is a whole number without bounds; give "
                 f"env.bounds.{each.name}=[LOW,HIGH]"
             )
-    low, high = (
-        np.concatenate(
-            [np.full(each.size, side) for each, side in zip(actions, sides, strict=True)]
-        )
-        for sides in ([each.low for each in actions], [each.high for each in actions])
-    )
+    sizes = [each.size for each in actions]
+    low = np.repeat([each.low for each in actions], sizes)
+    high = np.repeat([each.high for each in actions], sizes)
     kind = np.float64 if real else np.int64
     return spaces.Box(low.astype(kind), high.astype(kind), dtype=kind)
 

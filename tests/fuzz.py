@@ -91,7 +91,7 @@ RUNS = {
     "ppo": f"method=ppo {ONCE}",
     "coil": f"method=coil {ONCE}",
     "oil": f"method=oil {FOREST}",
-    "dynamic": f"method=dynamic_coil_sequential {ONCE} {PROXY} {PHASES}",
+    "dynamic": f"method=dynamic_coil_sequential {ONCE} {PROXY} {PHASES} budget.frames=160",
     "dqn": f"method=coil learner=dqn {REPLAY}",
     "learned": f"label=learned method=coil guide=learned guide.learned.run=runs/ppo {ONCE}",
 }

@@ -12,7 +12,7 @@ def test_no_input_makes_a_traceback_or_hangs_or_writes_outside(tmp_path):
         sys.executable,
         str(ROOT / "tests" / "fuzz.py"),
         "--cases",
-        "300",
+        "100",
         "--folder",
         str(tmp_path),
     ]

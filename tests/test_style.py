@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("envs", "transforms", "coil_rl", "benchmarks", "paper", "robot", "studies")
+FOLDERS = ("envs", "transforms", "coil_rl", "benchmarks", "fmu", "paper", "robot", "studies")
 LONGEST_COMPREHENSION = 5  # lines
 
 Comprehension = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)

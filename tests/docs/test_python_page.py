@@ -42,7 +42,7 @@ def test_distributed_collector_runs_a_learner(tmp_path):
         env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         check=True,
     )
     assert [line.split(":")[0] for line in ended.stdout.splitlines()] == [

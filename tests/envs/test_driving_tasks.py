@@ -95,6 +95,7 @@ def test_crash_replaces_all_other_reward_terms(ring: Track) -> None:
     )
 
 
+@pytest.mark.slow
 def test_tasks_without_weights_equal_the_cone_world(rings: list[Track]) -> None:
     shared: dict[str, Any] = {"num_envs": 6, "assignment": "cyclic", "laps": 1, "rate": 6}
     envs = [

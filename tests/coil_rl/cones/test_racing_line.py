@@ -80,6 +80,7 @@ def test_without_a_clear_arc_the_target_is_the_nearest(margin):
     )
 
 
+@pytest.mark.slow
 def test_blocked_arcs_agree_with_geometry(steps):
     check_guide(RacingLineGuide(), steps[::31])
     guide, draw = RacingLineGuide(margin=0.5), np.random.default_rng(3)

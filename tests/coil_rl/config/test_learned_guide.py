@@ -45,7 +45,7 @@ def run(request, tmp_path_factory):
     )
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 def test_guide_drives_as_the_policy_in_its_own_env(run):
     opened = open_run(run)
     env = opened.make_env(3, "evaluation", count=3)

@@ -85,6 +85,7 @@ def test_folder_of_a_proxy_follows_from_guide_env_and_settings():
     assert len({folder(), folder(guide="constant"), *others}) == 6
 
 
+@pytest.mark.slow
 def test_proxy_is_trained_behind_the_delays_and_noise_of_the_run():
     def proxy(*overrides):
         config = composed("guide=spline", "run_dir=unused", *overrides)

@@ -122,6 +122,7 @@ def test_object_or_function_is_a_guide_and_acts_row_by_row(guide, tmp_path):
     assert sent == pytest.approx(expected)
 
 
+@pytest.mark.slow
 def test_folder_made_with_an_object_is_opened_with_the_object(tmp_path, monkeypatch):
     folder = tmp_path / "run"
     guide = Held(0.7)

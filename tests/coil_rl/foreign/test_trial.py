@@ -111,6 +111,7 @@ def found(of, **env):
     return dict(trial.findings)
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("of", [Unseeded, Unseeded(), Inside, Inside(), OwnAtReset()])
 def test_controller_that_draws_what_no_seed_reaches_is_found(of):
     sentence = found(of)["draws"]

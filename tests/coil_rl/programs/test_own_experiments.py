@@ -136,6 +136,7 @@ def test_sweep_says_its_runs_and_frames_and_then_trains(tmp_path):
     assert folders == ["coil_seed0", "ppo_seed0"]
 
 
+@pytest.mark.slow
 def test_jobs_that_fail_for_one_reason_are_named_with_it_once(tmp_path):
     words = ["-m", *ENV, "guide=controller", "guide.controller.of=no:thing", "seed=0,1,2"]
     last = called("train", *words, cwd=tmp_path, code=2).stderr.splitlines()[-1]

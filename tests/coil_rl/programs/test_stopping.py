@@ -117,7 +117,7 @@ def test_sweep_whose_jobs_are_all_refused_leaves_no_folder(tmp_path):
     assert not (tmp_path / "sweep").exists()
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("removed", [False, True])
 def test_jobs_that_fail_in_two_programs_of_a_sweep_count_once(tmp_path, monkeypatch, removed):
     fail, folder = Jobs.fail, tmp_path / "sweep"

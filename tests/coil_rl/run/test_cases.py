@@ -268,6 +268,7 @@ def test_test_at_the_end_grows_with_what_its_episodes_take():
     assert further_cases(32, taken=32, frames=1000) == 0
 
 
+@pytest.mark.slow
 def test_learner_with_replay_learns_from_the_steps_of_the_start_test():
     cases, learner = built(
         *SHORT, "learner=sac", "learner.starts=50", "learner.n_step=2", frames=6000

@@ -76,6 +76,7 @@ def test_change_of_a_file_is_said_and_refused_where_the_run_would_go_on(place, c
     assert now[CODE]["rewards_of_mine"] != begun["rewards_of_mine"]
 
 
+@pytest.mark.slow
 def test_program_goes_on_where_the_change_is_accepted(place):
     folder = place / "run"
     coil_rl.train("tank_of_mine:Tank", frames=32, folder=folder, overrides=TINY)

@@ -79,6 +79,7 @@ def test_controller_has_normaliser_and_degraded_advice_inside(options, tmp_path)
     check_same(learned(tmp_path / "run", "coil", *options))
 
 
+@pytest.mark.slow
 def test_action_is_in_the_numbering_of_the_env(tmp_path):
     folder = learned(tmp_path / "run", "ppo", env="CartPole-v1")
     _, actions, controller = check_same(folder)

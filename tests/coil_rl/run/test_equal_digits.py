@@ -16,7 +16,7 @@ import coil_rl
 
 METHODS = shipped("method")
 WITHOUT_GUIDE = ("ppo",)
-FAST = ("coil", "residual")
+IN_ALL_BOXES = ("coil", "residual")
 
 TINY = ["budget.num_envs=4", "budget.steps=16", "evaluation.cases=2", "logger=none"]
 TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
@@ -147,7 +147,7 @@ def check_equal(folder, boxes, method, *overrides):
 @pytest.mark.parametrize("method", [name for name in METHODS if name not in ("guide", "tune")])
 def test_every_method_has_equal_digits_in_every_box(method, tmp_path):
     boxes = BOXES
-    if method in FAST:
+    if method not in IN_ALL_BOXES:
         boxes = {name: BOXES[name] for name in ("unit", "different")}
     check_equal(tmp_path, boxes, method)
 
@@ -184,20 +184,13 @@ def test_random_actions_earn_the_same_wherever_the_bound_is(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", FAST)
-def test_methods_of_the_fast_tests_have_equal_digits_in_the_other_boxes_too(method, tmp_path):
-    check_equal(tmp_path / "bounded", BOXES, method)
-    check_equal(tmp_path / "half bounded", HALF, method)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("squash", ["true", "false"])
 def test_clipped_actions_have_equal_digits_too(squash, tmp_path):
     boxes = {name: BOXES[name] for name in ("unit", "shifted")}
     check_equal(tmp_path, boxes, "ppo", f"learner.squash={squash}")
 
 
-@pytest.mark.fast(2)
+@pytest.mark.fast(1)
 @pytest.mark.parametrize("box", [*BOXES, *HALF])
 @pytest.mark.parametrize("method", ["residual", "residual_coil", "policy_decorator"])
 def test_residual_policy_is_its_guide_at_first(method, box, tmp_path):

@@ -57,6 +57,7 @@ def rows(found):
     )
 
 
+@pytest.mark.slow
 def test_every_state_of_every_episode_is_measured(found):
     assert found.guides == ["spline", "random"]
     assert all(episode["completed"] for episode in found.result.episodes)
@@ -130,6 +131,7 @@ def test_rows_by_section_add_up_to_the_first_one(found, rows):
             )
 
 
+@pytest.mark.slow
 def test_rows_along_the_track_contain_every_state_once(found):
     sections = TrackSections(TRACKS, bin=2.0)
     rows = sections.table(found)
