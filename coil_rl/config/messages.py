@@ -38,6 +38,7 @@ LAUNCHERS = {
 
 TYPED = re.compile(r"Could not override '([^']+)'")
 MERGED = re.compile(r"Error merging override (.+)")
+AMBIGUOUS = "Ambiguous value for argument"
 NO_CHOICE = "Config group override must be a string or a list"
 NO_INTEGER = re.compile(
     r"override ([\w.]+)=.*Value '([\d.eE+]+)' of type 'float' could not be converted to Integer",
@@ -116,6 +117,8 @@ def _message(error: BaseException) -> str:
         )
     if isinstance(error, OverrideParseException):
         return _unreadable_override(error)
+    if str(error).startswith(AMBIGUOUS):  # also where an experiment that sweeps cannot be composed
+        return f"{_first_paragraph(error)}; or another word is wrong, which -m names"
     return _not_composed(error)
 
 
