@@ -65,7 +65,7 @@ def quietly(*, bars: bool = False) -> Iterator[None]:
     Args:
         bars: whether bars are shown nevertheless.
     """
-    before = _quiet.set(_quiet.get() or ("said" if bars else "all"))
+    before = _quiet.set("said" if bars and _quiet.get() != "all" else "all")
     try:
         yield
     finally:
