@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from importlib.util import find_spec
 from typing import Any
 
 from tqdm import tqdm
@@ -54,13 +55,17 @@ class SafeStream:
         return getattr(self.stream, name)
 
 
-_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+_quiet: ContextVar[str] = ContextVar("quiet", default="")
 
 
 @contextmanager
-def quietly() -> Iterator[None]:
-    """Show neither progress bars nor what is said in the block; warnings and errors stay."""
-    before = _quiet.set(True)
+def quietly(*, bars: bool = False) -> Iterator[None]:
+    """Show neither progress bars nor what is said in the block; warnings and errors stay.
+
+    Args:
+        bars: whether bars are shown nevertheless.
+    """
+    before = _quiet.set("said" if bars and _quiet.get() != "all" else "all")
     try:
         yield
     finally:
@@ -68,10 +73,17 @@ def quietly() -> Iterator[None]:
 
 
 def progress(**options: Any) -> "tqdm[Any]":
-    """Return a progress bar on standard error; `options` are those of tqdm."""
-    if _quiet.get():
+    """Return a progress bar on standard error, or in a notebook; `options` are those of tqdm."""
+    if _quiet.get() == "all":
         options["disable"] = True
-    return tqdm(file=SafeStream(sys.stderr), **options)
+    if "ipykernel" not in sys.modules:
+        return tqdm(file=SafeStream(sys.stderr), **options)
+    if find_spec("ipywidgets") is not None:
+        from tqdm.notebook import tqdm as widget
+
+        return widget(**options)
+    # One line for all bars: codes that move a cursor are letters in a notebook.
+    return tqdm(file=SafeStream(sys.stderr), **options | {"position": 0, "mininterval": 1.0})
 
 
 def say(text: str, *, error: bool = False) -> None:

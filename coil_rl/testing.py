@@ -3,19 +3,23 @@
 They hold for the parts of this project, and can be used for those of any other one.
 """
 
+import copy
 import warnings
 from collections.abc import Iterable
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs
 
+from coil_rl.foreign.faults import shortened
 from coil_rl.foreign.trial import Finding, Recorded, Trial
 from coil_rl.transforms import GuideActions, set_progress
 from coil_rl.transforms.action_space import ActionSpace, nested_key, space_of
 from coil_rl.transforms.guide_actions import unfit_action
+
+RESUMED_AT = 6  # steps before and after the middle of episodes
 
 
 def check_env(env: EnvBase, steps: int = 10) -> None:
@@ -136,10 +140,78 @@ class _CheckedAction:
 
 
 def check_transform(env: EnvBase, transform: Transform) -> None:
-    """Check an env with a transform; see `check_env`.
+    """Check an env with a transform: see `check_env`, and its state in the middle of episodes.
+
+    A copy of the transform that gets its `state_dict()` and the data of a step, as in a resumed
+    run, has to go on with the same numbers. An env that cannot be restored is not asked for this.
 
     Args:
         env: the env.
         transform: the transform; its random state must be in its `state_dict()`.
+
+    Raises:
+        ValueError: as `check_env`, and if the copy does not go on in the same way.
     """
-    check_env(TransformedEnv(env, transform))
+    transformed = TransformedEnv(env, transform)
+    # Copies of the transforms without what contains them.
+    outer = {id(transformed): None, id(transformed.base_env): None}
+    unused = copy.deepcopy(transformed.transform, outer)
+    check_env(transformed)
+    env = transformed.base_env
+    if (env.state_dict() or env.state_spec.keys()) and getattr(env, "continues", True):
+        _check_resumed(transformed, unused, type(transform).__name__)
+
+
+def _check_resumed(env: TransformedEnv, unused: Transform, name: str) -> None:
+    """Check that an unused copy of the transforms of an env goes on from their state.
+
+    Args:
+        name: of the one that is checked.
+
+    Raises:
+        ValueError: if it does not.
+    """
+    env.set_seed(0)
+    torch.manual_seed(0)
+    _, carrier = _stepped(env, env.reset(), RESUMED_AT)
+    states = [copy.deepcopy(each.state_dict()) for each in (env.base_env, env)]
+    numbers, begun = torch.get_rng_state(), carrier.clone()
+    expected, _ = _stepped(env, carrier, RESUMED_AT)
+    try:
+        again = TransformedEnv(env.base_env, unused).train(env.training)
+        again.base_env.load_state_dict(states[0])
+        again.load_state_dict(states[1])
+        torch.set_rng_state(numbers)
+        found, _ = _stepped(again, begun, RESUMED_AT)
+    except Exception as error:
+        reason = shortened(f"{type(error).__name__}: {error}")
+        raise ValueError(
+            f"{name} cannot go on from its state_dict() in a resumed run ({reason}): keep what it "
+            "remembers in the data, see Link.state, or in buffers"
+        ) from error
+    for step, (one, other) in enumerate(zip(expected, found, strict=True), 1):
+        for key, value in one.items(True, True):
+            resumed = other.get(key)
+            if not _is_same(value, resumed):
+                raise ValueError(
+                    f"{name} gives another {key} in step {step} of a resumed run: keep what it "
+                    "remembers in the data, see Link.state, or in buffers"
+                )
+
+
+def _is_same(one: object, other: object) -> bool:
+    """Return whether two entries hold the same numbers; others than tensors are not compared."""
+    if not isinstance(one, Tensor):
+        return True
+    return isinstance(other, Tensor) and torch.equal(one.nan_to_num(), other.nan_to_num())
+
+
+def _stepped(
+    env: EnvBase, carrier: TensorDictBase, steps: int
+) -> tuple[list[TensorDictBase], TensorDictBase]:
+    """Return the entries after each of some steps of random actions, and those to go on with."""
+    after = []
+    for _ in range(steps):
+        step, carrier = env.step_and_maybe_reset(env.rand_action(carrier))
+        after.append(step["next"].clone())
+    return after, carrier

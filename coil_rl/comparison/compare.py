@@ -161,9 +161,9 @@ class Comparison:
             UserError: for a mistake in what was given, for a folder that holds something else, and
                 if another process uses the folder.
         """
-        start = time.perf_counter()
+        start = time.process_time()
         config = self._checked()
-        self.overhead = time.perf_counter() - start
+        self.overhead = time.process_time() - start
         with self._new_or_kept():
             (self.folder / FAILED_JOBS).unlink(missing_ok=True)
             plan = self._plan(config)

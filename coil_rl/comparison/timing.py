@@ -123,11 +123,13 @@ def measure(plain: Mapping[str, DictConfig], overhead: float) -> Pace:
         length = _length(env, follow)
         env = make_env.plain(EPISODES, TEST)
         length = max(length, _length(env, Acting.random(env)))
-        guided = _step(*make_env.guided(ROWS, TEST))
+        guided = _stepped(*make_env.guided(ROWS, TEST))
         env = make_env.plain(ROWS, TEST)
-        step = _step(env, Acting.random(env))
-        learning = {name: max(_frame(config), step) for name, config in plain.items()}
-    return Pace(step, max(guided - step, 0.0), learning, length, overhead)
+        clock = _stepped(env, Acting.random(env))
+        step = clock.seconds / ROWS
+        learning = {name: _frame(config) + clock.waiting / ROWS for name, config in plain.items()}
+    learning = {name: max(frame, step) for name, frame in learning.items()}
+    return Pace(step, max(guided.seconds / ROWS - step, 0.0), learning, length, overhead)
 
 
 def _length(env: EnvBase, policy: TensorDictModuleBase) -> float:
@@ -139,25 +141,54 @@ def _length(env: EnvBase, policy: TensorDictModuleBase) -> float:
     return float(steps.mean())
 
 
-def _step(env: EnvBase, policy: TensorDictModuleBase) -> float:
-    """Return the seconds of a step of one row; the first step may prepare something."""
+class Clock:
+    """Time of pieces of work that does not depend on what else the machine does.
+
+    It is the processor's time of this process, and what even the fastest piece waited besides, such
+    as for a process or a device.
+    """
+
+    def __init__(self) -> None:
+        self.laps: list[tuple[float, float]] = []  # on the wall, and of the processor
+        self.begun = time.perf_counter(), time.process_time()
+
+    def lap(self) -> None:
+        """End a piece."""
+        now = time.perf_counter(), time.process_time()
+        self.laps.append((now[0] - self.begun[0], now[1] - self.begun[1]))
+        self.begun = now
+
+    @property
+    def waiting(self) -> float:
+        """Seconds that a piece waits."""
+        return max(min((wall - own for wall, own in self.laps), default=0.0), 0.0)
+
+    @property
+    def seconds(self) -> float:
+        """Mean seconds of a piece."""
+        return sum(own for _, own in self.laps) / max(len(self.laps), 1) + self.waiting
+
+
+def _stepped(env: EnvBase, policy: TensorDictModuleBase) -> Clock:
+    """Return the clock of some steps of all rows; the first step may prepare something."""
     steps = itertools.islice(episodes(env, policy), STEPS + 1)
     next(steps)
-    start = time.perf_counter()
-    count = sum(1 for _ in steps)
-    return (time.perf_counter() - start) / (max(count, 1) * env.batch_size.numel())
+    clock = Clock()
+    for _ in steps:
+        clock.lap()
+    return clock
 
 
 def _frame(config: DictConfig) -> float:
-    """Return the seconds of a frame of training, with its share of the update."""
+    """Return the processor's seconds of a frame of training, with its share of the update."""
     learner = build_learner(config, env := env_maker(config)())
     keys = [*learner.keys, ("next", "done"), ("next", "reward"), ("next", "episode_reward")]
     rollout = Rollout(env, learner.policy, config.budget.steps, keys)
-    start, frames = time.perf_counter(), 0
+    start, frames = time.process_time(), 0
     while frames < TIMED:
         learner.update(rollout.collect(), 0.0)
         frames += rollout.frames
-    return (time.perf_counter() - start) / frames
+    return (time.process_time() - start) / frames
 
 
 def plan(

@@ -255,6 +255,7 @@ class ReportConfig(ProgramConfig):
     folder: Any = MISSING
     actions: Annotated[str, one_of("deterministic", "sampled", "both")] = "deterministic"
     against: str | None = None
+    figures: Annotated[str, one_of("png", "pdf", "svg")] = "png"
 
 
 def fingerprint(config: DictConfig) -> str:

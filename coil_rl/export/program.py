@@ -31,7 +31,8 @@ def export(config: DictConfig) -> None:
     guide = exported.contract["guide"]["place"]
     size = exported.contract["files"][exported.file.name]["bytes"] / 1000
     print(f"export: {exported.file} has {size:.0f} kB; guide {guide}; see {config.run_dir}")
-    print(f"Next: {next_step(str(config.run), str(config.run_dir), guide)}")
+    drive = f"on the machine: {config.run_dir}/drive.py, with numpy and onnxruntime alone"
+    print(f"Next: {next_step(str(config.run), str(config.run_dir), guide)} | {drive}")
 
 
 def next_step(run: str, folder: str, guide: str) -> str:

@@ -44,7 +44,7 @@ from coil_rl.errors import UserError
 from coil_rl.output import SafeStream
 from coil_rl.plain_yaml import is_part
 from coil_rl.programs.folders import spelled
-from coil_rl.programs.sweeps import Jobs, is_sweep, remove_unused
+from coil_rl.programs.sweeps import Jobs, command_of, is_sweep, remove_unused
 from coil_rl.run.stopping import STOP
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
@@ -223,10 +223,6 @@ def run_program(
     def checked(config: DictConfig) -> Any:
         try:
             return _do(task, check, config, signals)
-        except KeyboardInterrupt as error:
-            if is_sweep():
-                raise KeyboardInterrupt(f"continue with: {jobs.command}") from error
-            raise
         except Exception as error:
             if is_sweep() and not isinstance(error, NoSweepError):
                 return jobs.fail(error)
@@ -330,7 +326,11 @@ def program(name: str, signals: Signals | None = None) -> Iterator[None]:
     except (Exception, KeyboardInterrupt) as error:
         # A library may raise an error of its own on the way out of an interrupt.
         if signals.received or isinstance(error, KeyboardInterrupt):
-            reasons = map(str, error.args) if isinstance(error, KeyboardInterrupt) else ()
+            args = error.args if isinstance(error, KeyboardInterrupt) else ()
+            reasons = [str(each) for each in args]
+            if is_sweep():
+                command = command_of(sys.argv, HydraConfig.get().sweep.dir)
+                reasons = [f"continue with: {command}"]
             print(f"{name}: {'; '.join(['interrupted', *reasons])}", file=sys.stderr)
             sys.exit(130)
         if not is_no_bug(error):

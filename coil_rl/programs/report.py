@@ -54,29 +54,42 @@ class EnvPart:
         """Return the rows of the table of policies, by kind of actions."""
         return {kind: each.table(self.against) for kind, each in self.compared.items()}
 
-    def sections(self, folder: Path, strokes: Mapping[str, Stroke]) -> list[Section]:
+    def sections(self, folder: Path, strokes: Mapping[str, Stroke], kind: str) -> list[Section]:
         """Return the sections, the figures in the first one; the figures are written, too.
 
         Args:
             folder: for the figures.
             strokes: by label.
+            kind: of their files, such as "png".
         """
         from coil_rl.report import page
         from coil_rl.report.figures import draw_report
         from coil_rl.report.html import Section
 
         suffix = re.sub(r"[^\w.-]+", "_", f"_{self.env}") if self.env else ""
-        figures = draw_report(self.runs, self.compared, folder, strokes, suffix)
+        figures = draw_report(self.runs, self.compared, folder, strokes, f"{suffix}.{kind}")
         sections: list[Section] = []
-        for kind, rows in self.tables().items():
-            heading = ", ".join(filter(None, (self.env, f"{kind} actions")))
-            blocks = page.section(self.compared[kind], rows, self.against)
+        for actions, rows in self.tables().items():
+            heading = ", ".join(filter(None, (self.env, f"{actions} actions")))
+            blocks = page.section(self.compared[actions], rows, self.against)
             if not sections:
                 blocks += page.what_differs(self.differing, "policy")
             named = f"{heading[0].upper()}{heading[1:]}"
             sections.append(Section(named, blocks, [] if sections else figures))
         training = [*page.training(self.runs), *page.guide_training(self.runs)]
         return [*sections, Section("", [*training, *self._notes()])]
+
+    def curves(self) -> list[dict[str, Any]]:
+        """Return a row for each point of the learning curve of each run."""
+        from coil_rl.report.curves import points
+        from coil_rl.report.runs import RETURN
+
+        rows = []
+        for run in self.runs:
+            named = {"env": self.env, "label": run.label, "seed": run.seed}
+            found = points(run.curve, RETURN).tolist() if run.curve else []
+            rows += [named | {"frames": frames, "return": value} for frames, value in found]
+        return rows
 
     def _notes(self) -> list[str]:
         """Return the sentences on these runs."""
@@ -126,7 +139,7 @@ def report(config: DictConfig) -> None:
     overview = [*page.summary(first, against), *page.what_differs(envs, "env")]
     sections = [Section("", overview)] if overview else []
     for part in parts:
-        sections += part.sections(folder, strokes)
+        sections += part.sections(folder, strokes, config.figures)
     sections.append(
         Section(
             "",
@@ -140,6 +153,8 @@ def report(config: DictConfig) -> None:
     write_text(folder / "report.md", text)
     write_csv(_rows(parts, EnvPart.tables), folder / "report.csv")
     write_csv(_rows(parts, _cases), folder / "report_cases.csv")
+    write_csv([row for part in parts for row in part.curves()], folder / "report_curves.csv")
+    write_text(folder / "report.tex", "\n\n".join(filter(None, map(_latex, sections))))
     html = html_page(f"Report of {folder.resolve().name}", sections)
     write_text(folder / "report.html", html)
     print(f"{text}\nreport: see {folder}")
@@ -173,6 +188,14 @@ def _parts(
 def _markdown(section: Section) -> str:
     heading = [f"## {section.heading}"] if section.heading else []
     return "\n\n".join([*heading, *map(str, section.blocks)])
+
+
+def _latex(section: Section) -> str:
+    """Return the tables of a section as LaTeX, for the package booktabs."""
+    from coil_rl.report.table import Table
+
+    tables = [block.latex() for block in section.blocks if isinstance(block, Table)]
+    return "\n\n".join([f"% {section.heading}", *tables]) if tables else ""
 
 
 def _cases(part: EnvPart) -> dict[str, list[dict[str, Any]]]:

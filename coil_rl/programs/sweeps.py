@@ -25,7 +25,7 @@ from coil_rl.config.compose import keep_written
 from coil_rl.config.messages import reason_of, refuse
 from coil_rl.errors import RunningError, UserError
 from coil_rl.files import FAILED_JOBS
-from coil_rl.output import say
+from coil_rl.output import progress, say
 
 
 class Plan(Callback):
@@ -61,12 +61,15 @@ class Plan(Callback):
                 _check_words(config, runs)
             command = command_of(sys.argv, config.hydra.sweep.dir)
             say(f"if this sweep is stopped, go on with: {command}", error=True)
+            HydraConfig.instance().set_config(config)  # for an interrupt outside of a job
         Path(config.hydra.sweep.dir, FAILED_JOBS).unlink(missing_ok=True)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """End the program with exit code 2 if jobs have failed."""
         folder = Path(config.hydra.sweep.dir)
         if not (folder / FAILED_JOBS).is_file():
+            if "existing" in config:
+                say(f"Next: {shlex.join(['coil-report', f'folder={folder}'])}")
             return
         # Several programs may do the same sweep, and a job fails in each of them.
         lines = dict.fromkeys((folder / FAILED_JOBS).read_text(encoding="utf-8").splitlines())
@@ -138,7 +141,7 @@ def _planned(config: DictConfig) -> Iterator[DictConfig]:
     parser = OverridesParser.create(config_loader=loader)
     [jobs] = BasicSweeper.split_arguments(parser.parse_overrides(_words(config)), None)
     known: dict[tuple[str, ...], DictConfig] = {}
-    for job in jobs:
+    for job in progress(iterable=jobs, unit="job", desc="check", leave=False, delay=2):
         key = tuple(word for word in job if not word.startswith("seed="))
         if key not in known:
             known[key] = _composed(loader, config, job)
@@ -209,12 +212,6 @@ class Jobs:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.arguments = list(sys.argv)  # those of a process of its own are others
-
-    @property
-    def command(self) -> str:
-        """The command that continues the sweep, as a shell reads it."""
-        return command_of(self.arguments, HydraConfig.get().sweep.dir)
 
     def fail(self, error: Exception) -> float:
         """Note that a job failed, and return NaN, its result.

@@ -13,7 +13,7 @@ from coil_rl.config.folder import PREFIX
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
-from coil_rl.output import say
+from coil_rl.output import quietly, say
 from coil_rl.programs import app, folders, imported, sweeps
 
 # What may be given beside resume=FOLDER.
@@ -23,12 +23,19 @@ BESIDE_RESUME = ("trust=", "budget.frames=", "env.workers=", "changed=")
 def train(config: DictConfig) -> float:
     """Do one run and return the mean test reward of its deterministic policy."""
     from coil_rl.config.assemble import run_configured
+    from coil_rl.report.table import return_format
 
     if config.resume is not None:
         raise UserError(
             f"resume={config.resume} belongs on the command line, alone: coil-train resume=FOLDER"
         )
-    return run_configured(config, command=app.command_line())
+    if not sweeps.is_sweep():
+        return run_configured(config, command=app.command_line())
+    with quietly(bars=True):  # the whole text is in the folder of each run
+        reward = run_configured(config, command=app.command_line())
+    shown = format(reward, return_format([reward]))
+    say(f"{config.label}, seed {config.seed}: mean test reward {shown}; see {config.run_dir}")
+    return reward
 
 
 def check(config: DictConfig) -> None:

@@ -37,7 +37,7 @@ def draw_report(
     compared: Mapping[str, Comparison],
     folder: Path,
     strokes: Mapping[str, style.Stroke],
-    suffix: str = "",
+    suffix: str = ".png",
 ) -> list[Figure]:
     """Draw all figures of the runs in one env into a folder, and return them for the HTML page.
 
@@ -45,11 +45,11 @@ def draw_report(
         compared: the policies, by kind of actions.
         folder: where the files are written.
         strokes: by label.
-        suffix: of the names of the files.
+        suffix: of the names of the files, with their format.
     """
 
     def drawn(name: str, title: str, caption: str, draw: Draw) -> Figure:
-        draw(folder / f"{name}{suffix}.png")
+        draw(folder / f"{name}{suffix}")
         return Figure(title, svg(draw), caption)
 
     panels = {}

@@ -72,6 +72,14 @@ class Table:
         """Return the table in Markdown."""
         return markdown_table(self.rows, self.columns)
 
+    def latex(self) -> str:
+        """Return the table as LaTeX, for the package booktabs."""
+        columns = "".join("r" if each else "l" for each in self.numeric or [False])
+        rows = [self.headings, *([cell.text for cell in row] for row in self.cells)]
+        first, *others = (rf"{' & '.join(map(_latex, row))} \\" for row in rows)
+        lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", first, r"\midrule"]
+        return "\n".join([*lines, *others, r"\bottomrule", r"\end{tabular}"])
+
     @property
     def headings(self) -> list[str]:
         """Headings of the columns."""
@@ -180,6 +188,12 @@ def _numeric(values: Sequence[Sequence[object]]) -> list[bool]:
         all(_is_missing(value) or _is_number(value) for value in column)
         for column in zip(*values, strict=True)
     ]
+
+
+def _latex(text: str) -> str:
+    """Return a text as LaTeX shows it."""
+    escaped = re.sub(r"([&%$#_{}])", r"\\\1", text.replace("\\", r"\textbackslash "))
+    return escaped.replace("~", r"\textasciitilde ").replace("^", r"\textasciicircum ")
 
 
 def _escaped(text: str) -> str:

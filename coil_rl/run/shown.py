@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 def line_of(run: Run) -> str:
     """Return what a run is, and how far it is."""
     rows = [row for row in _means(run) if row["driver"] == run.label]
-    state = "finished" if _means(run) else "begun" if is_begun(run.folder) else "new"
+    state = "begun" if is_begun(run.folder) else "new"
+    if _means(run):
+        state = "finished"
     if rows:
         reward = rows[0]["reward"]
         state += f" with return {reward:{return_format([reward])}}"

@@ -79,6 +79,19 @@ def test_logger_that_fails_is_left_out(tmp_path):
     assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 3
 
 
+def test_bars_may_be_shown_where_nothing_is_said(capsys):
+    with quietly(bars=True):
+        say("said")
+        with quietly():
+            progress(total=1).close()
+        assert capsys.readouterr() == ("", "")
+        progress(total=1).close()
+        with quietly(bars=True):
+            say("said")
+    out, error = capsys.readouterr()
+    assert (out, "0/1" in error) == ("", True)
+
+
 def test_nothing_is_shown_quietly(capsys):
     with quietly():
         say("a text")

@@ -308,3 +308,35 @@ class Undeclared(Transform):
 def test_defect_of_a_transform_is_found(make, error, message):
     with pytest.raises(error, match=message):
         check_transform(cones(), make())
+
+
+class RemembersInAnAttribute(Transform):
+    """Writes the observation of the step before, from a plain attribute."""
+
+    def __init__(self):
+        super().__init__(in_keys=["steering"], out_keys=["last"])
+        self.last = None
+
+    def _reset(self, tensordict, reset):
+        self.last = reset["steering"].clone()
+        return reset.set("last", self.last)
+
+    def _step(self, tensordict, after):
+        after.set("last", self.last)
+        self.last = after["steering"].clone()
+        return after
+
+    def transform_observation_spec(self, spec):
+        spec["last"] = spec["steering"].clone()
+        return spec
+
+
+class RemembersInTheData(RemembersInAnAttribute):
+    def _step(self, tensordict, after):
+        return after.set("last", tensordict["steering"])
+
+
+def test_memory_of_a_transform_survives_a_resume():
+    check_transform(cones(), RemembersInTheData())
+    with pytest.raises(ValueError, match=r"InAnAttribute gives another last in step 1 of a res"):
+        check_transform(cones(), RemembersInAnAttribute())

@@ -4,7 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from coil_rl.comparison.arms import ANCHORED, ARMS, PPO, SAC
-from coil_rl.comparison.timing import LEAST_BATCHES, LEAST_FRAMES, Pace, plan
+from coil_rl.comparison.timing import LEAST_BATCHES, LEAST_FRAMES, Clock, Pace, plan
 
 BATCH = 8 * 256
 CONFIG = OmegaConf.create(
@@ -62,3 +62,11 @@ def test_learner_with_replay_has_enough_frames_to_learn_on_a_slow_env():
     pace = Pace(0.01, 0.0, {PPO: 0.01, SAC: 0.013}, 200, 1.0)
     found = plan({PPO: CONFIG, SAC: REPLAY}, pace, [ARMS[PPO], ARMS[SAC]], minutes=2)
     assert found.frames == {PPO: LEAST_BATCHES * BATCH, SAC: 2016}
+
+
+def test_clock_counts_the_processor_and_what_each_piece_waits():
+    busy, waits = Clock(), Clock()
+    busy.laps = [(0.010, 0.001), (0.0010, 0.001), (0.030, 0.004)]  # beside other programs
+    waits.laps = [(0.006, 0.001), (0.020, 0.001)]
+    assert (busy.waiting, busy.seconds) == (0, pytest.approx(0.002))
+    assert (waits.waiting, waits.seconds) == (pytest.approx(0.005), pytest.approx(0.006))

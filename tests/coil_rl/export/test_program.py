@@ -25,7 +25,8 @@ def test_export_prints_what_it_does_and_what_comes_next(exported):
     lines = text.strip().splitlines()
     assert lines[0] == "export: 30 observations of coil in its env ..."
     assert any("the file differs from torch by at most" in line for line in lines)
-    assert f"Next: coil-evaluate {RUN} exported={folder}" == lines[-1]
+    assert f"Next: coil-evaluate {RUN} exported={folder}" in lines[-1]
+    assert lines[-1].endswith(f"{folder}/drive.py, with numpy and onnxruntime alone")
     assert all(line.startswith("export: ") for line in lines[:-1])  # no notes of libraries
 
 

@@ -13,6 +13,8 @@ FILES = {
     "report.png",
     "report_curves.png",
     "report_cases.png",
+    "report_curves.csv",
+    "report.tex",
 }
 
 
@@ -45,8 +47,15 @@ def test_report_prints_the_page_and_writes_its_files_again_and_again(sweep):
     assert out == (sweep / "report.md").read_text() + "report: see sweep\n"
     assert "better than its guide" in out
     assert "6 of 8 runs that were started are finished" in out
-    assert report("folder=sweep") == (code, out, error)
-    assert all_files() == after
+    curves = read_csv(sweep / "report_curves.csv")
+    assert (len(curves), list(curves[0])) == (120, ["env", "label", "seed", "frames", "return"])
+    tables = (sweep / "report.tex").read_text()
+    assert tables.count(r"\bottomrule") == 3
+    assert r"0\% to 71\%" in tables
+    assert report("folder=sweep", "figures=pdf") == (code, out, error)
+    assert {path for path in all_files() - after if path.endswith("pdf")} == {
+        f"sweep/report{kind}.pdf" for kind in ("", "_cases", "_curves")
+    }
 
 
 @pytest.mark.parametrize(
