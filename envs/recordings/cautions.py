@@ -65,8 +65,8 @@ def _about_view(env: "McapReplayEnv", number: int, recording: Recording) -> str:
         rejected = env.perception.rejected(recording.ranges[some], recording.angles(some))
         if rejected > MOST:
             problems.append(
-                f"{rejected:.0%} of the clusters in sight are unlike any cone of the training, "
-                "which coil-reproduce figure=25 makes of your own cones"
+                f"{rejected:.0%} of the clusters in sight are unlike any cone of the training "
+                "(coil-reproduce figure=25 trains a classifier on your cones)"
             )
     return " and ".join(problems)
 

@@ -51,9 +51,10 @@ NOT_ALONE = {
     "entry",
     "exported",
     "learned",
+    "pid",
     "recorded",
     "recording",
-}  # need a package, a class, an entry, a run, a file or recordings
+}  # need a package, a class, an entry, a run, an entry to control, a file or recordings
 WITH_MEMORY = {"authors", "spline_memory"}
 OF_OTHER_ENVS = {
     "bot",

@@ -101,7 +101,7 @@ class Broken(Picture):
 
     watches = True
 
-    def watch(self, env, rows):
+    def watch(self, env, rows, before, after):
         self.seen += 1
         if self.place == "watch":
             raise TypeError("render() returns floats")

@@ -182,7 +182,8 @@ def test_recording_without_boundaries_is_replayed_with_a_warning(tmp_path):
     assert sentence.startswith(
         "replay: room.mcap: no scan shows both boundaries and "
         "100% of the clusters in sight are unlike any cone of the "
-        "training, so the actions mean little; check env.perception, or train the classifier"
+        "training (coil-reproduce figure=25 trains a classifier on your cones), so the actions "
+        "mean little; check env.perception"
     )
     assert (
         f"Warning: {sentence.removeprefix('replay: ')}."
