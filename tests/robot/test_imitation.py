@@ -36,14 +36,14 @@ SHORT = [
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two drives, and a third one in which commands end and the robot stands."""
+    """Three drives, of which the last is one in which commands end and the robot stands."""
     folder = tmp_path_factory.mktemp("drives")
-    files = [folder / "a.mcap", folder / "b.mcap"]
-    record_drives(SimulatedRobotEnv(num_envs=2, time_limit=SCANS / 5.5), SplineGuide(), files)
-    drive = odd.messages_of(files[0])
+    files = [folder / "a.mcap", folder / "b.mcap", folder / "c.mcap"]
+    record_drives(SimulatedRobotEnv(num_envs=3, time_limit=SCANS / 5.5), SplineGuide(), files)
+    drive = odd.messages_of(files[2])
     odd.commands_end_early(drive)  # the twelfth is the last one, and counts for three turns
     drive.commands[3:6] = [(time, odd.twist(0.0, 0.0)) for time, _ in drive.commands[3:6]]
-    odd.write(folder / "c.mcap", drive)
+    odd.write(files[2], drive)
     return folder
 
 
