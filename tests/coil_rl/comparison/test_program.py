@@ -47,7 +47,7 @@ def test_table_has_everything_that_acts(compared):
     assert all(row["seeds"] == "2" for row in judged)
     assert all(float(rows[name]["frames"]) == 0 for name in without)
     assert [float(rows[name]["frames"]) for name in ("ppo", "sac")] == [128, 640]
-    assert float(rows["ppo"]["calls"]) == 0 < float(rows["coil_anchored_sac"]["calls"])
+    assert float(rows["ppo"]["calls"]) == 0 < float(rows["tune"]["calls"])
     assert float(rows["guide"]["worst"]) <= float(rows["guide"]["return"])
 
 
