@@ -130,7 +130,7 @@ def test_every_method_is_exported(method, tmp_path):
     guide, words = tuned.get(method, ("thermostat.control:Feedforward", []))
     run, policy = exported(tmp_path, method, *words, guide=guide)
     # The guides that dynamic COIL learns are networks of the policy itself.
-    without = method in ("ppo", "oil", "dagger") or method.startswith("dynamic_coil")
+    without = method == "ppo" or method.startswith("dynamic_coil")
     assert policy.contract["guide"]["place"] == ("absent" if without else "inside")
     same_actions(run, policy, rooms())
 
