@@ -238,7 +238,9 @@ class Comparison:
         say("coil-compare: timing the env and the guide", error=True)
         with quietly():
             arms = self._able(arms_for(env_maker(config).bare(1, TEST, None), tunes=self.tunes))
-            plain = {arm.name: self._timed(arm) for arm in arms if arm.name in (PPO, SAC)}
+            plain = {PPO: config}
+            if any(arm.learner == SAC for arm in arms):  # whose first update is as long as others
+                plain[SAC] = self._config(SAC, short=["learner.starts=1"])
             pace = timing.measure(plain, self.overhead)
         plan = timing.plan(plain, pace, arms, self.minutes)
         keep_plan(self.folder, identity, plan)
@@ -257,10 +259,6 @@ class Comparison:
             else:
                 able.append(arm)
         return able
-
-    def _timed(self, arm: Arm) -> DictConfig:
-        """Return the configuration of an arm whose first update is as long as others."""
-        return self._config(arm.name, short=["learner.starts=1"] if arm.name == SAC else [])
 
     def _jobs(self, plan: Plan, short: Sequence[str]) -> dict[str, Named]:
         """Return what each training consists of, by its name; each seed of all arms in turn."""

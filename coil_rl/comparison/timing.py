@@ -114,10 +114,11 @@ def measure(plain: Mapping[str, DictConfig], overhead: float) -> Pace:
     """Time a step of the env and of the guide, and batches of training.
 
     Args:
-        plain: configurations of trainings that do not ask the guide, by learner.
+        plain: configurations of trainings that do not ask the guide, by learner; PPO's is among
+            them.
         overhead: seconds to prepare a training.
     """
-    make_env = env_maker(next(iter(plain.values())))
+    make_env = env_maker(plain[PPO])
     with torch.random.fork_rng():
         env, follow = make_env.guided(EPISODES, TEST)
         length = _length(env, follow)
@@ -205,8 +206,7 @@ def plan(
     """
     config = configs[PPO]
     cases = _cases(config, pace, arms, minutes)
-    left = 60 * minutes - _measuring(config, pace, arms, cases)
-    frames, seconds = dict[str, int](), 60 * minutes - left
+    left, frames = 60 * minutes - _measuring(config, pace, arms, cases), dict[str, int]()
     # What those that need little time leave is for the others.
     costs = {
         arm.name: pace.learning.get(arm.learner, pace.step) + pace.guide * arm.asks for arm in arms
@@ -214,10 +214,10 @@ def plan(
     for arm in sorted(arms, key=lambda arm: costs[arm.name]):
         share = max(left, 0.0) / (SEEDS * (len(arms) - len(frames)))
         frames[arm.name] = _frames(configs.get(arm.learner, config), arm, share / costs[arm.name])
-        taken = SEEDS * frames[arm.name] * costs[arm.name]
-        left, seconds = left - taken, seconds + taken
+        left -= SEEDS * frames[arm.name] * costs[arm.name]
     number = cases if isinstance(config.evaluation.cases, int) else None
-    return Plan({arm.name: frames[arm.name] for arm in arms}, number, SEEDS, seconds)
+    in_order = {arm.name: frames[arm.name] for arm in arms}
+    return Plan(in_order, number, SEEDS, 60 * minutes - left)
 
 
 def _frames(config: DictConfig, arm: Arm, affordable: float) -> int:
