@@ -286,6 +286,7 @@ class Held:
         self.numbers: Numbers | None = None  # not seeded yet
         guide.register_forward_pre_hook(self.before)
         guide.register_forward_hook(self.after, always_call=True)
+        # Not the method itself: torch sets an attribute of the hook.
         guide.register_state_dict_post_hook(partial(self.save))
         guide.register_load_state_dict_pre_hook(self.load)
 

@@ -70,14 +70,9 @@ class Film(Picture):
         before: TensorDictBase,
         after: TensorDictBase,
     ) -> None:
-        """Take a frame of each policy if it is time.
+        """Take a frame of each policy if it is time; see `Picture.watch`.
 
-        Args:
-            env: of the evaluation. Its `render(row)` returns a picture [height, width, 3], or None
-                if it cannot.
-            rows: the row in which each policy drives the first case, of those that still drive.
-            before: as of `Picture.watch`.
-            after: as of `Picture.watch`.
+        The env's `render(row)` returns a picture [height, width, 3], or None if it cannot.
         """
         every = self._steps_of_frame(getattr(env, "rate", math.nan))
         for name, row in rows.items():

@@ -66,14 +66,7 @@ class InTime(Picture):
         before: TensorDictBase,
         after: TensorDictBase,
     ) -> None:
-        """Note a step of each policy; see `Picture.watch`.
-
-        Args:
-            env: of the evaluation.
-            rows: the row in which each policy drives the first case, of those that still drive.
-            before: the entries before the step, with the action.
-            after: the entries after it.
-        """
+        """Note a step of each policy; see `Picture.watch`."""
         key = env.action_key
         space = ActionSpace(env.full_action_spec[key], env.batch_dims)
         units = given_units(env)
