@@ -175,7 +175,7 @@ def test_env_agrees_with_the_oracle_over_two_laps(ring: Track) -> None:
 @pytest.mark.parametrize("driver", ["random", "disturbed"])
 def test_env_agrees_with_the_oracle_under_other_steering(preset: str, driver: str) -> None:
     tracks = random_tracks(2, seed=5) * (2 if driver == "random" else 1)
-    trace = drive(tracks, PRESETS[preset], driver, 100, seed=1)
+    trace = drive(tracks, PRESETS[preset], driver, 150, seed=1)
     for car, track in enumerate(tracks):
         assert_agreement(track, PRESETS[preset], column(trace, car))
     assert trace["crashed"].any() or driver == "disturbed"

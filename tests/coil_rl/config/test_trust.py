@@ -295,11 +295,16 @@ GROUPS = (
 )  # of the cone world
 MISSING = ["+track.dir=levels", "+guide.learned.run=other", "+guide.exported.file=a"]
 MISSING += [
+    "+guide.pid.measured=observation",
     "+guide.controller.of=coil_rl.guides:SplineGuide",
     "+guide.recorded.file=a.csv",
     "+guide.entry.key=steering",
 ]
-OF_ENV = {"gym": ["env.id=CartPole-v1"], "torchrl": ["env.of._target_=coil_rl.envs.ConeTrackEnv"]}
+OF_ENV = {
+    "fmu": ["env.file=motor.fmu"],
+    "gym": ["env.id=CartPole-v1"],
+    "torchrl": ["env.of._target_=coil_rl.envs.ConeTrackEnv"],
+}
 
 
 def files(group):
@@ -309,6 +314,7 @@ def files(group):
 @pytest.mark.slow
 def test_every_choice_of_the_configuration_can_be_saved_and_read(tmp_path, monkeypatch):
     monkeypatch.setattr(run_folder, "versions", dict)
+    monkeypatch.setattr(trust, "_packages", frozenset({"coil_fmu"}))  # an FMU is a program
     columns = [[f"{group}={name}" for name in files(group)] for group in GROUPS]
     choices = [[*filter(None, row), *MISSING] for row in zip_longest(*columns)]
     choices += [[f"env={name}", *OF_ENV.get(name, [])] for name in files("env")]
