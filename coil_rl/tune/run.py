@@ -124,9 +124,9 @@ class TunedRun(Run):
             return
         typed = [*self.command] or record.COMMAND.read(self.folder) or ["coil-train"]
         tuned = self.words(values)
-        own = ("method=", "method.run.", "tune=", "tune.", "label=", "run_dir=", "existing=")
-        own += tuple(f"{word.lstrip('+').partition('=')[0]}=" for word in tuned)
-        kept = [word for word in typed if not word.lstrip("+").startswith(own)]
+        own = ["method=", "method.run.", "tune=", "tune.", "label=", "run_dir=", "existing="]
+        own += [f"{word.lstrip('+').partition('=')[0]}=" for word in tuned]
+        kept = [word for word in typed if not word.lstrip("+").startswith(tuple(own))]
         say(f"Next: {shlex.join([*kept, *tuned, 'method=coil_anchored'])}")
 
     def _env_of(self, candidates: Candidates) -> Any:
