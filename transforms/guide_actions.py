@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -28,7 +28,7 @@ from coil_rl.transforms.action_space import (
     space_of,
 )
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
-from coil_rl.transforms.hosted import HostedGuide, ToldGuide
+from coil_rl.transforms.hosted import HostedGuide, ToldGuide, guide_of
 from coil_rl.transforms.link import State
 from coil_rl.transforms.normalised_action import ActionUnits
 
@@ -103,7 +103,7 @@ class Guides(TensorDictModuleBase):
 
     def __init__(
         self,
-        guides: Mapping[str, TensorDictModuleBase],
+        guides: Mapping[str, Any],
         action_key: NestedKey = "action",
         out_key: NestedKey = "guide_action",
         trainable: bool = False,
@@ -113,6 +113,7 @@ class Guides(TensorDictModuleBase):
             raise TypeError(
                 f"guides must be a mapping from name to guide, not {type(guides).__name__}"
             )
+        guides = {name: guide_of(guide) for name, guide in guides.items()}
         if not guides:
             raise ValueError("at least one guide is required, none was given")
         for name, guide in guides.items():
@@ -289,13 +290,14 @@ class GuideCache:
 class GuideActions(ActionTransform):
     """Write the action of each guide into the observation.
 
-    The agent is free to use the advice. A guide is any TensorDictModule that reads observations of
-    the env and writes an action. Guides run in evaluation mode, without gradients, on a copy of the
-    data. If all guides have the attribute `pure = True` (the action is a deterministic function of
-    the guide's input entries of the same row), the advice for the first states of episodes is
-    cached. With discrete actions the advice is one-hot; a guide may write an index, in the
-    numbering of the env, or a one-hot vector. Advice is clamped to the bounds of the action. Guides
-    act in the unit of the env; behind `NormalisedAction` the advice is normalised.
+    The agent is free to use the advice. A guide is a TensorDictModule that reads observations of
+    the env and writes an action, or anything else that `ControllerGuide` takes. Guides run in
+    evaluation mode, without gradients, on a copy of the data. If all guides have the attribute
+    `pure = True` (the action is a deterministic function of the guide's input entries of the same
+    row), the advice for the first states of episodes is cached. With discrete actions the advice is
+    one-hot; a guide may write an index, in the numbering of the env, or a one-hot vector. Advice is
+    clamped to the bounds of the action. Guides act in the unit of the env; behind
+    `NormalisedAction` the advice is normalised.
 
     A guide may have a memory: what it reads as `k` and writes as `("next", k)`, declared by its
     `make_tensordict_primer()`, as TorchRL's `LSTMModule` and `GRUModule` do. It is kept in the data
@@ -328,7 +330,7 @@ class GuideActions(ActionTransform):
 
     def __init__(
         self,
-        guides: Mapping[str, TensorDictModuleBase],
+        guides: Mapping[str, Any],
         action_key: NestedKey = "action",
         out_key: NestedKey = "guide_action",
     ) -> None:
@@ -337,9 +339,9 @@ class GuideActions(ActionTransform):
         super().__init__(in_keys=module.in_keys, out_keys=module.out_keys)
         self.guides, self.action_key = module.eval(), module.action_key
         self.needs_past = bool(self.supplied or module.memories)
-        pure = all(getattr(guide, "pure", False) for guide in guides.values())
+        pure = all(getattr(guide, "pure", False) for guide in module.guides.values())
         self._cache = GuideCache() if pure and not self.needs_past else None
-        if any(map(_is_by_row, guides.values())):
+        if any(map(_is_by_row, module.guides.values())):
             self.passed = (self.out_keys[0],)
         self._checked: set[str] = set()
         self.calls = 0  # number of actions that guides were asked for

@@ -23,7 +23,7 @@ from torch import nn
 from coil_rl.errors import did_you_mean
 from coil_rl.foreign.faults import ForeignError, foreign, shown
 from coil_rl.foreign.guard import NUMBERS, Guard, hold
-from coil_rl.foreign.host import Host, Predictor, called, check_call, role_of
+from coil_rl.foreign.host import Host, Predictor, asks_for_env, called, check_call, role_of
 from coil_rl.foreign.remembered import copied, maker_of_rows, restore, state_of
 from coil_rl.foreign.shared import FunctionGuide, NetworkGuide
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key, written_key
@@ -216,6 +216,11 @@ class ControllerGuide(HostedGuide):
         title = getattr(called(of), "__name__", type(of).__name__)
         if isinstance(of, (str, int, float)):
             title = str(of)
+        if asks_for_env(thing) and "env" not in (options or {}):
+            raise ValueError(
+                f"of={title} asks for its env: let it act beside that, by guide=entry "
+                f"guide.entry.key=[controller,its] +env.controllers.its={title}"
+            )
         keys = None if in_keys is None else [nested_key(key) for key in in_keys]
         make = _of_class if inspect.isclass(called(thing)) else _of_object
         guide = make(thing, title, keys, dict(options or {}))

@@ -71,13 +71,11 @@ class GymnasiumEnv(SeededRows):
         cases: number of different episodes, by default `num_envs`; needs `first_seed`.
         info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], NaN where
             missing.
-        controllers: by name. A class gets one object an env, `THING(env)`, with a method
-            `act(observation)` and, if it wants, `reset()`, called at the start of an episode;
-            without it each episode gets a new object. A function is called as
-            `THING(env, observation)`. Either may be a `functools.partial`. An object with `act`,
-            or a trained model with `predict`, is used as it is. Its action for the present
-            observation is written as ("controller", NAME), not clamped, in the env's own
-            numbering; after a termination it is the last one.
+        controllers: by name: anything that a guide may be, see `ControllerGuide`, or `MODULE:NAME`.
+            Each env has its own, and a class or function with a parameter `env` gets it, as
+            `THING(env)` and `THING(env, observation)`. The action for the present observation is
+            written as ("controller", NAME), not clamped, in the env's own numbering; after a
+            termination it is the last one.
         fresh: whether every episode has a new env, for those whose reset leaves something of the
             past. BipedalWalker is one: without `fresh`, its episodes depend on the seed and, a
             little, on those before.

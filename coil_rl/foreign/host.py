@@ -3,7 +3,6 @@
 What it is is decided here only, see `role_of`.
 """
 
-import copy
 import inspect
 import math
 import sys
@@ -12,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -164,33 +162,14 @@ def _in_space(entry: NDArray[Any], space: Any) -> Any:
     return entry
 
 
-def maker_beside(thing: Any, name: str, env: Any) -> Callable[[], Any]:
-    """Return what makes the object that acts beside an env.
-
-    Args:
-        thing: a class, made as `THING(env)`; a function, called as `THING(env, observation)`; an
-            object with `act`, or a trained model, which do not get the env.
-        env: beside which it acts.
-
-    Raises:
-        ValueError: for a text, and for what cannot act.
-    """
-    if isinstance(thing, str):
-        raise ValueError(
-            f"controller {name}: {thing!r} is a text; write {{_target_: "
-            f"{thing.replace(':', '.')}, _partial_: true}}"
-        )
-    role, is_class = role_of(thing), inspect.isclass(called(thing))
-    if role == "act":
-        return partial(thing, env) if is_class else partial(copy.deepcopy, thing)
-    if role == "predict":
-        return lambda: Predictor(thing(env) if is_class else thing)
-    if role == "function":
-        return partial(SimpleNamespace, act=partial(thing, env))
-    raise ValueError(
-        f"controller {name}: {getattr(called(thing), '__name__', type(thing).__name__)} needs a "
-        "method act(observation)"
-    )
+def asks_for_env(thing: Any) -> bool:
+    """Return whether a class or function, or a partial of one, has a parameter `env`."""
+    if not (inspect.isclass(called(thing)) or role_of(thing) == "function"):
+        return False
+    try:
+        return "env" in inspect.signature(thing).parameters
+    except (TypeError, ValueError):  # some that are written in C have no signature
+        return False
 
 
 class Host:

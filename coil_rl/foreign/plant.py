@@ -19,6 +19,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
+from coil_rl.foreign.beside import maker_beside
 from coil_rl.foreign.codec import Codec
 from coil_rl.foreign.faults import (
     ForeignError,
@@ -30,7 +31,7 @@ from coil_rl.foreign.faults import (
     shown,
 )
 from coil_rl.foreign.guard import Numbers
-from coil_rl.foreign.host import Host, maker_beside
+from coil_rl.foreign.host import Host
 from coil_rl.foreign.limit import limit_of, warn_of_limit
 from coil_rl.foreign.makers import Env
 

@@ -11,8 +11,9 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from coil_rl.foreign.beside import maker_beside
 from coil_rl.foreign.codec import Actions
-from coil_rl.foreign.host import Host, maker_beside
+from coil_rl.foreign.host import Host
 from coil_rl.transforms.action_space import ActionSpace
 
 ADVICE = "guide_action"  # key of the advice in an observation of several entries
@@ -29,10 +30,9 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: the env. Its actions are a Box, Discrete, MultiDiscrete or MultiBinary.
-        controller: whose action is the advice, as in `GymnasiumEnv`: a class, made as
-            `THING(env)`, with `act(observation)` and, if it wants, `reset()`, called at the start
-            of an episode; a function, called as `THING(env, observation)`; an object with `act`,
-            or a trained model with `predict`.
+        controller: whose action is the advice: anything that a guide may be, as for `train`, or a
+            class or function with a parameter `env`, called as `THING(env)` and
+            `THING(env, observation)`.
 
     Attributes:
         advice: the present one, [A], as observed; None before the first reset.
@@ -44,9 +44,7 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
             action of the env.
 
     Example:
-        >>> env = AdviceObservation(
-        ...     gymnasium.make("CartPole-v1"), lambda env, seen: int(seen[2] > 0)
-        ... )
+        >>> env = AdviceObservation(gymnasium.make("CartPole-v1"), lambda seen: int(seen[2] > 0))
         >>> observation, _ = env.reset(seed=0)
         >>> observation.shape, observation[4:].tolist()
         ((6,), [1.0, 0.0])

@@ -160,7 +160,7 @@ def test_memory_of_a_policy_goes_in_and_out(method, tmp_path):
 def test_place_of_a_guide_depends_on_what_it_is(guide, place, reason, tmp_path):
     words, parts = [], {"guide": f"thermostat.control:{guide}"}
     if guide == "KnowsTheDay":
-        words = ["+env.controllers.day={_target_: thermostat.control.KnowsTheDay, _partial_: true}"]
+        words = ["+env.controllers.day=thermostat.control:KnowsTheDay"]
         words += ["guide.entry.key=[controller,day]"]
         parts = {"guide": "entry"}
     _, policy = exported(tmp_path, "coil", *words, **parts)

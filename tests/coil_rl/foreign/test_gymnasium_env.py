@@ -619,7 +619,7 @@ def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
         (
             "CartPole-v1",
             {"controllers": {"pid": "math:PID"}},
-            r"'math:PID' is a text; write {_target_: math.PID, _partial_: true}",
+            "of=math:PID: math has no PID",
         ),
         (
             "CartPole-v1",

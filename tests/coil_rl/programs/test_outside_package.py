@@ -134,7 +134,7 @@ def test_each_kind_of_controller_is_a_guide(guide, at_least, installed, tmp_path
     name = f"thermostat.control:{guide}"
     chosen = ["guide=controller", f"guide.controller.of={name}"]
     if guide == "KnowsTheDay":
-        beside = "{_target_: thermostat.control.KnowsTheDay, _partial_: true}"
+        beside = "thermostat.control:KnowsTheDay"
         chosen = [f"+env.controllers.day={beside}", "guide=entry"]
         chosen += ["guide.entry.key=[controller,day]"]
     called(
