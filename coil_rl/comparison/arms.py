@@ -56,8 +56,8 @@ class Arm:
 
 ARMS = {
     TUNE: Arm(TUNE, ("method=tune",), asks=True, learner=TUNE),
-    PPO: Arm(PPO, ("method=ppo",), asks=False, learner=PPO),
-    ANCHORED: Arm(ANCHORED, ("method=coil_anchored",), asks=True, learner=PPO),
+    PPO: Arm(PPO, ("method=ppo", "learner=ppo"), asks=False, learner=PPO),
+    ANCHORED: Arm(ANCHORED, ("method=coil_anchored", "learner=ppo"), asks=True, learner=PPO),
     SAC: Arm(SAC, ("method=ppo", "learner=sac"), asks=False, learner=SAC),
     ANCHORED_SAC: Arm(
         ANCHORED_SAC, ("method=coil_anchored", "learner=sac"), asks=True, learner=SAC

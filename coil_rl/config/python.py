@@ -19,6 +19,7 @@ from torchrl.envs import EnvBase
 from coil_rl.config.assemble import assemble
 from coil_rl.config.check import check
 from coil_rl.config.compose import compose_train, packages, quoted
+from coil_rl.config.default_learner import default_learner
 from coil_rl.config.folder import PREFIX, make_folder, read_config, run_folder
 from coil_rl.config.given import give, import_path, keep
 from coil_rl.config.schema import method_for
@@ -55,8 +56,9 @@ def train(
             function, a network; the import path "PACKAGE.MODULE:NAME" of one; the name of a file in
             conf/guide, such as "spline"; a `Controller` of another run; or None.
         method: name of a file in conf/method; by default "coil_anchored" with a guide, "ppo"
-            without one.
-        frames: length of the run; by default that of the env's file.
+            without one. In both cases SAC is the learner where actions are numbers, unless
+            `overrides` names one, such as "learner=ppo".
+        frames: length of the run; by default 100,000 of SAC, else those of the env's file.
         seed: of everything.
         folder: for everything that the run writes; by default a new one in outputs/train.
         tune: of method="tune": bounds of numbers of the guide by name, [low, high] or [low, high,
@@ -132,10 +134,13 @@ def prepare(
     """
     folder = Path(folder).absolute()
     given = named(env, guide, str(folder))
-    words = list(given.words)
-    words.append(f"method={method or method_for(guide)}")
-    if frames is not None:
-        words.append(f"budget.frames={frames}")
+    words = [*given.words, *([] if method is None else [f"method={method}"])]
+    words += [] if frames is None else [f"budget.frames={frames}"]
+    words += default_learner(
+        [*words, *overrides], lambda of_env: composed(Named(of_env, given.nodes), folder)
+    )
+    if method is None:
+        words.append(f"method={method_for(guide)}")
     if tune is not None:
         given.nodes["tune"] = tune if isinstance(tune, str) else dict(tune)
     words += [f"seed={seed}", *overrides]

@@ -201,6 +201,7 @@ def run_program(
     config_name: str,
     check: Callable[[DictConfig], None] = check_run,
     config_path: str = "pkg://coil_rl.conf",
+    further: Callable[[list[str]], list[str]] | None = None,
 ) -> None:
     """Run a task as a console program: Hydra composes its configuration, which is checked first.
 
@@ -213,6 +214,7 @@ def run_program(
         config_path: where the YAML file is. One of another package, such as "pkg://my_package.conf",
             finds the files of coil-rl by an entry point, see `coil_rl.config.guest_files`, and
             gets the help and the clean-up of these programs by the schema `ProgramConfig`.
+        further: returns the words that a command line leaves open.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
@@ -236,6 +238,7 @@ def run_program(
 
     with program(config_name, signals):
         sys.argv[1:] = map(spelled, sys.argv[1:])
+        sys.argv += further(sys.argv[1:]) if further else []
         _check_options(config_name)
         try:
             hydra.main(version_base="1.3", config_path=config_path, config_name=config_name)(

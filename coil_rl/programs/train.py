@@ -9,6 +9,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from coil_rl.config.default_learner import default_learner
 from coil_rl.config.folder import PREFIX
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import trust_packages
@@ -152,7 +153,7 @@ def main() -> None:
     arguments = sys.argv[1:]
     resumed = next((argument for argument in arguments if argument.startswith("resume=")), None)
     if resumed is None:
-        app.run_program(train, "train", check)
+        app.run_program(train, "train", check, further=default_learner)
         return
     with app.program("train"):
         resume_from_command_line(resumed, [each for each in arguments if each != resumed])

@@ -22,8 +22,8 @@ ENV = "thermostat:Room-v0"
 SMALL = ["budget.num_envs=2", "budget.steps=16", "learner.minibatches=2", "logger=none"]
 SMALL += ["evaluation.cases=2", "evaluation.curve.num_envs=2", "evaluation.curve.points=2"]
 SMALL += ["checkpoint_every=1", "evaluation.gif=false"]
-SHORT = [*SMALL, "env.max_steps=20"]
-OF_A_LEARNER = ("budget.", "learner.", "checkpoint_every=")
+SHORT = [*SMALL, "env.max_steps=20", "learner=ppo"]
+OF_A_LEARNER = ("budget.", "learner", "checkpoint_every=")
 
 
 @pytest.fixture(autouse=True)

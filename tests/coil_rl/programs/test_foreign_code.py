@@ -108,6 +108,7 @@ TINY = [
     "evaluation.cases=2",
     "evaluation.curve.num_envs=2",
     "evaluation.curve.points=1",
+    "learner=ppo",
     "learner.minibatches=2",
     "logger=none",
     "hydra.run.dir=run",

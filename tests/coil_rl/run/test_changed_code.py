@@ -30,6 +30,7 @@ class Tank(gymnasium.Env):
         return np.array([self.level], np.float32), -cost(self.level), False, self.time >= 8, {}
 """
 TINY = [
+    "learner=ppo",
     "learner.minibatches=1",
     "budget.num_envs=2",
     "budget.steps=8",

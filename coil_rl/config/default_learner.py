@@ -1,0 +1,56 @@
+"""The learner of a command that names none, in an env of somebody else.
+
+SAC needs far fewer frames where actions are numbers (docs/learners.md), and cannot learn choices.
+Hydra composes the learner before the env exists. So the env is made once before, and the choice
+becomes words of the command, which the folder of the run keeps.
+"""
+
+from collections.abc import Callable, Iterable
+from contextlib import closing, suppress
+
+from omegaconf import DictConfig
+
+from coil_rl.config.compose import compose_train, key_of
+from coil_rl.output import say
+
+ANY_ENV = ("fmu", "gym", "torchrl")  # files of conf/env that stand for any env
+FRAMES = 100_000  # in which SAC takes about as long as PPO with the frames of train.yaml
+
+
+def default_learner(
+    words: Iterable[str], compose: Callable[[list[str]], DictConfig] = compose_train
+) -> list[str]:
+    """Return the words that choose SAC where a command leaves it open and it can learn, else none.
+
+    A learner, a network, an experiment, a policy to begin with and a method are a choice, but for
+    `coil_anchored`, which is the default method with a guide.
+
+    An env that cannot be made gives none: the run says what is wrong with it.
+
+    Args:
+        words: of the command line.
+        compose: returns the configuration for those of the env.
+    """
+    given = {key_of(word): word for word in words}
+    kind, method = (given.get(key, "").partition("=")[2] for key in ("env", "method"))
+    chosen = given.keys() & {"experiment", "init", "learner", "network", "resume"}
+    if kind not in ANY_ENV or chosen or method not in ("", "coil_anchored"):
+        return []
+    of_env = [word for key, word in given.items() if key.startswith(("env", "hydra.searchpath"))]
+    with suppress(Exception):
+        if _acts_in_numbers(compose(of_env)):
+            say("learner=sac, because actions are numbers (for PPO write learner=ppo)")
+            frames = [] if "budget.frames" in given else [f"budget.frames={FRAMES}"]
+            return ["learner=sac", *frames]
+    return []
+
+
+def _acts_in_numbers(config: DictConfig) -> bool:
+    """Return whether SAC can learn in the env of a configuration."""
+    from coil_rl.config.parts import build_bare_env  # imports torch
+    from coil_rl.learners.off_policy import check_replay
+
+    few = {"num_envs": 1} | ({"workers": 0} if "workers" in config.env else {})
+    with closing(build_bare_env(config, few)) as env:
+        check_replay(env, "SAC")
+        return env.action_spec.dtype.is_floating_point
