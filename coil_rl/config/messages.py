@@ -244,9 +244,9 @@ def _unknown_key(error: OmegaConfBaseException, typed: re.Match[str] | None) -> 
 
 def _wrong_value(error: OmegaConfBaseException, key: str) -> str:
     """Return the message for the value of a key that is missing or cannot be used."""
-    missing = LACKED.search(str(error))
-    if missing is not None:
-        key = key if isinstance(error, MissingMandatoryValue) else missing[1]
+    lacked = LACKED.search(str(error))
+    if lacked is not None:
+        key = key if isinstance(error, MissingMandatoryValue) else lacked[1]
         return f"{key} must be given: write {key}=VALUE{_own_file(error, key)}"
     if isinstance(error, InterpolationKeyError):
         missing, group = str(error).split("'")[1], key.partition(".")[0]
