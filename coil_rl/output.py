@@ -15,6 +15,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from coil_rl.errors import NO_SPACE
+
 
 class SafeStream:
     """A stream that is written to as long as it can be.
@@ -24,10 +26,12 @@ class SafeStream:
 
     Attributes:
         broken: whether it could not be written to.
+        full: the error of a full disk, on which a text was lost.
     """
 
     def __init__(self, stream: Any) -> None:
         self.stream, self.broken = stream, stream is None
+        self.full: OSError | None = None
 
     def write(self, text: str) -> int:
         """Write a text, unless the stream is broken; return its length."""
@@ -47,8 +51,10 @@ class SafeStream:
             return None
         try:
             return getattr(self.stream, name)(*arguments)
-        except (OSError, ValueError):  # a ValueError for a closed file
+        except (OSError, ValueError) as error:  # a ValueError for a closed file
             self.broken = True
+            if isinstance(error, OSError) and error.errno in NO_SPACE:
+                self.full = error
             return None
 
     def __getattr__(self, name: str) -> Any:

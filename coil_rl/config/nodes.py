@@ -19,7 +19,7 @@ from pydantic_core import SchemaError
 from torchrl.envs import Transform
 
 from coil_rl.config.messages import similar
-from coil_rl.errors import UserError, lacks_memory
+from coil_rl.errors import UserError
 from coil_rl.ranges import adapter, settings_of, validation_message, yaml_text
 
 # Largest numbers of arguments of other libraries, by class: memory grows with them, and the
@@ -54,8 +54,6 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
         built = hydra.utils.instantiate({**node, "_convert_": "all"}, **arguments)
     except hydra.errors.InstantiationException as error:
         cause = error.__cause__
-        if lacks_memory(cause):
-            raise UserError(f"{name}: there is not enough memory; make it smaller") from error
         if isinstance(cause, (UserError, ValueError, KeyError, TypeError, AttributeError, OSError)):
             message = cause.args[0] if isinstance(cause, KeyError) and cause.args else cause
             raise UserError(

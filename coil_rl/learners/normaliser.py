@@ -23,8 +23,8 @@ from coil_rl.output import say
 from coil_rl.transforms.guide_actions import GuideActions
 
 LIMIT = 10.0  # of a normalised number: an outlier must not become a huge input
-# An element is out of scale if its deviation is not between these two, or its mean is more than
-# that many deviations from 0; one that never changed is, beyond that number.
+# An element is out of scale if its deviation is below the first, its size above the second, or
+# its mean more than that many deviations from 0; one that never changed is, beyond that number.
 SMALL, LARGE, FAR = 0.1, 10.0, 3.0
 ROUNDING = 1e-7  # of the size of an element: smaller deviations are that of float32
 TINIEST = 1e-60  # variance of an element that was always 0, in any unit
@@ -151,13 +151,13 @@ class Moments(nn.Module):
     def out_of_scale(self) -> Tensor:
         """Whether each element is out of scale for a network.
 
-        It is with a deviation below SMALL or above LARGE, or a mean of more than FAR deviations; if
-        it never changed, with a mean beyond FAR.
+        It is with a deviation below SMALL, a size above LARGE, or a mean of more than FAR
+        deviations; if it never changed, with a mean beyond FAR.
         """
         sizes, deviations = self.mean.abs(), self.variance.sqrt()
         constant = deviations <= 1e-6 * sizes
         far = sizes > FAR * torch.where(constant, 1.0, deviations)
-        return far | (~constant & ((deviations < SMALL) | (deviations > LARGE)))
+        return far | (~constant & ((deviations < SMALL) | (self.size > LARGE)))
 
     def described(self, chosen: Tensor) -> list[str]:
         """Return index, mean and deviation of some elements as texts; of many the first ones.
@@ -282,10 +282,11 @@ class RawObservations:
             if found := moments.described(moments.size > LARGE):
                 del self.used[key]
                 remedy = f"use learner.normalise={'auto or true' if used is None else 'true'}"
+                now = "is" if used is None else "is by now"
                 if key in self.images:
                     remedy = "a picture of 0 to 255 needs a space of uint8, or a division by 255"
                 warnings.warn(
-                    f"{_name(key)} is observed as it is, but is far out of scale for a network: "
+                    f"{_name(key)} is observed as it is, but {now} far out of scale for a network: "
                     f"{', '.join(found)}; {remedy}",
                     stacklevel=2,
                 )

@@ -323,9 +323,15 @@ def program(name: str, signals: Signals | None = None) -> Iterator[None]:
     _draw_into_files()
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.formatwarning = lambda message, *_, **__: f"{name}: {message}\n"
-    sys.stdout, sys.stderr = SafeStream(sys.stdout), SafeStream(sys.stderr)
+    out = SafeStream(sys.stdout)
+    sys.stdout, sys.stderr = out, SafeStream(sys.stderr)
     try:
         yield
+        _check_written(name, out)
+    except SystemExit as end:  # such as after a help text
+        if not end.code:
+            _check_written(name, out)
+        raise
     except (Exception, KeyboardInterrupt) as error:
         # A library may raise an error of its own on the way out of an interrupt.
         if signals.received or isinstance(error, KeyboardInterrupt):
@@ -341,6 +347,13 @@ def program(name: str, signals: Signals | None = None) -> Iterator[None]:
         refuse(name, error)
     finally:
         sys.stdout, sys.stderr = _end(sys.stdout), _end(sys.stderr)
+
+
+def _check_written(name: str, out: SafeStream) -> None:
+    """End the program with an error code if its text met a full disk."""
+    out.flush()
+    if out.full is not None:
+        refuse(name, out.full)
 
 
 def _end(stream: Any) -> Any:

@@ -21,7 +21,7 @@ from torchrl.envs import (
     VecNormV2,
 )
 
-from coil_rl.errors import UserError, lacks_memory
+from coil_rl.errors import UserError
 from coil_rl.foreign.batch import SeededRows
 from coil_rl.foreign.limit import limits_of
 from coil_rl.foreign.trial import PATIENCE, Trial
@@ -213,8 +213,4 @@ def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> Env
         env.observation_spec  # noqa: B018  transforms check the specs when these are computed
     except (KeyError, ValueError) as error:
         raise UserError(f"{name}: {error.args[0]}") from error
-    except (MemoryError, RuntimeError) as error:
-        if not lacks_memory(error):
-            raise
-        raise UserError(f"{name}: there is not enough memory; make it smaller") from error
     return env

@@ -123,9 +123,11 @@ class TunedRun(Run):
             say(f"Next: coil_rl.train(env, guide=functools.partial(GUIDE, {numbers}))")
             return
         typed = [*self.command] or record.COMMAND.read(self.folder) or ["coil-train"]
-        own = ("method=", "method.run.", "tune=", "tune.", "label=", "run_dir=", "existing=")
-        kept = [word for word in typed if not word.lstrip("+").startswith(own)]
-        say(f"Next: {shlex.join([*kept, *self.words(values), 'method=coil_anchored'])}")
+        tuned = self.words(values)
+        own = ["method=", "method.run.", "tune=", "tune.", "label=", "run_dir=", "existing="]
+        own += [f"{word.lstrip('+').partition('=')[0]}=" for word in tuned]
+        kept = [word for word in typed if not word.lstrip("+").startswith(tuple(own))]
+        say(f"Next: {shlex.join([*kept, *tuned, 'method=coil_anchored'])}")
 
     def _env_of(self, candidates: Candidates) -> Any:
         """Return what makes the env in which candidates act."""

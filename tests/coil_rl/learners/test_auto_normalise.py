@@ -124,6 +124,12 @@ def test_raw_observations_far_out_of_scale_are_named(tmp_path):
         learned(PHYSICAL, tmp_path / "run", *ON_POLICY, "learner.normalise=false")
 
 
+def test_an_entry_is_never_in_scale_and_far_out_of_scale_in_one_batch():
+    moments = Moments(torch.Size([1]), automatic=True)
+    moments.add(9.0 + 8.0 * torch.tensor([[-1.0], [1.0]]))  # its size is above 10
+    assert moments.out_of_scale.item()
+
+
 @pytest.mark.parametrize(
     ("space", "message"),
     [

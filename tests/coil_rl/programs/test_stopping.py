@@ -1,16 +1,20 @@
 """Signals, closed streams and failing jobs: what was learned is kept, and the others go on."""
 
+import io
+import os
 import re
 import shlex
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from functools import partial
 
 import pytest
 from programs import TINY, called, command, environment, program
 
+from coil_rl.programs import app
 from coil_rl.programs.sweeps import Jobs
 from coil_rl.run import checkpoint, stopping
 from coil_rl.run.folder import is_evaluated, locked
@@ -82,9 +86,19 @@ def test_closed_or_full_streams_do_not_end_a_training(tmp_path, streams):
     done = subprocess.run(
         f"{arguments} {streams}", shell=True, cwd=tmp_path, env=environment(tmp_path), check=False
     )
-    assert done.returncode == 0
+    assert done.returncode == (2 if ">/dev/full" in streams else 0)  # a text was lost
     assert is_evaluated(tmp_path / "run")
     assert (tmp_path / "run" / "checkpoint.pt").exists()
+
+
+def test_text_that_meets_a_full_disk_ends_a_program_with_an_error(monkeypatch, capsys):
+    full = io.StringIO()
+    monkeypatch.setattr(full, "flush", lambda: os.write(os.open("/dev/full", os.O_WRONLY), b"."))
+    monkeypatch.setattr(sys, "stdout", full)
+    with pytest.raises(SystemExit) as end, app.program("info"):
+        print("a line")
+    assert end.value.code == 2
+    assert capsys.readouterr().err.startswith("info: the output cannot be used (No space left")
 
 
 SWEEP = ["-m", *SMALL, "learner.gamma=7,0.9", "hydra.sweep.dir=sweep"]

@@ -1,6 +1,7 @@
 """Sentences of a run that tunes its guide."""
 
 import json
+import shlex
 
 import pytest
 from hydra import compose, initialize_config_module
@@ -8,7 +9,7 @@ from hydra import compose, initialize_config_module
 from coil_rl import UserError, extras
 from coil_rl.record import DELIVERY
 from coil_rl.tune import Tuning
-from coil_rl.tune.run import beyond_budget
+from coil_rl.tune.run import TunedRun, beyond_budget
 
 
 def test_search_beyond_its_budget_is_said_from_a_file_that_may_be_missing(tmp_path):
@@ -25,3 +26,21 @@ def test_missing_extra_is_named(monkeypatch):
         config = compose("train", ["method=tune", "env=pendulum", "run_dir=unused"])
     with pytest.raises(UserError, match=r"method=tune needs cmaes: .* 'coil-rl\[tune\]'"):
         Tuning().check(config)
+
+
+def test_next_command_names_each_number_of_the_guide_once(tmp_path, capsys):
+    words = ["env=pendulum", "guide.swing_up.gain=2", "++guide.swing_up.other=1", "seed=3"]
+    run = TunedRun.__new__(TunedRun)
+    run.folder, run.in_python, run.numbers = tmp_path, False, ()
+    run.command = ["coil-train", "method=tune", "tune={gain: [1, 4]}", *words]
+    run.words = lambda values: ["++guide.swing_up.gain=3.5"]
+    run._say_next()
+    said = shlex.split(capsys.readouterr().out)
+    kept = [word for word in words if "gain" not in word]
+    assert said == [
+        "Next:",
+        "coil-train",
+        *kept,
+        "++guide.swing_up.gain=3.5",
+        "method=coil_anchored",
+    ]
