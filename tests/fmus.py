@@ -110,9 +110,13 @@ def edited(
     return out
 
 
-def motor() -> Path:
-    """Return a motor: voltage in, speed and current out, an inertia; without FMU state."""
-    return built(MOTOR, "motor")
+def motor(*, state: bool = False) -> Path:
+    """Return a motor: voltage in, speed and current out, an inertia; with FMU state or without."""
+    return (
+        built(MOTOR, "motor_state", (("canGetAndSetFMUstate", True),))
+        if state
+        else built(MOTOR, "motor")
+    )
 
 
 def tank() -> Path:

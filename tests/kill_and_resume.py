@@ -3,8 +3,8 @@
     python tests/kill_and_resume.py --kills 20 [--seed 0] [--folder FOLDER] [OVERRIDES of coil-train
     ...]
 
-Every second kill hits a checkpoint or policy while it is written, and every second run is killed
-twice.
+Another env than the cones is named by `env=NAME`. Every second kill hits a checkpoint or policy
+while it is written, and every second run is killed twice.
 """
 
 from __future__ import annotations
@@ -35,15 +35,17 @@ SMALL = [
     "budget.frames=10240",
     "budget.num_envs=32",
     "budget.steps=16",
+    "evaluation.repeats=2",
+    "evaluation.gif=false",
+    "learner.epochs=2",
+    "checkpoint_every=1",
+]
+CONES = [
     "track=generated",
     "track.train.count=1",
     "track.test.count=1",
     "env.laps=1",
     "env.time_limit=2",
-    "evaluation.repeats=2",
-    "evaluation.gif=false",
-    "learner.epochs=2",
-    "checkpoint_every=1",
 ]
 MILESTONES = [
     "config.yaml",
@@ -61,7 +63,11 @@ TIMEOUT = 600  # s
 def start(folder: Path, overrides: list[str], **options: Any) -> subprocess.Popen[bytes]:
     """Start a process that begins the run in the folder or resumes it, with options of `Popen`."""
     begun = (folder / "config.yaml").exists()
-    arguments = [f"resume={folder}"] if begun else [*SMALL, *overrides, f"hydra.run.dir={folder}"]
+    if begun:
+        arguments = [f"resume={folder}", *(word for word in overrides if word.startswith("trust="))]
+    else:
+        other = any(word.startswith("env=") for word in overrides)
+        arguments = [*SMALL, *([] if other else CONES), *overrides, f"hydra.run.dir={folder}"]
     env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     with (folder.parent / f"{folder.name}.log").open("ab") as log:
         command = [sys.executable, "-m", "coil_rl.programs.train", *arguments]

@@ -1,11 +1,36 @@
+import fmus
 import full_disk
 import kill_and_resume
 import pytest
+
+FMU = [
+    "env=fmu",
+    "env.step=0.01",
+    "env.seconds=0.5",
+    "env.workers=0",
+    "env.setpoints={speed: {low: 50, high: 150, every: 0.1}}",
+    "env.parameters={inertia: {low: 0.008, high: 0.012}}",
+    "method=ppo",
+    "budget.num_envs=4",
+    "budget.frames=3200",
+    "evaluation.cases=4",
+    "evaluation.curve.num_envs=2",
+    "trust=[coil_fmu]",
+]
 
 
 @pytest.mark.slow
 def test_killed_and_resumed_runs_end_like_an_uninterrupted_one(tmp_path):
     assert kill_and_resume.main(["--kills", "3", "--folder", str(tmp_path)]) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("state", [False, True], ids=["no FMU state", "FMU state"])
+def test_killed_and_resumed_runs_of_an_fmu_end_like_an_uninterrupted_one(state, tmp_path):
+    # Both repeat their episodes; one of them could also save its state.
+    file = fmus.motor(state=state)
+    words = [*FMU, f"env.file={file}"]
+    assert kill_and_resume.main(["--kills", "2", "--folder", str(tmp_path), *words]) == 0
 
 
 @pytest.mark.slow
