@@ -192,8 +192,8 @@ def measure_command(args: Namespace) -> list[Row]:
             (run,) = read_runs([Path(folder)])
         found, training = learning(run), run.seconds or math.nan
         times = {"whole command (s)": seconds, "training (s)": training}
-        times["to the guide's level (s)"] = found["until_100"] / found["frames"] * training
-        rows.append({"time": name, **times, "frames to the guide's level": found["until_100"]})
+        times["to the guide's level (s)"] = found["until_guide"] / found["frames"] * training
+        rows.append({"time": name, **times, "frames to the guide's level": found["until_guide"]})
     return rows
 
 

@@ -19,7 +19,7 @@ from coil_rl.run.reasons import POLICIES, still_rising
 from coil_rl.tune.run import TUNED
 
 FEW = 4  # cases of a start test, below which only a very large difference is certain
-NOT_JUDGED = "not judged: too few cases for the start test"
+NOT_JUDGED = "not judged: the start test had too few cases, of which a whole training has more"
 
 
 @dataclass(frozen=True)

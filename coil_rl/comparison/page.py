@@ -10,7 +10,7 @@ import numpy as np
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
-from coil_rl.comparison.arms import ANCHORED, ARMS, GUIDE, RANDOM, TUNE
+from coil_rl.comparison.arms import ARMS, GUIDE, RANDOM, TUNE
 from coil_rl.comparison.entry import Entry, difference
 from coil_rl.comparison.outcome import Outcome, few_cases
 from coil_rl.comparison.sentences import COMPARE
@@ -18,7 +18,6 @@ from coil_rl.comparison.verdict import Verdict
 from coil_rl.config.compose import key_of
 from coil_rl.config.python import Named
 from coil_rl.report import draw_learning_curves, markdown_table
-from coil_rl.report.runs import Run
 from coil_rl.report.table import AUTO_FORMAT, return_format
 
 ROOM = 0.1  # of the scale, below the guide in the picture
@@ -53,7 +52,7 @@ def page_of(
         markdown_table(outcome.rows, columns),
     ]
     about = COMPARE.said("about_table", measured=measured)
-    for each in [*about, *start_tests(outcome.runs.get(ANCHORED, ())), *delayed]:
+    for each in [*about, *delayed]:
         parts += ["", each]
     if command:
         lead = "Train it to the end"
@@ -61,12 +60,6 @@ def page_of(
             lead = "To see whether a whole training changes that"
         parts += ["", f"{lead}: {command}"]
     return "\n".join(parts)
-
-
-def start_tests(runs: Sequence[Run]) -> list[str]:
-    """Return the sentence about start tests that held no guide after few cases; none for others."""
-    few = [cases for cases in map(few_cases, runs) if cases]
-    return COMPARE.said("few_cases", arm=ANCHORED, cases=few, runs=len(runs))
 
 
 def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> list[str]:

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import (
     ConfigCompositionException,
     MissingConfigException,
@@ -23,6 +24,7 @@ from omegaconf.errors import (
 from yaml.error import MarkedYAMLError
 
 from coil_rl import conf
+from coil_rl.config import schema
 from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean, is_outside, lacks_memory
 from coil_rl.plain_yaml import entries
 from coil_rl.run.folder import is_begun
@@ -38,6 +40,7 @@ LAUNCHERS = {
 
 TYPED = re.compile(r"Could not override '([^']+)'")
 MERGED = re.compile(r"Error merging override (.+)")
+LACKED = re.compile(r"Missing mandatory value: ([\w.]+)")
 AMBIGUOUS = "Ambiguous value for argument"
 NO_CHOICE = "Config group override must be a string or a list"
 NO_INTEGER = re.compile(
@@ -222,6 +225,11 @@ def _unknown_key(error: OmegaConfBaseException, typed: re.Match[str] | None) -> 
     names = parent if isinstance(parent, DictConfig) else []
     known = [str(name) for name in names if name not in ("hydra", "defaults")]
     node = key.rpartition(".")[0] or "the configuration"
+    swept = [word for word in sys.argv if word.startswith(f"{key.partition('.')[0]}=")]
+    if any(
+        "," in word for word in swept
+    ):  # Hydra composes a sweep without the files that it sweeps
+        return f"there is no key {key} before {swept[0]} is chosen; write {key}=choice(VALUE)"
     other_file = unchosen(key, typed[1] if typed else key)
     if other_file:
         return f"there is no key {key}{other_file}"
@@ -236,8 +244,10 @@ def _unknown_key(error: OmegaConfBaseException, typed: re.Match[str] | None) -> 
 
 def _wrong_value(error: OmegaConfBaseException, key: str) -> str:
     """Return the message for the value of a key that is missing or cannot be used."""
-    if isinstance(error, MissingMandatoryValue):
-        return f"{key} must be given: write {key}=VALUE"
+    lacked = LACKED.search(str(error))
+    if lacked is not None:
+        key = key if isinstance(error, MissingMandatoryValue) else lacked[1]
+        return f"{key} must be given: write {key}=VALUE{_own_file(error, key)}"
     if isinstance(error, InterpolationKeyError):
         missing, group = str(error).split("'")[1], key.partition(".")[0]
         return (
@@ -245,6 +255,18 @@ def _wrong_value(error: OmegaConfBaseException, key: str) -> str:
             f"choose another {group}, or give {key}=VALUE"
         )
     return f"{key}: {_first_paragraph(error)}"
+
+
+def _own_file(error: OmegaConfBaseException, key: str) -> str:
+    """Return `, or KEY into FILE` for a key of a file of the user; else an empty string."""
+    group, _, last = key.rpartition(".")
+    root: Any = HydraConfig.instance().cfg  # none before the folder of a run has its name
+    if root is None and error.parent_node is not None:
+        root = error.parent_node._get_root()
+    name = OmegaConf.select(root, f"hydra.runtime.choices.{group}") if root and group else None
+    if name is None or Path(conf.__file__).with_name(group).joinpath(f"{name}.yaml").is_file():
+        return ""
+    return f", or {last} into {group}/{name}.yaml"
 
 
 def _first_paragraph(error: BaseException) -> str:
@@ -322,15 +344,26 @@ def choice(group: str, name: str, options: Iterable[str]) -> str:
 
 
 def file_without_package(message: str) -> str:
-    """Return the sentence for a YAML file that lacks its package line, or an empty string.
+    """Return the sentence for a YAML file whose keys do not fit, or an empty string.
+
+    Without its package line Hydra puts the nodes of the root into that of its group.
 
     Args:
         message: of Hydra, for a file whose keys do not fit.
     """
+    chosen = re.search(r"In '([\w/]+)': Could not override '\w+@\w+\.", message)
+    if chosen is not None:
+        return f"{chosen[1]}.yaml: begin the file with the line # @package _global_"
     found = re.search(r"In '([\w/]+)/([^'/]+)'.*Key '(\w+)' not in '(\w+)'", message, re.DOTALL)
     if found is None:
         return ""
-    group, name, key, _ = found.groups()
+    group, name, key, kind = found.groups()
+    if key not in schema.TrainConfig.__dataclass_fields__:
+        known = list(vars(schema)[kind].__dataclass_fields__)
+        return (
+            f"{group}/{name}.yaml: {group} has no key {key}; it has {', '.join(known)}"
+            f"{did_you_mean(key, known)}"
+        )
     return (
         f"{group}/{name}.yaml: Hydra puts its keys under {group}, which has no key {key}; begin "
         "the file with the line # @package _global_"

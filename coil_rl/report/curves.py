@@ -308,8 +308,8 @@ def learning(run: Run) -> dict[str, float]:
 
     These are the `frames` of the run; the return of the `first`, the `final` and the `best` policy,
     which is chosen in other cases, if there are any, with the frames `best_at`; the mean of the
-    curve (`area`, under the curve divided by the frames); the return of the best `guide`; and the
-    frames `until_90` and `until_100` percent of that.
+    curve (`area`, under the curve divided by the frames); the return of the best `guide`, and the
+    frames `until_guide`, its level.
 
     Args:
         run: with or without a curve.
@@ -318,7 +318,7 @@ def learning(run: Run) -> dict[str, float]:
     guide = max(run.guide_returns.values(), default=math.nan)
     frames = run.curve[-1]["frames"] if run.curve else math.nan
     if not len(curve):
-        unknown = ("first", "best", "best_at", "final", "area", "until_90", "until_100")
+        unknown = ("first", "best", "best_at", "final", "area", "until_guide")
         return {"frames": frames, "guide": guide} | dict.fromkeys(unknown, math.nan)
     at, values = curve.T
     best, best_at = math.nan, math.nan
@@ -333,8 +333,7 @@ def learning(run: Run) -> dict[str, float]:
         "best": best,
         "best_at": best_at,
         "area": np.trapezoid(values, at) / (at[-1] - at[0]) if len(at) > 1 else values[0],
-        "until_90": frames_until(at, values, 0.9 * guide) if guide > 0 else math.nan,
-        "until_100": frames_until(at, values, guide),
+        "until_guide": frames_until(at, values, guide),
     }
 
 

@@ -129,9 +129,8 @@ def training(runs: Sequence[Run]) -> list[Table]:
         row["label"], row["seeds"] = label, len(of_label)
         seconds = [run.seconds for run in of_label if run.seconds is not None]
         row["seconds"] = _mean_of_some(seconds, len(of_label), ".0f")
-        for key in ("until_90", "until_100"):
-            reached = [seed[key] for seed in numbers if not math.isnan(seed[key])]
-            row[f"{key} cell"] = _mean_of_some(reached, len(of_label), ",.0f")
+        reached = [seed["until_guide"] for seed in numbers if not math.isnan(seed["until_guide"])]
+        row["until_guide cell"] = _mean_of_some(reached, len(of_label), ",.0f")
         if not math.isnan(row["area"]):
             rows.append(row)
     rows.sort(key=lambda row: -float(row["area"]))

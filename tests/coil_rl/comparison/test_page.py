@@ -1,17 +1,15 @@
 """The page of a comparison: its sentences, and the command to go on with."""
 
 import shlex
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from coil_rl.comparison.entry import Entry
-from coil_rl.comparison.page import command_of, delayed_sentence, lowest_shown, start_tests
+from coil_rl.comparison.page import command_of, delayed_sentence, lowest_shown
 from coil_rl.comparison.verdict import Verdict
 from coil_rl.config.compose import compose_train
 from coil_rl.config.python import Named
-from coil_rl.report.runs import Run
 
 
 def entry(mean):
@@ -46,21 +44,6 @@ def test_printed_command_has_the_values_of_the_comparison(word):
     expected = compose_train([*words, *place]).env.options.mode
     found = compose_train([*printed, "run_dir=unused"]).env.options.mode
     assert (type(found), found) == (type(expected), expected)
-
-
-def anchored(seed, **first):
-    curve = ({"frames": 400.0} | {f"start/{name}": value for name, value in first.items()},)
-    return Run(Path("run"), "coil_anchored", seed, needs_guide=True, settings={}, curve=curve)
-
-
-def test_start_test_of_few_cases_that_held_no_guide_is_said():
-    weak = anchored(0, cases=2.0, weight=0.0)
-    strong = anchored(1, cases=2.0, weight=1.0), anchored(2, cases=4.0, weight=0.0), anchored(3)
-    assert start_tests(strong) == start_tests(()) == []
-    (sentence,) = start_tests((*strong, weak))
-    assert (
-        "had only 2 cases in the frames of a training here, and held none in 1 of 4 s" in sentence
-    )
 
 
 def test_picture_is_about_the_guide_and_what_is_better():
