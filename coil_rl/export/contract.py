@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import read_file, read_text
@@ -111,6 +111,14 @@ class _State(BaseModel):
     shape: Shape
     dtype: NumberType
     first: float | list[Any]
+
+    @model_validator(mode="after")
+    def _begins(self) -> _State:
+        first = np.asarray(self.first, float)
+        np.broadcast_to(first, self.shape)
+        if not np.isfinite(first).all():
+            raise ValueError("first must be finite numbers")
+        return self
 
 
 class _Space(BaseModel):

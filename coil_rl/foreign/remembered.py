@@ -8,13 +8,12 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 # Key of a saved state with the attributes of a network and its parts that torch does not save.
 PLAIN = "plain attributes"
 OF_TORCH = frozenset(vars(nn.Module()))
 UNSAVED = (pickle.PickleError, TypeError, AttributeError, RuntimeError)
-SAVED = (type(None), bool, int, float, str, Tensor)  # a checkpoint can hold them
 
 
 def maker_of_rows(thing: Any) -> partial[Any]:
@@ -84,8 +83,6 @@ def copied(value: Any) -> Any:
 
 def _can_be_saved(value: Any) -> bool:
     """Return whether a checkpoint can hold a value."""
-    if type(value) in SAVED:
-        return True
     try:
         copied(value)
     except UNSAVED:
@@ -95,7 +92,12 @@ def _can_be_saved(value: Any) -> bool:
 
 def _is_same(value: Any, other: Any) -> bool:
     """Return whether two values are one, or have the same content."""
+    return value is other or pickled(value) == pickled(other) != b""
+
+
+def pickled(value: Any) -> bytes:
+    """Return the content of a value; empty for what cannot be pickled."""
     try:
-        return value is other or pickle.dumps(value) == pickle.dumps(other)
-    except UNSAVED:
-        return False
+        return pickle.dumps(value)
+    except Exception:  # whatever the pickling of somebody else's object raises
+        return b""

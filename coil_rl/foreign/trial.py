@@ -30,6 +30,7 @@ from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.foreign.host import called, is_of_user
 from coil_rl.foreign.makers import layers
+from coil_rl.foreign.remembered import pickled
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import (
     first_choices,
@@ -434,7 +435,7 @@ class _Shared:
     def __init__(self, kinds: Sequence[type]) -> None:
         own = [each for kind in kinds for each in kind.__mro__ if is_of_user(each)]
         self.kinds = dict.fromkeys(own)
-        self.before = {name: _pickled(value) for name, value, _ in self._things()}
+        self.before = {name: pickled(value) for name, value, _ in self._things()}
 
     def changed(self) -> str:
         """Return the names of what has changed; empty for nothing."""
@@ -447,7 +448,7 @@ class _Shared:
 
     def _changed(self) -> Iterator[tuple[str, Any, Any]]:
         for name, value, put in self._things():
-            if self.before.get(name) and _pickled(value) != self.before[name]:
+            if self.before.get(name) and pickled(value) != self.before[name]:
                 yield name, value, put
 
     def _things(self) -> Iterator[tuple[str, Any, Any]]:
@@ -483,14 +484,6 @@ def _set_defaults(function: FunctionType, then: Sequence[Any]) -> None:
 def _is_data(value: Any) -> bool:
     """Return whether a value may be what rows share: data, or an object of a user's class."""
     return isinstance(value, DATA) or (not isinstance(value, type) and is_of_user(type(value)))
-
-
-def _pickled(value: Any) -> bytes:
-    """Return the content of a value; empty for what cannot be pickled."""
-    try:
-        return pickle.dumps(value)
-    except Exception:  # whatever the pickling of somebody else's object raises
-        return b""
 
 
 def _random(env: EnvBase) -> Callable[[TensorDictBase], TensorDictBase]:

@@ -1,7 +1,6 @@
 """Whatever acts as a guide: objects, functions, networks, models of other libraries."""
 
 import importlib
-import itertools
 import textwrap
 from functools import partial
 
@@ -465,13 +464,6 @@ def test_function_is_for_a_batch_only_if_its_answer_has_the_form_of_actions(id, 
     found = found[..., 1] if id == "CartPole-v1" else found[..., 0]
     expected = action(rollout["observation"]).reshape(found.shape)
     torch.testing.assert_close(found, expected.to(found.dtype))
-
-
-def test_function_that_remembers_is_refused():
-    calls = itertools.count()
-    for action in (lambda x: float(next(calls)), lambda x: x[:, :1] * 0 + next(calls)):
-        with pytest.raises(ForeignError, match=r"for the same observation: .* a class"):
-            advised(ControllerGuide(action))
 
 
 class Model:
