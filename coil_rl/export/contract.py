@@ -114,10 +114,7 @@ class _State(BaseModel):
 
     @model_validator(mode="after")
     def _begins(self) -> _State:
-        first = np.asarray(self.first, float)
-        np.broadcast_to(first, self.shape)
-        if not np.isfinite(first).all():
-            raise ValueError("first must be finite numbers")
+        np.broadcast_to(np.asarray(self.first, float), self.shape)  # ValueError if it does not fit
         return self
 
 

@@ -176,6 +176,7 @@ def changed(place, value):
         (("inputs",), {}, "is damaged.*inputs"),
         (("state", 0, "output"), "action2", "it writes no action2"),
         (("state", 0, "first"), "x", "is damaged.*state.0.first"),
+        (("state", 0, "first"), [1, 2], "is damaged.*state.0: .*broadcast"),
         (("state", 0, "shape"), [2], r"it reads state.sum .* not any rows of \[2\]"),
         (("outputs", 0, "shape"), [2], r"it writes action .* not any rows of \[2\]"),
         (("outputs", 0, "space"), None, "is damaged.*outputs.0.space"),
