@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import torch
 from omegaconf import DictConfig
 
 from coil_rl.comparison import timing
@@ -163,6 +164,7 @@ class Comparison:
         """
         start = time.process_time()
         config = self._checked()
+        torch.set_num_threads(config.threads)  # as the trainings, whose steps are timed
         self.overhead = time.process_time() - start
         with self._new_or_kept():
             (self.folder / FAILED_JOBS).unlink(missing_ok=True)

@@ -9,6 +9,7 @@ import time
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from programs import called
 
@@ -298,3 +299,21 @@ def test_folder_that_is_a_file_is_said_to_be_one(tmp_path):
 
 def test_help_is_printed():
     assert "is my guide worth it?" in called("compare", "--help").stdout
+
+
+def test_steps_are_timed_with_the_threads_of_the_trainings(monkeypatch, tmp_path):
+    threads = []
+
+    def measured(*_):
+        threads.append(torch.get_num_threads())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(timing, "measure", measured)
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            coil_rl.compare("pendulum", guide="zero", overrides=SMALL, folder=tmp_path / "it")
+        assert torch.get_num_threads() == 2, "of the caller"
+    finally:
+        torch.set_num_threads(1)
+    assert threads == [1]
