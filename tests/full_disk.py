@@ -40,7 +40,7 @@ def interrupted_by_full_disk(
     lines = [
         line
         for line in text.decode().splitlines()
-        if line.strip() and not re.search("%|step/s", line)
+        if line.strip() and not re.search("%|step/s|the logger .* is left out", line)
     ]
     return lines if process.returncode == 2 else [f"exit code {process.returncode}", *lines]
 

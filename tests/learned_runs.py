@@ -14,7 +14,7 @@ ON_POLICY = ["learner.minibatches=2", "learner.epochs=1", "learner.action_gain=1
 FOREST = ["learner.regressor.n_estimators=3"]
 # What makes a method small, and its policy do something before it has learned anything.
 OPTIONS = dict.fromkeys(("cheq", "ibrl", "policy_decorator", "rlpd", "wsrl", "q_filter"), REPLAY)
-OPTIONS |= {"dagger": FOREST, "oil": FOREST, "coil_anchored": ON_POLICY[:2]}
+OPTIONS |= {"dagger": FOREST, "oil": FOREST, "coil_anchored": ["learner=ppo", *ON_POLICY[:2]]}
 
 
 def learned(folder, method, *overrides, guide="thermostat.control:PI", env="thermostat:Room-v0"):

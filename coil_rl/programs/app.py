@@ -323,6 +323,7 @@ def program(name: str, signals: Signals | None = None) -> Iterator[None]:
     _draw_into_files()
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.formatwarning = lambda message, *_, **__: f"{name}: {message}\n"
+    threading.excepthook = _end_of_thread
     out = SafeStream(sys.stdout)
     sys.stdout, sys.stderr = out, SafeStream(sys.stderr)
     try:
@@ -354,6 +355,16 @@ def _check_written(name: str, out: SafeStream) -> None:
     out.flush()
     if out.full is not None:
         refuse(name, out.full)
+
+
+def _end_of_thread(error: Any) -> None:
+    """Show the error of a thread, but that of a full disk, which the next use of a logger raises.
+
+    Args:
+        error: as of `threading.excepthook`.
+    """
+    if not issubclass(error.exc_type, OSError):
+        threading.__excepthook__(error)
 
 
 def _end(stream: Any) -> Any:

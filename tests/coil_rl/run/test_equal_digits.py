@@ -24,7 +24,7 @@ ON_POLICY = ["learner.minibatches=2", "learner.epochs=3"]
 REPLAY = ["learner.starts=16", "learner.updates_per_step=0.015625", "learner.batch_size=16"]
 FOREST = ["learner.regressor.n_estimators=3"]
 OPTIONS = dict.fromkeys(("cheq", "ibrl", "policy_decorator", "rlpd", "wsrl", "q_filter"), REPLAY)
-OPTIONS |= {"dagger": FOREST, "oil": FOREST}
+OPTIONS |= {"dagger": FOREST, "oil": FOREST, "coil_anchored": ["learner=ppo", *ON_POLICY]}
 PROXY = ["proxy.budget.frames=64", "proxy.budget.num_envs=4", "proxy.budget.steps=16"]
 
 INF = math.inf
