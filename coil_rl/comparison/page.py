@@ -91,15 +91,14 @@ def command_of(given: Named, verdict: Verdict) -> str:
     tune = given.nodes.get("tune")
     if not [key for key in given.nodes if key != "tune"]:
         if arm.name == TUNE and tune is not None:
-            bounds = ", ".join(f"{name}: {_bounds(each)}" for name, each in tune.items())
-            words.append(f"tune={{{bounds}}}")
+            words.append(f"tune={_bounds(tune)}")
         return shlex.join(["coil-train", *map(_plain, [*words, *arm.words])])
     method = arm.words[0].partition("=")[2]
     others = [word for word in words if not word.startswith(("env=", "env.id=", "guide"))]
     overrides = [*others, *arm.words[1:]]
     arguments = [f"method={method!r}"]
     if arm.name == TUNE:
-        arguments.append(f"tune={dict(tune or {})!r}")
+        arguments.append(f"tune={tune!r}")
     if overrides:
         arguments.append(f"overrides={overrides!r}")
     return f"coil_rl.train(env, guide=guide, {', '.join(arguments)})"
@@ -120,9 +119,12 @@ def _read(word: str) -> tuple[type, Any] | None:
     return type(value), value
 
 
-def _bounds(each: Any) -> str:
-    """Return bounds as Hydra reads them."""
-    return f"[{', '.join(map(str, each))}]"
+def _bounds(tune: Mapping[str, Any] | str) -> str:
+    """Return the bounds of numbers, or `auto`, as Hydra reads them."""
+    if isinstance(tune, str):
+        return tune
+    each = (f"{name}: [{', '.join(map(str, bounds))}]" for name, bounds in tune.items())
+    return f"{{{', '.join(each)}}}"
 
 
 def draw(outcome: Outcome, cases: int | None, path: Path) -> None:
