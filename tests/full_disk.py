@@ -23,6 +23,9 @@ from pathlib import Path
 
 from kill_and_resume import describe_state, differences, finish, start
 
+# What a full disk makes of a logger, which is no result.
+LEFT_OUT = r"the logger TensorboardLogger of .* is left out \(OSError: .*(No space|File too large)"
+
 
 def interrupted_by_full_disk(
     folder: Path, overrides: list[str], room: int, disk: Path | None
@@ -40,7 +43,7 @@ def interrupted_by_full_disk(
     lines = [
         line
         for line in text.decode().splitlines()
-        if line.strip() and not re.search("%|step/s|the logger .* is left out", line)
+        if line.strip() and not re.search(f"%|step/s|{LEFT_OUT}", line)
     ]
     return lines if process.returncode == 2 else [f"exit code {process.returncode}", *lines]
 

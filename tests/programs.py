@@ -11,6 +11,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 from hydra._internal.hydra import Hydra
+from hydra.core.hydra_config import HydraConfig
 
 import coil_fmu.conf
 import coil_rl.conf
@@ -141,6 +142,7 @@ def called(name, *arguments, cwd=".", code=0):
         ended = end.code
     finally:
         sys.argv = given
+        HydraConfig.instance().cfg = None  # a later test is no job of this program
         logging.getLogger().handlers.clear()
     assert code is None or ended == code, error.getvalue()
     return subprocess.CompletedProcess(sys.argv, ended, out.getvalue(), error.getvalue())

@@ -226,9 +226,8 @@ def _unknown_key(error: OmegaConfBaseException, typed: re.Match[str] | None) -> 
     known = [str(name) for name in names if name not in ("hydra", "defaults")]
     node = key.rpartition(".")[0] or "the configuration"
     swept = [word for word in sys.argv if word.startswith(f"{key.partition('.')[0]}=")]
-    if any(
-        "," in word for word in swept
-    ):  # Hydra composes a sweep without the files that it sweeps
+    # Hydra composes a sweep without the files that it sweeps.
+    if any("," in word for word in swept):
         return f"there is no key {key} before {swept[0]} is chosen; write {key}=choice(VALUE)"
     other_file = unchosen(key, typed[1] if typed else key)
     if other_file:

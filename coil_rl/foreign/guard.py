@@ -220,7 +220,7 @@ def _set_torch(states: Sequence[Tensor]) -> None:
 
 
 def _equal(states: Sequence[Tensor], others: Sequence[Tensor]) -> bool:
-    """Return whether states are the same, in a tenth of the time of `torch.equal`."""
+    """Return whether states have the same bytes."""
     pairs = zip(states, others, strict=True)
     return all(one.numpy().tobytes() == other.numpy().tobytes() for one, other in pairs)
 

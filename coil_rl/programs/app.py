@@ -40,7 +40,7 @@ from coil_rl.config.compose import keep_written, key_of
 from coil_rl.config.folder import make_folder
 from coil_rl.config.messages import is_no_bug, refuse
 from coil_rl.config.trust import trust_packages
-from coil_rl.errors import UserError
+from coil_rl.errors import NO_SPACE, UserError
 from coil_rl.output import SafeStream
 from coil_rl.plain_yaml import is_part
 from coil_rl.programs.folders import spelled
@@ -358,12 +358,14 @@ def _check_written(name: str, out: SafeStream) -> None:
 
 
 def _end_of_thread(error: Any) -> None:
-    """Show the error of a thread, but that of a full disk, which the next use of a logger raises.
+    """Print the uncaught error of a thread, unless the disk is full.
+
+    The thread of a logger meets a full disk, and the next call of the logger raises the same error.
 
     Args:
         error: as of `threading.excepthook`.
     """
-    if not issubclass(error.exc_type, OSError):
+    if getattr(error.exc_value, "errno", None) not in NO_SPACE:
         threading.__excepthook__(error)
 
 

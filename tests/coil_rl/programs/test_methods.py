@@ -66,7 +66,7 @@ def test_existing_resume_does_not_repeat_a_finished_run(residual, capsys):
     before = {file: file.stat().st_mtime_ns for file in residual.iterdir() if file.name != ".lock"}
     trained(residual, "residual", "label=mine", "existing=resume")
     assert {file: file.stat().st_mtime_ns for file in before} == before
-    assert "mean test reward" in capsys.readouterr().out
+    assert "mine: mean test reward" in capsys.readouterr().out
     with pytest.raises(
         UserError, match=r"residual holds a run with learner.gamma=0.99, not 0.9; choose another"
     ):
