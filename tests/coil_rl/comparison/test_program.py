@@ -43,9 +43,7 @@ def test_table_has_everything_that_acts(compared):
     without = ["guide", "opposite", "zero", "random", "first network"]
     learned = ["tune", "ppo", "coil_anchored", "sac", "coil_anchored_sac"]
     assert list(rows) == [*without, *learned]
-    judged = [rows[name] for name in learned if "not judged" not in rows[name]["note"]]
-    assert len(judged) >= 3, "those without a start test"
-    assert all(row["seeds"] == "2" for row in judged)
+    assert all(rows[name]["seeds"] == "2" for name in learned)
     assert all(float(rows[name]["frames"]) == 0 for name in without)
     assert [float(rows[name]["frames"]) for name in ("ppo", "sac")] == [128, 640]
     assert float(rows["ppo"]["calls"]) == 0 < float(rows["tune"]["calls"])
