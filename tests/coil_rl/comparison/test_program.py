@@ -53,7 +53,7 @@ def test_table_has_everything_that_acts(compared):
 @pytest.mark.slow
 def test_it_says_before_what_it_runs_and_how_to_go_on(compared):
     folder, done = compared
-    assert "ppo 128, coil_anchored 128, sac 640" in done.stderr
+    assert "ppo 128, coil_anchored 384, sac 640" in done.stderr
     assert "go on with: coil-compare env=pendulum" in done.stderr
     assert "minutes=0.01 is not enough" in done.stderr
     assert shlex.quote(f"folder={folder}") in done.stderr
