@@ -123,7 +123,7 @@ def benchmark_rows(task: str, runs: Sequence[Run]) -> list[dict[str, Any]]:
     arms = arms_of(runs)
     if (PPO, ALONE) not in arms:
         return []
-    compared = {(row["method"], row["arm"]): row for row in rows_of_task(task, runs)}
+    compared = {(row["method"], row["arm"]): row for row in rows_of_task(task, arms, PPO)}
     rows = [_row(task, key, arms, compared.get(key, {}), known[task]) for key in arms]
     return sorted(rows, key=lambda row: -row["end"])
 
