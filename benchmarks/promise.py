@@ -18,6 +18,8 @@ beside those below 10; the other columns are of all.
 """
 
 import argparse
+import hashlib
+import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,6 +41,7 @@ from coil_rl.report.statistics import difference
 PPO, ALONE, INTACT, RANDOM = "ppo", "alone", "intact", "random"
 Key = tuple[str, str]  # method and arm
 MATERIAL = 0.01  # of the scale of a task
+VARIES = ("seed", "run_dir", "logger", "existing", "trust", "defaults", "workers")
 COLUMNS = {
     "task": ("task", ""),
     "method": ("method", ""),
@@ -169,6 +172,18 @@ def paired(arm: Arm, alone: Arm) -> tuple[Arm, Arm]:
     return Arm({s: arm.runs[s] for s in seeds}), Arm({s: alone.runs[s] for s in seeds})
 
 
+def fingerprint(settings: Mapping[str, Any]) -> str:
+    """Return ten hexadecimal digits of a configuration, the same for all seeds."""
+    text = json.dumps(_without_seeds(settings), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+def _without_seeds(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _without_seeds(each) for key, each in value.items() if key not in VARIES}
+    return [_without_seeds(each) for each in value] if isinstance(value, list) else value
+
+
 def best_alone(arms: Mapping[Key, Arm]) -> str:
     """Return the learner whose runs without a guide have the highest mean reward."""
     means = {
@@ -265,6 +280,18 @@ def _row(arm: Arm, alone: Arm, scale: float) -> dict[str, object]:
     }
 
 
+def rows_of_runs(name: str, arms: Mapping[Key, Arm]) -> list[dict[str, object]]:
+    """Return a row for each finished run of a task."""
+    return [
+        {"task": name, "method": method, "arm": kind, "seed": seed}
+        | {"frames": run.curve[-1]["frames"] if run.curve else math.nan, "seconds": run.seconds}
+        | {"guide": arm.guide, "end": arm.reward(seed), "handed_over": run.handed_over}
+        | {"fingerprint": fingerprint(run.settings)}
+        for (method, kind), arm in arms.items()
+        for seed, run in sorted(arm.runs.items())
+    ]
+
+
 def verdict(mean: float, low: float, high: float) -> str:
     """Return "gain", "even", "loss" or "unknown" for a mean difference and its interval.
 
@@ -349,7 +376,7 @@ def main() -> None:
     if not folder.is_dir():
         parser.error(f"{folder} does not exist; give the folder of the experiments")
     try:
-        rows = _all_rows(folder, given.others)
+        rows, runs = _all_rows(folder, given.others)
     except (ValueError, UserError) as error:
         parser.error(str(error))
     losses = [f"{row['task']} {row['arm']}" for row in rows if row["verdict"] == "loss"]
@@ -360,21 +387,30 @@ def main() -> None:
     page = f"{markdown_table(rows, columns)}\n\n{sentence}."
     write_text(folder / "promise.md", page)
     write_csv(rows, folder / "promise.csv")
+    write_csv(runs, folder / "promise_runs.csv")
     print(page)
 
 
-def _all_rows(folder: Path, others: int | None) -> list[dict[str, Any]]:
-    """Return the rows of all tasks, with two more columns if the smallest other seed is given."""
+def _all_rows(
+    folder: Path, others: int | None
+) -> tuple[list[dict[str, Any]], list[dict[str, object]]]:
+    """Return the rows of the arms of all tasks, and those of all runs.
+
+    Args:
+        others: smallest of the seeds that confirm the claim, which have a column of their own.
+    """
     rows: list[dict[str, Any]] = []
+    each: list[dict[str, object]] = []
     for task, runs in with_ppo(folder, runs_of(folder)).items():
         arms = arms_of(runs)
         found = rows_of_task(task, arms, best_alone(arms))
         if others is not None:
             add_parts(found, arms, others)
         rows += found
+        each += rows_of_runs(task, arms)
     if not rows:
         raise ValueError(f"{folder} has no run with a guide; train it: +arm=intact,random")
-    return rows
+    return rows, each
 
 
 if __name__ == "__main__":

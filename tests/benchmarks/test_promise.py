@@ -3,6 +3,7 @@
 import json
 import math
 
+import pandas as pd
 import pytest
 from programs import TINY_ARM, called
 from run_folders import driven, make_run
@@ -226,6 +227,9 @@ def test_program_writes_the_table(folder, monkeypatch, capsys):
     assert page in capsys.readouterr().out
     assert "gains," in page
     assert (folder / "promise.csv").exists()
+    runs = pd.read_csv(folder / "promise_runs.csv")
+    assert len(runs) == 6
+    assert runs.groupby("method").fingerprint.nunique().to_dict() == {"ppo": 1, "coil_anchored": 2}
     assert "others" not in page
 
 
