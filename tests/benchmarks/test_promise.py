@@ -5,10 +5,12 @@ import math
 
 import pandas as pd
 import pytest
-from programs import TINY_ARM, called
+from hydra import compose, initialize_config_module
+from programs import CONFS, TINY_ARM, called
 from run_folders import driven, make_run
 
 from benchmarks import promise
+from coil_rl.config.check import check
 from coil_rl.errors import UserError
 from coil_rl.report.runs import read_runs
 
@@ -166,6 +168,22 @@ def test_folder_without_results_is_one_sentence(arms, message, tmp_path, monkeyp
     assert refused.value.code == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.rglob("promise.*"))
+
+
+PUBLISHED = sorted(path.stem for path in (CONFS[0] / "settings" / "zoo").glob("*.yaml"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_published_settings_are_those_of_a_run_of_their_task(name, tmp_path):
+    task, _, learner = name.rpartition("_")
+    if task == "swimmer":
+        pytest.importorskip("mujoco")
+    words = ["+experiment=promise", f"+task={task}", "+arm=alone", f"+settings=zoo/{name}"]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", [*words, f"run_dir={tmp_path}"])
+        check(config)
+    assert config.label == f"{learner}_zoo_alone"
 
 
 @pytest.fixture(scope="module")
