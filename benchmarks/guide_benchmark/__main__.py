@@ -71,7 +71,7 @@ def main() -> None:
         finished, refused = sum(run.finished for run in own), failed_jobs([given.folder / task])
         print(f"{task}: {finished} of {len(own) + refused} runs finished, {refused} were refused")
         draw_curves(pages, task, own)
-    for task in runs or {row["task"]: None for row in table}:
+    for task in runs or dict.fromkeys(row["task"] for row in table):
         ladder = sorted((row for row in table if row["task"] == task), key=lambda row: -row["end"])
         write_task(pages, task, ladder)
     print(write_all(pages, table))
