@@ -282,14 +282,15 @@ def _row(arm: Arm, alone: Arm, scale: float) -> dict[str, object]:
 
 def rows_of_runs(name: str, arms: Mapping[Key, Arm]) -> list[dict[str, object]]:
     """Return a row for each finished run of a task."""
-    return [
-        {"task": name, "method": method, "arm": kind, "seed": seed}
-        | {"frames": run.curve[-1]["frames"] if run.curve else math.nan, "seconds": run.seconds}
-        | {"guide": arm.guide, "end": arm.reward(seed), "handed_over": run.handed_over}
-        | {"fingerprint": fingerprint(run.settings)}
-        for (method, kind), arm in arms.items()
-        for seed, run in sorted(arm.runs.items())
-    ]
+    rows: list[dict[str, object]] = []
+    for (method, kind), arm in arms.items():
+        for seed, run in sorted(arm.runs.items()):
+            frames = run.curve[-1]["frames"] if run.curve else math.nan
+            row = {"task": name, "method": method, "arm": kind, "seed": seed, "frames": frames}
+            row |= {"seconds": run.seconds, "guide": arm.guide, "end": arm.reward(seed)}
+            row |= {"handed_over": run.handed_over, "fingerprint": fingerprint(run.settings)}
+            rows.append(row)
+    return rows
 
 
 def verdict(mean: float, low: float, high: float) -> str:
