@@ -55,7 +55,6 @@ WORDS = [  # of a run of PPO in env=gym env.id=odd_parts:Plain
     ("evaluation.measures.speed=speed", "write evaluation.measures.speed.entry=ENTRY"),
     ("evaluation.measures.speed.entrry=reward", "no key entrry; evaluation.measures.speed"),
     ("evaluation.measures.steps.entry=reward", "steps is already a column of the tables"),
-    ("~evaluation.cases", "evaluation.cases cannot be left out; give it another value"),
     ("guide.controller.of=odd_parts:first", "it belongs to guide=controller: write"),
 ]
 OTHER_ENVS = [
