@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -70,7 +71,8 @@ def _write(file: Path, tables: Tables) -> None:
     unfinished = file.with_name(f".{file.stem}.{os.getpid()}{SUFFIX}")
     try:
         with unfinished.open("wb") as stream:
-            np.savez(stream, **{name: table.numpy() for name, table in tables.items()})
+            arrays: dict[str, Any] = {name: table.numpy() for name, table in tables.items()}
+            np.savez(stream, **arrays)
         unfinished.replace(file)
     finally:
         unfinished.unlink(missing_ok=True)
