@@ -1,22 +1,25 @@
-"""The promise of anchored COIL, arm by arm: at least the better of its guide and of plain PPO.
+"""The promise of anchored COIL, arm by arm: at least the better of its guide and learning alone.
 
 `coil-train +experiment=promise` trains the runs, and this program makes the table of them:
 
     python -m benchmarks.promise outputs/experiments/promise
 
 A task has a folder with the runs of its arms, whose labels are METHOD_ARM. `ppo_alone` is plain
-PPO; in the others a method has an intact, detuned, reversed or random guide. The unit is the seed.
-A method is compared with the better of its guide, as it acts alone in the cases of the table, and
-of PPO, seed by seed. It is a loss if the 95 % interval of the mean difference is below 0 and the
-mean below -1 % of the scale, a gain if both are above, and else even; without an interval, as with
-one seed, it is unknown. The scale of a task is the distance from the return of its random guide to
-the better of PPO and its intact guide.
+PPO, `sac_alone` plain SAC; in the others a method has an intact, detuned, reversed or random guide.
+The unit is the seed. A method is compared with the better of its guide, as it acts alone in the
+cases of the table, and of the learner that is best alone, seed by seed. It is a loss if the 95 %
+interval of the mean difference is below 0 and the mean below -1 % of the scale, a gain if both are
+above, and else even; without an interval, as with one seed, it is unknown. The scale of a task is
+the distance from the return of its random guide to the better of learning alone and its intact
+guide.
 
 With `--others 10` the seeds from 10 on, which were run once afterwards, have a column of their own
 beside those below 10; the other columns are of all.
 """
 
 import argparse
+import hashlib
+import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,13 +41,15 @@ from coil_rl.report.statistics import difference
 PPO, ALONE, INTACT, RANDOM = "ppo", "alone", "intact", "random"
 Key = tuple[str, str]  # method and arm
 MATERIAL = 0.01  # of the scale of a task
+VARIES = ("seed", "run_dir", "logger", "existing", "trust", "defaults", "workers")
 COLUMNS = {
     "task": ("task", ""),
     "method": ("method", ""),
     "arm": ("arm", ""),
     "seeds": ("seeds", "d"),
     "guide": ("guide", ".1f"),
-    "ppo": ("ppo", ".1f"),
+    "alone": ("alone", ".1f"),
+    "learner": ("which", ""),
     "end": ("end", ".1f"),
     "difference": ("difference (%)", "+.1f"),
     "low": ("low", "+.1f"),
@@ -56,7 +61,7 @@ COLUMNS = {
     "tests": ("tests (% of frames)", ".1f"),
     "held": ("weight: seeds", ""),
     "handed_over": ("handed over: seeds", ""),
-    "time": ("seconds / PPO", ".2f"),
+    "time": ("seconds / alone", ".2f"),
 }
 
 
@@ -152,7 +157,7 @@ def _cases(run: Run) -> set[str]:
 
 
 def paired(arm: Arm, alone: Arm) -> tuple[Arm, Arm]:
-    """Return the runs of a method and of PPO, limited to the seeds that both have.
+    """Return the runs of a method and of learning alone, limited to the seeds that both have.
 
     Raises:
         UserError: if they have no seed in common.
@@ -167,44 +172,67 @@ def paired(arm: Arm, alone: Arm) -> tuple[Arm, Arm]:
     return Arm({s: arm.runs[s] for s in seeds}), Arm({s: alone.runs[s] for s in seeds})
 
 
-def rows_of_task(name: str, runs: Sequence[Run]) -> list[dict[str, object]]:
-    """Return a row of the table for each method with each guide; none without plain PPO."""
-    arms = arms_of(runs)
-    alone = arms.get((PPO, ALONE))
-    if alone is None:
-        return []
+def fingerprint(settings: Mapping[str, Any]) -> str:
+    """Return ten hexadecimal digits of a configuration, the same for all seeds."""
+    text = json.dumps(_without_seeds(settings), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+def _without_seeds(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _without_seeds(each) for key, each in value.items() if key not in VARIES}
+    return [_without_seeds(each) for each in value] if isinstance(value, list) else value
+
+
+def best_alone(arms: Mapping[Key, Arm]) -> str:
+    """Return the learner whose runs without a guide have the highest mean reward."""
+    means = {
+        learner: np.mean([each.reward(seed) for seed in each.runs])
+        for (learner, arm), each in arms.items()
+        if arm == ALONE
+    }
+    return max(means, key=lambda learner: means[learner])
+
+
+def rows_of_task(name: str, arms: Mapping[Key, Arm], learner: str) -> list[dict[str, object]]:
+    """Return a row of the table for each method with each guide.
+
+    Args:
+        arms: see `arms_of`.
+        learner: what they are compared with, see `best_alone`.
+    """
+    alone = arms[learner, ALONE]
     scale = scale_of(arms, alone)
     return [
-        {"task": name, "method": method, "arm": arm} | _row(each, alone, scale)
+        {"task": name, "method": method, "arm": arm, "learner": learner} | _row(each, alone, scale)
         for (method, arm), each in arms.items()
         if arm != ALONE
     ]
 
 
-def add_parts(rows: Sequence[dict[str, object]], runs: Sequence[Run], others: int) -> None:
+def add_parts(rows: Sequence[dict[str, object]], arms: Mapping[Key, Arm], others: int) -> None:
     """Add to the rows of a task the difference with the first seeds, and with the others."""
-    arms = arms_of(runs)
-    scale = scale_of(arms, arms[PPO, ALONE])
     for row in rows:
-        arm = arms[str(row["method"]), str(row["arm"])]
-        row["claimed"] = _part(arm, arms[PPO, ALONE], scale, range(others))
-        row["others"] = _part(arm, arms[PPO, ALONE], scale, range(others, max(arm.runs) + 1))
+        arm, alone = arms[str(row["method"]), str(row["arm"])], arms[str(row["learner"]), ALONE]
+        scale = scale_of(arms, alone)
+        row["claimed"] = _part(arm, alone, scale, range(others))
+        row["others"] = _part(arm, alone, scale, range(others, max(arm.runs) + 1))
 
 
 def _part(arm: Arm, alone: Arm, scale: float, seeds: range) -> str:
     """Return the difference of some seeds of an arm, its interval and the verdict as a text."""
-    part, ppo = (
+    part, other = (
         Arm({seed: run for seed, run in each.runs.items() if seed in seeds})
         for each in (arm, alone)
     )
-    if not set(part.runs) & set(ppo.runs):
+    if not set(part.runs) & set(other.runs):
         return ""
-    row: dict[str, Any] = _row(part, ppo, scale)
+    row: dict[str, Any] = _row(part, other, scale)
     interval = f"({row['low']:+.1f} to {row['high']:+.1f})"
     return f"{row['difference']:+.1f} {interval} {row['verdict']}"
 
 
-def scale_of(arms: dict[Key, Arm], alone: Arm) -> float:
+def scale_of(arms: Mapping[Key, Arm], alone: Arm) -> float:
     """Return the scale of a task; NaN without a random guide, or if it is as good as the better."""
     best = float(np.mean([alone.reward(seed) for seed in alone.runs]))
     intact = guide_of(arms, INTACT)
@@ -213,21 +241,21 @@ def scale_of(arms: dict[Key, Arm], alone: Arm) -> float:
     return abs(best - guide_of(arms, RANDOM)) or math.nan
 
 
-def guide_of(arms: dict[Key, Arm], name: str) -> float:
+def guide_of(arms: Mapping[Key, Arm], name: str) -> float:
     """Return the mean reward of the guide of an arm, which is no method's; NaN without the arm."""
     known = [each.guide for (_, arm), each in arms.items() if arm == name]
     return float(np.mean(known)) if known else math.nan
 
 
 def _row(arm: Arm, alone: Arm, scale: float) -> dict[str, object]:
-    """Return the row of a method with one guide, of the seeds that PPO has too."""
+    """Return the row of a method with one guide, of the seeds that learning alone has too."""
     arm, alone = paired(arm, alone)
     seeds = list(arm.runs)
     ends = np.array([arm.reward(seed) for seed in seeds])
-    of_ppo = np.array([alone.reward(seed) for seed in seeds])
+    better = np.array([alone.reward(seed) for seed in seeds])
+    learned = float(better.mean())
     guide = arm.guide
-    better = of_ppo
-    if guide > of_ppo.mean():
+    if guide > learned:
         better = np.full(len(seeds), guide)
     mean, low, high = (100 * each / scale for each in difference(ends, better)[:3])
     curves = [arm.runs[seed].curve for seed in seeds if arm.runs[seed].curve]
@@ -238,7 +266,7 @@ def _row(arm: Arm, alone: Arm, scale: float) -> dict[str, object]:
     return {
         "seeds": len(seeds),
         "guide": guide,
-        "ppo": float(of_ppo.mean()),
+        "alone": learned,
         "end": float(ends.mean()),
         "difference": mean,
         "low": low,
@@ -250,6 +278,19 @@ def _row(arm: Arm, alone: Arm, scale: float) -> dict[str, object]:
         "handed_over": _counted(arm.runs[seed].handed_over for seed in seeds),
         "time": float(np.median([a / b for a, b in seconds if a and b] or [math.nan])),
     }
+
+
+def rows_of_runs(name: str, arms: Mapping[Key, Arm]) -> list[dict[str, object]]:
+    """Return a row for each finished run of a task."""
+    rows: list[dict[str, object]] = []
+    for (method, kind), arm in arms.items():
+        for seed, run in sorted(arm.runs.items()):
+            frames = run.curve[-1]["frames"] if run.curve else math.nan
+            row = {"task": name, "method": method, "arm": kind, "seed": seed, "frames": frames}
+            row |= {"seconds": run.seconds, "guide": arm.guide, "end": arm.reward(seed)}
+            row |= {"handed_over": run.handed_over, "fingerprint": fingerprint(run.settings)}
+            rows.append(row)
+    return rows
 
 
 def verdict(mean: float, low: float, high: float) -> str:
@@ -336,7 +377,7 @@ def main() -> None:
     if not folder.is_dir():
         parser.error(f"{folder} does not exist; give the folder of the experiments")
     try:
-        rows = _all_rows(folder, given.others)
+        rows, runs = _all_rows(folder, given.others)
     except (ValueError, UserError) as error:
         parser.error(str(error))
     losses = [f"{row['task']} {row['arm']}" for row in rows if row["verdict"] == "loss"]
@@ -347,20 +388,30 @@ def main() -> None:
     page = f"{markdown_table(rows, columns)}\n\n{sentence}."
     write_text(folder / "promise.md", page)
     write_csv(rows, folder / "promise.csv")
+    write_csv(runs, folder / "promise_runs.csv")
     print(page)
 
 
-def _all_rows(folder: Path, others: int | None) -> list[dict[str, Any]]:
-    """Return the rows of all tasks, with two more columns if the smallest other seed is given."""
+def _all_rows(
+    folder: Path, others: int | None
+) -> tuple[list[dict[str, Any]], list[dict[str, object]]]:
+    """Return the rows of the arms of all tasks, and those of all runs.
+
+    Args:
+        others: smallest of the seeds that confirm the claim, which have a column of their own.
+    """
     rows: list[dict[str, Any]] = []
+    each: list[dict[str, object]] = []
     for task, runs in with_ppo(folder, runs_of(folder)).items():
-        found = rows_of_task(task, runs)
+        arms = arms_of(runs)
+        found = rows_of_task(task, arms, best_alone(arms))
         if others is not None:
-            add_parts(found, runs, others)
+            add_parts(found, arms, others)
         rows += found
+        each += rows_of_runs(task, arms)
     if not rows:
-        raise ValueError(f"{folder} has plain PPO alone; train it with a guide: +arm=intact,random")
-    return rows
+        raise ValueError(f"{folder} has no run with a guide; train it: +arm=intact,random")
+    return rows, each
 
 
 if __name__ == "__main__":

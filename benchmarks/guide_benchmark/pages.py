@@ -68,50 +68,44 @@ EDGE = (
 SMOKE = "**Smoke: too few seeds or frames for a conclusion**; it only shows that everything runs."
 
 
-def write_task(
-    folder: Path,
-    task: str,
-    rows: Sequence[Row],
-    runs: Sequence[Run],
-    jobs: int,
-    curves_of: str = "",
-) -> None:
-    """Write the page of a task with its curves and its ladder.
-
-    Args:
-        rows: of the table, the best first.
-        jobs: number of further runs beside them that were refused or failed.
-        curves_of: name of a further picture of curves; empty: the first picture.
-    """
+def draw_curves(folder: Path, task: str, runs: Sequence[Run]) -> None:
+    """Draw the learning curves with the intact guide and of PPO; a picture that exists stays."""
+    if (folder / f"{task}.webp").exists():
+        return
     arms = arms_of(runs)
     curves = {
         method: [run.curve for run in arm.runs.values() if run.curve]
         for (method, name), arm in arms.items()
         if name == INTACT or (method, name) == (PPO, ALONE)
     }
-    curves = {method: seeds for method, seeds in curves.items() if seeds}
     guide = float(np.mean([max(run.guide_returns.values()) for run in _guided(arms)] or [np.nan]))
-    picture = f"{task}.{curves_of}.webp" if curves_of else f"{task}.webp"
     draw_learning_curves(
-        curves,
-        folder / picture,
+        {method: seeds for method, seeds in curves.items() if seeds},
+        folder / f"{task}.webp",
         guides={GUIDE: guide},
         title=f"{task}: with its intact guide",
     )
+
+
+def write_task(folder: Path, task: str, rows: Sequence[Row]) -> None:
+    """Write the page of a task with its curves, if they are drawn, and its ladder.
+
+    Args:
+        rows: of the table, the best first.
+    """
     reference = references()[task]
-    finished = sum(run.finished for run in runs)
+    picture = f"{task}.webp"
     lines = [
         f"# {task}",
         *([SMOKE] if all(row["effort"] == "smoke" for row in rows) else []),
         f"Score 0 is the random guide ({rows[0]['random']:.1f}), score 1 is "
         f"{rows[0]['reference']:.1f}: {reference.source}. Percentages are of the distance from the "
         "random guide to the better of PPO and the intact guide.",
-        *(f"![learning curves]({name})" for name in _pictures(folder, task)),
+        *([f"![learning curves]({picture})"] if (folder / picture).exists() else []),
         "## Ladder",
         markdown_table([{**row, "frames_to_guide": _frames_to_guide(row)} for row in rows], LADDER),
         *_several_ppo(rows),
-        f"Runs in the table: {sum(row['seeds'] for row in rows)}. Of the last sweep "
-        f"{len(runs) + jobs} were started, {finished} finished, {jobs} were refused or failed.",
+        f"Runs in the table: {sum(row['seeds'] for row in rows)}.",
     ]
     write_text(folder / f"{task}.md", "\n\n".join(lines) + "\n")
 
@@ -147,12 +141,6 @@ def _frames_to_guide(row: Row) -> float | str:
     if math.isnan(frames) or row["reached"] is None:
         return frames
     return f"{frames:.0f}{some_of(row['reached'], row['seeds'])}"
-
-
-def _pictures(folder: Path, task: str) -> list[str]:
-    """Return the names of the pictures of a task, the first one first."""
-    found = [*folder.glob(f"{task}.webp"), *sorted(folder.glob(f"{task}.*.webp"))]
-    return [path.name for path in found]
 
 
 def _guided(arms: Mapping[tuple[str, str], Any]) -> list[Run]:

@@ -7,8 +7,6 @@ the table.
 """
 
 import csv
-import hashlib
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -26,6 +24,7 @@ from benchmarks.promise import (
     Arm,
     Key,
     arms_of,
+    fingerprint,
     guide_of,
     paired,
     plain_episodes,
@@ -56,7 +55,6 @@ COLUMNS = (
     *("task", "method", "arm", "effort", "seeds", *NUMBERS, REACHED, "verdict"),
     *("fingerprint", *VERSIONS),
 )
-VARIES = ("seed", "run_dir", "logger", "existing", "trust", "defaults", "workers")
 
 
 @dataclass(frozen=True)
@@ -87,18 +85,6 @@ def references() -> dict[str, Reference]:
         }
 
 
-def fingerprint(settings: Mapping[str, Any]) -> str:
-    """Return ten hexadecimal digits of a configuration, the same for all seeds."""
-    text = json.dumps(_without_seeds(settings), sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:10]
-
-
-def _without_seeds(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _without_seeds(each) for key, each in value.items() if key not in VARIES}
-    return [_without_seeds(each) for each in value] if isinstance(value, list) else value
-
-
 def effort(seeds: int, frames: float, reference: Reference) -> str:
     """Return "smoke", "standard" or "headline"."""
     standard = min(STANDARD_FRAMES, reference.frames)
@@ -123,7 +109,7 @@ def benchmark_rows(task: str, runs: Sequence[Run]) -> list[dict[str, Any]]:
     arms = arms_of(runs)
     if (PPO, ALONE) not in arms:
         return []
-    compared = {(row["method"], row["arm"]): row for row in rows_of_task(task, runs)}
+    compared = {(row["method"], row["arm"]): row for row in rows_of_task(task, arms, PPO)}
     rows = [_row(task, key, arms, compared.get(key, {}), known[task]) for key in arms]
     return sorted(rows, key=lambda row: -row["end"])
 

@@ -203,7 +203,7 @@ def test_seeds_that_reach_the_guide_are_counted(made, tmp_path):
         "coilrandom": 3,
     }
     assert program.added(tmp_path / "rows.csv", rows) == rows
-    write_task(tmp_path, "pendulum", rows, runs, 0)
+    write_task(tmp_path, "pendulum", rows)
     ladder = (tmp_path / "pendulum.md").read_text()
     mean = next(row["frames_to_guide"] for row in rows if row["method"] == "ppo")
     assert f" {mean:.0f} (2 of 3 seeds) |" in ladder
@@ -217,7 +217,7 @@ def test_page_names_the_returns_of_ppo_that_its_rows_are_compared_with(made, tmp
     row = next(row for row in rows if row["arm"] == "intact")
 
     def page(*others):
-        write_task(tmp_path, "pendulum", [*rows, *others], runs, 0)
+        write_task(tmp_path, "pendulum", [*rows, *others])
         return (tmp_path / "pendulum.md").read_text()
 
     alike, sac = row | {"ppo": row["ppo"] + 0.01}, row | {"method": "ibrl", "ppo": -936.39}
@@ -298,9 +298,10 @@ def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, monke
     for row in rows:
         check_row(row)
     page = (tmp_path / "README.md").read_text()
-    assert page in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert page in printed
+    assert "pendulum: 3 of 3 runs finished, 0 were refused" in printed
     assert "Smoke" in page
-    assert "3 were started, 3 finished" in (tmp_path / "pendulum.md").read_text()
     assert (tmp_path / "all.png").exists()
     assert (tmp_path / "pendulum.webp").exists()
 
@@ -313,7 +314,7 @@ def test_page_of_all_tasks_is_of_the_whole_table_that_rows_join(folder, tmp_path
     pages.mkdir()
     shutil.copyfile(ROWS.parent / "pendulum.webp", pages / "pendulum.webp")
     words = ["guide_benchmark", str(folder), "--pages", str(pages), "--add", str(file)]
-    monkeypatch.setattr(sys, "argv", [*words, "--curves", "more"])
+    monkeypatch.setattr(sys, "argv", words)
     program.main()
     assert len(read_rows(file)) == len(read_rows(ROWS)) + 3
     assert (pages / "rows.csv").read_bytes() == file.read_bytes()
@@ -322,10 +323,27 @@ def test_page_of_all_tasks_is_of_the_whole_table_that_rows_join(folder, tmp_path
     assert "[pendulum](pendulum.md)" in page
     task = (pages / "pendulum.md").read_text()
     assert "(pendulum.webp)" in task
-    assert "(pendulum.more.webp)" in task
     known = [row for row in read_rows(file) if row["task"] == "pendulum"]
     assert task.count("\n| ") == len(known) + 1  # the ladder has the rows of all sweeps
     assert (pages / "pendulum.webp").read_bytes() == (ROWS.parent / "pendulum.webp").read_bytes()
+
+
+def test_pages_of_the_docs_are_those_of_the_table(tmp_path, monkeypatch):
+    for file in (ROWS, *ROWS.parent.glob("*.webp")):
+        shutil.copyfile(file, tmp_path / file.name)
+    words = ["guide_benchmark", "--pages", str(tmp_path), "--add", str(tmp_path / "rows.csv")]
+    monkeypatch.setattr(sys, "argv", words)
+    program.main()
+    for page in ROWS.parent.glob("*.md"):
+        assert (tmp_path / page.name).read_text() == page.read_text(), page.name
+
+
+def test_no_folder_and_no_table_is_one_sentence(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["guide_benchmark", "--pages", "pages"])
+    with pytest.raises(SystemExit) as refused:
+        program.main()
+    assert refused.value.code == 2
+    assert "give the folder of the experiments" in capsys.readouterr().err
 
 
 @pytest.mark.slow

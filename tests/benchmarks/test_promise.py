@@ -3,11 +3,14 @@
 import json
 import math
 
+import pandas as pd
 import pytest
-from programs import TINY_ARM, called
+from hydra import compose, initialize_config_module
+from programs import CONFS, TINY_ARM, called
 from run_folders import driven, make_run
 
 from benchmarks import promise
+from coil_rl.config.check import check
 from coil_rl.errors import UserError
 from coil_rl.report.runs import read_runs
 
@@ -54,6 +57,12 @@ def small(folder, arms, seeds=1):
     return folder
 
 
+def rows_of(runs):
+    """Return the rows of a task, compared with the learner that is best alone."""
+    arms = promise.arms_of(runs)
+    return promise.rows_of_task("task", arms, promise.best_alone(arms))
+
+
 def printed(monkeypatch, capsys, *words):
     """Return what the program prints."""
     monkeypatch.setattr("sys.argv", ["promise", *map(str, words)])
@@ -63,7 +72,7 @@ def printed(monkeypatch, capsys, *words):
 
 def test_one_seed_has_no_verdict(tmp_path, monkeypatch, capsys):
     small(tmp_path / "task", {"ppo_alone": 10.0, "coil_intact": 5.0, "coil_random": 5.0})
-    (row, _) = promise.rows_of_task("task", read_runs([tmp_path / "task"]))
+    (row, _) = rows_of(read_runs([tmp_path / "task"]))
     assert row["verdict"] == "unknown"
     assert "0 even (undecided), 2 unknown, 0 losses." in printed(monkeypatch, capsys, tmp_path)
 
@@ -71,7 +80,7 @@ def test_one_seed_has_no_verdict(tmp_path, monkeypatch, capsys):
 def test_task_whose_random_guide_is_as_good_as_the_better_has_no_verdict(tmp_path):
     arms = {"ppo_alone": 10.0, "coil_intact": 5.0, "coil_random": 5.0}
     runs = read_runs([small(tmp_path, arms, seeds=2)])
-    rows = promise.rows_of_task("task", runs)
+    rows = rows_of(runs)
     assert [row["verdict"] for row in rows] == ["unknown", "unknown"]
 
 
@@ -103,7 +112,7 @@ def test_runs_that_cannot_be_compared_are_refused(cases, settings, seed, message
     rows = [row for who in ("guide", "coil_intact") for row in driven(who, dict.fromkeys(cases, 9))]
     changed(make_run(tmp_path / "further", "coil_intact", seed, rows), **settings)
     with pytest.raises(UserError, match=message):
-        promise.rows_of_task("task", read_runs([tmp_path]))
+        rows_of(read_runs([tmp_path]))
 
 
 def test_all_columns_are_of_the_seeds_that_ppo_has_too(tmp_path):
@@ -112,15 +121,15 @@ def test_all_columns_are_of_the_seeds_that_ppo_has_too(tmp_path):
         rows = driven("guide", {"a": 100.0 + seed, "b": 100.0})
         rows += driven("coil_intact", {"a": 5.0 + seed, "b": 5.0})
         make_run(tmp_path / str(seed), "coil_intact", seed, rows)
-    (row,) = promise.rows_of_task("task", read_runs([tmp_path]))
-    assert (row["seeds"], row["guide"], row["ppo"], row["end"]) == (2, 100.25, 15.0, 5.25)
+    (row,) = rows_of(read_runs([tmp_path]))
+    assert (row["seeds"], row["guide"], row["alone"], row["end"]) == (2, 100.25, 15.0, 5.25)
 
 
 def test_arm_and_ppo_without_a_common_seed_are_refused(tmp_path):
     small(tmp_path, {"ppo_alone": 10.0})
     make_run(tmp_path / "1", "coil_intact", 1, driven("coil_intact", {"a": 1.0, "b": 1.0}))
     with pytest.raises(UserError, match="coil_intact has no seed of ppo_alone; train both"):
-        promise.rows_of_task("task", read_runs([tmp_path]))
+        rows_of(read_runs([tmp_path]))
 
 
 def test_of_several_guides_the_best_one_is_compared(tmp_path):
@@ -128,8 +137,15 @@ def test_of_several_guides_the_best_one_is_compared(tmp_path):
     rows = driven("guide x", {"a": 500.0, "b": 500.0}) + driven("guide y", {"a": 5.0, "b": 5.0})
     rows += driven("coil_intact", {"a": 90.0, "b": 90.0})
     make_run(tmp_path / "two", "coil_intact", 0, rows)
-    (row,) = promise.rows_of_task("task", read_runs([tmp_path]))
+    (row,) = rows_of(read_runs([tmp_path]))
     assert row["guide"] == 500
+
+
+def test_of_several_learners_alone_the_best_one_is_compared(tmp_path):
+    arms = {"ppo_alone": 10.0, "sac_alone": 400.0, "coil_intact": 90.0, "coil_random": 5.0}
+    rows = rows_of(read_runs([small(tmp_path, arms, seeds=2)]))
+    assert [(row["learner"], row["alone"], row["guide"]) for row in rows] == [("sac", 210, 100)] * 2
+    assert rows[0]["difference"] == pytest.approx(100 * (55 - 210) / (210 - 100))
 
 
 @pytest.mark.parametrize(
@@ -138,7 +154,7 @@ def test_of_several_guides_the_best_one_is_compared(tmp_path):
         (None, "does not exist; give the folder of the experiments"),
         ({}, "has no task with plain PPO; train it: +arm=alone method=ppo"),
         ({"coil_intact": 5.0}, "has no task with plain PPO; train it: +arm=alone method=ppo"),
-        ({"ppo_alone": 5.0}, "has plain PPO alone; train it with a guide"),
+        ({"ppo_alone": 5.0}, "has no run with a guide; train it"),
     ],
     ids=["no folder", "empty folder", "no PPO", "only PPO"],
 )
@@ -152,6 +168,22 @@ def test_folder_without_results_is_one_sentence(arms, message, tmp_path, monkeyp
     assert refused.value.code == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.rglob("promise.*"))
+
+
+PUBLISHED = sorted(path.stem for path in (CONFS[0] / "settings" / "zoo").glob("*.yaml"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_published_settings_are_those_of_a_run_of_their_task(name, tmp_path):
+    task, _, learner = name.rpartition("_")
+    if task == "swimmer":
+        pytest.importorskip("mujoco")
+    words = ["+experiment=promise", f"+task={task}", "+arm=alone", f"+settings=zoo/{name}"]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", [*words, f"run_dir={tmp_path}"])
+        check(config)
+    assert config.label == f"{learner}_zoo_alone"
 
 
 @pytest.fixture(scope="module")
@@ -183,12 +215,12 @@ def test_experiment_trains_the_arms_of_a_task_in_its_folder(folder):
 
 
 @pytest.mark.slow
-def test_table_compares_each_arm_with_the_better_of_guide_and_ppo(folder):
+def test_table_compares_each_arm_with_the_better_of_guide_and_learning_alone(folder):
     runs = read_runs([folder / "pendulum"])
-    intact, random = promise.rows_of_task("pendulum", runs)
+    intact, random = rows_of(runs)
     assert [intact["arm"], random["arm"]] == ["intact", "random"]
-    assert intact["ppo"] == random["ppo"]
-    assert intact["guide"] > intact["ppo"], "so the guide is what it is compared with"
+    assert intact["alone"] == random["alone"]
+    assert intact["guide"] > intact["alone"], "so the guide is what it is compared with"
     scale = intact["guide"] - random["guide"]
     expected = 100 * (intact["end"] - intact["guide"]) / scale
     assert intact["difference"] == pytest.approx(expected)
@@ -213,19 +245,22 @@ def test_program_writes_the_table(folder, monkeypatch, capsys):
     assert page in capsys.readouterr().out
     assert "gains," in page
     assert (folder / "promise.csv").exists()
+    runs = pd.read_csv(folder / "promise_runs.csv")
+    assert len(runs) == 6
+    assert runs.groupby("method").fingerprint.nunique().to_dict() == {"ppo": 1, "coil_anchored": 2}
     assert "others" not in page
 
 
 @pytest.mark.slow
 def test_seeds_that_confirm_have_a_column_of_their_own(folder):
     runs = read_runs([folder / "pendulum"])
-    rows = promise.rows_of_task("pendulum", runs)
-    promise.add_parts(rows, runs, 1)
+    rows = rows_of(runs)
+    promise.add_parts(rows, promise.arms_of(runs), 1)
     scale = rows[0]["guide"] - rows[1]["guide"]
     for column, seed in (("claimed", 0), ("others", 1)):
         intact = promise.arms_of(runs)["coil_anchored", "intact"]
         expected = 100 * (intact.reward(seed) - intact.guide) / scale
         assert rows[0][column].startswith(f"{expected:+.1f} (")
-    promise.add_parts(rows, runs, 2)
+    promise.add_parts(rows, promise.arms_of(runs), 2)
     assert rows[0]["others"] == ""
     assert f"{rows[0]['difference']:+.1f}" in rows[0]["claimed"]
