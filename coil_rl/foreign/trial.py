@@ -76,14 +76,12 @@ class Trial:
 
     Attributes:
         findings: what is wrong.
-        seconds: the shortest time of an action of one row, by the title of the controller.
     """
 
     def __init__(self, env: EnvBase, steps: int = STEPS, patience: float = math.inf) -> None:
         self.env, self.steps, self.patience = env, steps, patience
         self.base = env.base_env if isinstance(env, TransformedEnv) else env
         self.findings: list[Finding] = []
-        self.seconds: dict[str, float] = {}
         self.clock = Clock()
         if isinstance(self.base, GymnasiumEnv):
             self.base.stay_in_process()
@@ -335,7 +333,6 @@ class Trial:
         if slow > 1:
             recorded = recorded[:, : max(FEWEST, recorded.shape[1] // slow)]
             advice = advice[:, : recorded.shape[1]]
-        self.seconds[own.title] = min(host.seconds for host in first.hosts.values())
 
         def ask(data: TensorDictBase, **how: Any) -> Tensor:
             again = _new(own, lambda: _reseeded(own.make(), first))
