@@ -15,7 +15,6 @@ import pytest
 from programs import TINY, called, command, environment, program
 
 from coil_rl.programs import app
-from coil_rl.programs import app
 from coil_rl.run import checkpoint, stopping
 from coil_rl.run.folder import is_evaluated, locked
 
