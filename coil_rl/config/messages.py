@@ -26,6 +26,7 @@ from yaml.error import MarkedYAMLError
 from coil_rl import conf
 from coil_rl.config import schema
 from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean, is_outside, lacks_memory
+from coil_rl.output import printable
 from coil_rl.plain_yaml import entries
 
 # Launchers of Hydra, and the extra of the package that installs each.
@@ -87,7 +88,7 @@ def reason_of(error: Exception) -> str:
 
 def sentence(error: BaseException) -> str:
     """Return the message of an error of the user, of Hydra or of OmegaConf on one line."""
-    return " ".join(_message(error).split())
+    return printable(" ".join(_message(error).split()))
 
 
 def _message(error: BaseException) -> str:
