@@ -61,6 +61,11 @@ class SafeStream:
         return getattr(self.stream, name)
 
 
+def printable(text: str) -> str:
+    """Return a text that may be somebody else's, without what a terminal obeys."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
+
+
 _quiet: ContextVar[str] = ContextVar("quiet", default="")
 
 

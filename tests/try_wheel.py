@@ -29,7 +29,6 @@ NEED_A_CHECKOUT = [
     "docs",
     "examples",
     "test_contributing.py",
-    "test_fuzz.py",
     "test_imports.py",
     "test_packaging.py",
     "test_readme.py",

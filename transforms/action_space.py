@@ -48,10 +48,6 @@ def written_key(key: NestedKey) -> str:
     return f"[{','.join(json.dumps(part) if part.isdigit() else part for part in key)}]"
 
 
-class ChoicesError(ValueError):
-    """An error about an action that is choices, where a number is needed."""
-
-
 class ActionRange:
     """The numbers that an action may have, in the unit and numbering of its env.
 

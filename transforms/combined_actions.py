@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from coil_rl.ranges import Share, checked
-from coil_rl.transforms.action_space import ChoicesError
 from coil_rl.transforms.guide_transform import (
     GuideSettings,
     GuideTransform,
@@ -67,12 +66,12 @@ class CombinedAction(GuideTransform):
         return {EXECUTED: Unbounded(spec.shape, device=self.parent.device, dtype=spec.dtype)}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add what it writes; raises a `ChoicesError` if choices would have to be added."""
+        """Add what it writes; raises a `ValueError` if choices would have to be added."""
         if self.adds and not self.action_space.continuous:
-            raise ChoicesError(
+            raise ValueError(
                 f"{type(self).__name__} needs continuous actions, but this env has "
-                f"{self.action_space.size} discrete ones; use Takeover, which replaces the agent's "
-                "action in some steps"
+                f"{self.action_space.size} discrete ones; take method=coil_anchored, method=coil, "
+                "or Takeover, which replaces the agent's action in some steps"
             )
         return super().transform_observation_spec(observation_spec)
 

@@ -3,8 +3,7 @@
 A mistake is found in seconds.
 """
 
-import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,29 +36,13 @@ from coil_rl.config.values import check_values
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.off_policy import OffPolicy
-from coil_rl.output import say
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, transformed, try_out
 from coil_rl.run.training import INIT
-from coil_rl.transforms.action_space import ChoicesError, nested_key
+from coil_rl.transforms.action_space import nested_key
 
-# Methods that take choices as actions, the most useful ones first.
-WITH_CHOICES = (
-    "coil_anchored",
-    "coil",
-    "coil_dropout",
-    "rfc",
-    "coil_rfc",
-    "kickstart",
-    "jump_start",
-    "imitate_then_ppo",
-    "advisor",
-    "dagger",
-    "oil",
-    "ppo",
-)
 # Kind of a learner: description and example.
 KINDS = {
     "agent": ("learns from reward", "ppo"),
@@ -67,9 +50,6 @@ KINDS = {
     "guides": ("improves its guides", "dynamic_coil"),
 }
 WATCHED = ("episode", "step")  # groups of `watch`
-# What is said of a slow controller is about so many steps of an episode, and a curve of so many
-# policies at least.
-STEPS_SAID, POINTS_SAID = 100, 8
 
 
 def check(config: DictConfig) -> None:
@@ -96,12 +76,7 @@ def check(config: DictConfig) -> None:
     build_all(config.evaluation.advice, "evaluation.advice")
     if has_agent:
         _check_label(config.label)
-        try:
-            _check_training(config, make_env)
-        except UserError as error:
-            if not needs_numbers(error):
-                raise
-            raise UserError(about_choices(config)) from error
+        _check_training(config, make_env)
         if config.method.transforms:
             for advice in config.evaluation.advice:
                 _check_cases(cases, partial(make_env, cases, TEST, advice))
@@ -177,9 +152,7 @@ def _check_env(
     for key in recorded:
         check_entry(env, key, "evaluation.pictures")
     guides = _check_guides(config, make_env, cases, env)
-    trial = try_out(env, guides)
-    if OmegaConf.get_type(config) is TrainConfig:
-        _say_cost_of_curve(config, trial.seconds)
+    try_out(env, guides)
 
 
 def _check_guides(
@@ -205,31 +178,6 @@ def _check_guides(
     if config.degrade:
         _check_cases(cases, partial(make_env.guided, cases, TEST, guides))
     return guides
-
-
-def _say_cost_of_curve(config: DictConfig, seconds: Mapping[str, float]) -> None:
-    """Say how much time a slow controller takes in the evaluation curve, and how to shorten it.
-
-    The number of policies in it is left to the user: if it followed a measured time, the same
-    command would make another run on a busier machine.
-
-    Args:
-        seconds: of an action, by controller.
-    """
-    curve = config.evaluation.curve
-    asks = config.method.observes is not None and "advice" in config.method.transforms
-    sets = 1 if config.delivery == "tested" else len(curve.cases)
-    episodes = (curve.points + 1) * curve.num_envs * sets
-    for title, each in seconds.items():
-        minutes = STEPS_SAID * episodes * each / 60
-        if asks and curve.points >= POINTS_SAID and 1 <= minutes < math.inf:
-            say(
-                f"an action of the controller {title} takes {1000 * each:.1f} ms, so the "
-                f"evaluation curve takes {minutes:.0f} min for each {STEPS_SAID} steps of its "
-                f"{episodes} episodes ({curve.points + 1} policies); "
-                f"evaluation.curve.points={curve.points // 4} keeps fewer policies",
-                error=True,
-            )
 
 
 def _check_cases(cases: int, make: Callable[[], Any]) -> None:
@@ -370,34 +318,3 @@ def _check_frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> None:
             f"guides take {taken} frames; give at least "
             f"{taken + budget.num_envs * budget.steps}, or a smaller proxy.budget.frames"
         )
-
-
-def needs_numbers(error: BaseException | None) -> bool:
-    """Return whether an error, or one of its causes, is about choices where numbers are needed.
-
-    Args:
-        error: or None.
-    """
-    while error is not None and not isinstance(error, ChoicesError):
-        error = error.__cause__
-    return error is not None
-
-
-def about_choices(config: DictConfig) -> str:
-    """Return why a method cannot be used where actions are choices, and which ones can.
-
-    Args:
-        config: composed, of a method that needs numbers.
-    """
-    needs = f"method={config.method.name}"
-    if config.method.name in WITH_CHOICES:  # then it is another learner than the method's own
-        needs = f"learner={config.learner['_target_'].rpartition('.')[2].lower()}"
-    if config.action:
-        return (
-            f"{needs} needs numbers as actions, but action=choices makes choices of them; leave "
-            f"action= out, or take learner=dqn or learner=ppo with method={', '.join(WITH_CHOICES)}"
-        )
-    return (
-        f"{needs} needs numbers as actions, but they are choices here; with choices take "
-        f"learner=ppo and method={', '.join(WITH_CHOICES)}"
-    )

@@ -17,7 +17,6 @@ by the names of their folders:
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from importlib import metadata, resources
 from importlib.resources.abc import Traversable
@@ -75,23 +74,6 @@ class GuestFiles(SearchPathPlugin):
 Plugins.instance().register(GuestFiles)
 
 
-@dataclass(frozen=True)
-class Written:
-    """A value in a file of a user.
-
-    Args:
-        key: its full key.
-        value: as written, perhaps a reference.
-        file: name of the file, for messages.
-        files: that file, and those whose defaults list leads to it.
-    """
-
-    key: str
-    value: Any
-    file: str
-    files: frozenset[str]
-
-
 def keep_written(
     config: DictConfig, hydra: Any, task: Sequence[str], others: Sequence[str] = ()
 ) -> None:
@@ -106,7 +88,7 @@ def keep_written(
         others: overrides of the command line for Hydra.
 
     Raises:
-        UserError: for a value that two files give differently, or that has no place.
+        UserError: for a word that chooses several files of a group that takes one.
     """
     loader = GlobalHydra.instance().config_loader()
     groups = {str(group).replace("/", ".") for group in hydra.runtime.choices}
@@ -120,48 +102,16 @@ def keep_written(
             )
     places = [f"{place.schema}://{place.path}" for place in hydra.runtime.config_sources]
     # To look for files of users takes as long as to compose all files.
-    if not all(place.startswith(shipped_places()) for place in places):
-        name, words = hydra.job.config_name, [*task, *others]
-        defaults = loader.compute_defaults_list(name, words, RunMode.RUN).defaults
-        # A choice of a file, such as method=coil, gives no value.
-        typed = [key for key in map(key_of, task) if key not in groups]
-        with open_dict(config):
-            _keep(config, _written(defaults, places), typed)
-
-
-def _keep(config: DictConfig, values: Iterable[Written], typed: Sequence[str]) -> None:
-    """Put values of users' files into their places.
-
-    Args:
-        config: composed; it is changed in place.
-
-    Raises:
-        UserError: for a value that two files give differently, or that has no place.
-    """
-    last: dict[str, Written] = {}
-    for written in values:
-        if any(covers(key, written.key) for key in typed):
-            continue
-        other = last.get(written.key, written)
-        last[written.key] = written
-        if other.value != written.value and not _lists(other, written):
-            raise UserError(
-                f"{written.key} is {other.value} in {other.file} and {written.value} in "
-                f"{written.file}; leave one out, or give it on the command line"
-            )
-        _put(config, written)
-
-
-def _put(config: DictConfig, written: Written) -> None:
-    """Set a value; a `UserError` if a node on its way is no node."""
-    parent = written.key.rpartition(".")[0]
-    node = OmegaConf.select(config, parent, throw_on_resolution_failure=False) if parent else config
-    if parent and node is not None and not isinstance(node, DictConfig):
-        raise UserError(
-            f"{written.file}: {written.key} has no place, because {parent} is {node!r}; leave it "
-            "out, or give it on the command line"
-        )
-    OmegaConf.update(config, written.key, written.value, merge=False, force_add=True)
+    if all(place.startswith(shipped_places()) for place in places):
+        return
+    name, words = hydra.job.config_name, [*task, *others]
+    defaults = loader.compute_defaults_list(name, words, RunMode.RUN).defaults
+    # A choice of a file, such as method=coil, gives no value.
+    typed = [key for key in map(key_of, task) if key not in groups]
+    with open_dict(config):
+        for key, value in _written(defaults, places):
+            if not any(covers(each, key) for each in typed):
+                OmegaConf.update(config, key, value, merge=False, force_add=True)
 
 
 def key_of(text: str) -> str:
@@ -188,32 +138,24 @@ def covers(one: str, other: str) -> bool:
     return one == other or other.startswith(f"{one}.") or one.startswith(f"{other}.")
 
 
-def _lists(one: Written, other: Written) -> bool:
-    """Return whether one of two files has the other in its defaults list, whose order is meant."""
-    return one.file in other.files or other.file in one.files
-
-
-def _written(defaults: Iterable[Any], places: Sequence[str]) -> Iterator[Written]:
-    """Yield the values in the files of users, in the order of composition.
+def _written(defaults: Iterable[Any], places: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    """Yield the values in the files of users by their full keys, in the order of composition.
 
     Args:
-        defaults: Hydra's list of all files.
-        places: where Hydra looks for files, the first one that has a file wins.
+        defaults: Hydra's defaults list.
+        places: folders and packages of the files, in the order in which Hydra looks.
     """
-    defaults = [default for default in defaults if default.config_path is not None]
-    parents = {default.config_path: default.parent for default in defaults}
     for default in defaults:
         name = f"{default.config_path}.yaml"
         found = [(place, file) for place in places if (file := _file(place, name)).is_file()]
-        if not found or found[0][0].startswith(shipped_places()):
+        if default.config_path is None or not found or found[0][0].startswith(shipped_places()):
             continue
-        lists = frozenset(f"{path}.yaml" for path in _ancestors(default, parents))
         content = OmegaConf.create(found[0][1].read_text(encoding="utf-8"))
         values: Any = OmegaConf.to_container(content, resolve=False)
         for key, _, value in entries(values, default.package or ""):
             is_node = isinstance(value, Mapping)
             if not is_node and key.partition(".")[0] not in ("hydra", "defaults"):
-                yield Written(key, value, name, lists)
+                yield key, value
 
 
 def _file(place: str, name: str) -> Traversable:
@@ -222,16 +164,6 @@ def _file(place: str, name: str) -> Traversable:
     if kind == "pkg" and find_spec(where.replace("/", ".")) is not None:
         return resources.files(where.replace("/", ".")) / name
     return Path(where) / name
-
-
-def _ancestors(default: Any, parents: Mapping[str, str | None]) -> set[str]:
-    """Return the path of a file and of those whose defaults list leads to it."""
-    paths = {default.config_path}
-    path = default.parent
-    while path is not None and path not in paths:
-        paths.add(path)
-        path = parents.get(path)
-    return paths
 
 
 def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConfig:

@@ -26,8 +26,8 @@ from yaml.error import MarkedYAMLError
 from coil_rl import conf
 from coil_rl.config import schema
 from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean, is_outside, lacks_memory
+from coil_rl.output import printable
 from coil_rl.plain_yaml import entries
-from coil_rl.run.folder import is_begun
 
 # Launchers of Hydra, and the extra of the package that installs each.
 LAUNCHERS = {
@@ -36,19 +36,14 @@ LAUNCHERS = {
     "submitit_local": "slurm",
     "ray": "ray",
 }
-
-
 TYPED = re.compile(r"Could not override '([^']+)'")
 MERGED = re.compile(r"Error merging override (.+)")
 LACKED = re.compile(r"Missing mandatory value: ([\w.]+)")
-AMBIGUOUS = "Ambiguous value for argument"
 NO_CHOICE = "Config group override must be a string or a list"
 NO_INTEGER = re.compile(
     r"override ([\w.]+)=.*Value '([\d.eE+]+)' of type 'float' could not be converted to Integer",
     re.DOTALL,
 )
-
-
 # Names of hyper-parameters elsewhere (Stable-Baselines3, CleanRL, rsl_rl), and ours.
 OTHER_NAMES = {
     "lr": "learning_rate",
@@ -93,7 +88,7 @@ def reason_of(error: Exception) -> str:
 
 def sentence(error: BaseException) -> str:
     """Return the message of an error of the user, of Hydra or of OmegaConf on one line."""
-    return " ".join(_message(error).split())
+    return printable(" ".join(_message(error).split()))
 
 
 def _message(error: BaseException) -> str:
@@ -124,9 +119,10 @@ def _message(error: BaseException) -> str:
             "logger=none, disturb=[] or degrade=[], or leave it out"
         )
     if isinstance(error, OverrideParseException):
-        return _unreadable_override(error)
-    if str(error).startswith(AMBIGUOUS):  # also where an experiment that sweeps cannot be composed
-        return f"{_first_paragraph(error)}; or another word is wrong, which -m names"
+        return (
+            f"{error.override!r} cannot be parsed; "
+            "write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"
+        )
     return _not_composed(error)
 
 
@@ -160,27 +156,9 @@ def _wrong_kind(override: str, cause: str) -> str:
             f"{number[1]}={number[2]} must be a whole number; "
             f"write {number[1]}={int(float(number[2])):_}"
         )
-    if "could not be converted to Integer" in cause:
-        return f"{override} must be a whole number"
-    if "could not be converted to Float" in cause:
-        return f"{override} must be a number"
-    if "is not a valid bool" in cause or "could not be converted to Boolean" in cause:
-        return f"{override} must be true or false"
     if "is not a ListConfig" in cause:
         return f"{override} must be a list; write {key}=[{value}]"
-    if "does not support deletion" in cause:
-        return f"{override}: {key.lstrip('~')} cannot be left out; give it another value"
     return ""
-
-
-def _unreadable_override(error: OverrideParseException) -> str:
-    """Return the message for an argument that is no KEY=VALUE."""
-    if is_begun(Path(error.override)):
-        return f"{error.override!r} is the folder of a run; write run={error.override} (see --help)"
-    return (
-        f"{error.override!r} cannot be parsed; "
-        "write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"
-    )
 
 
 def _unusable_file(error: OSError) -> str:
@@ -336,9 +314,6 @@ def choice(group: str, name: str, options: Iterable[str]) -> str:
         return f"; for an env of Gymnasium write env=gym env.id={name}"
     if group == "guide" and ":" in name:
         return f"; for a controller of your own write guide=controller guide.controller.of={name}"
-    if group.startswith("guide") and (Path(group[6:], name) / "config.yaml").is_file():
-        folder = Path(group[6:], name)
-        return f"; for the policy of a run write guide=learned guide.learned.run={folder}"
     return similar(name, options)
 
 

@@ -1,14 +1,12 @@
 """Words of the command line that nothing reads: they would have no effect, and are refused.
 
-Some nodes are read by some runs only, or only where another value refers to them. This is known
-without building anything, so that a sweep of many runs can be asked before its first one.
+Some nodes are read by some runs only, or only where another value refers to them.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.config.compose import REFERENCE, covers, key_of
 from coil_rl.config.parts import advises, env_maker, learner_kind, trains_guides
@@ -101,41 +99,3 @@ def _adds_noise(config: DictConfig) -> bool:
         return False
     env = env_maker(config)()
     return bool(env.full_action_spec[env.action_key].dtype.is_floating_point)
-
-
-def check_sweep(task: Iterable[str], runs: Sequence[DictConfig]) -> list[str]:
-    """Refuse a word that no run of a sweep reads.
-
-    Args:
-        task: words for the program, those of the sweep as they were given.
-        runs: configurations of all runs; one object for those that differ by their seed only.
-
-    Returns:
-        a sentence for each word that only some of the runs read.
-
-    Raises:
-        UserError: for the first word that none of them reads.
-    """
-    sentences = []
-    different = {id(run): run for run in runs}
-    for text in task:
-        ignoring = {key: run for key, run in different.items() if _ignores(run, text)}
-        if runs and len(ignoring) == len(different):
-            [sentence] = unread(runs[0], [text])
-            raise UserError(sentence.replace("no effect", "no effect in any run of this sweep"))
-        if ignoring:
-            count = sum(id(run) in ignoring for run in runs)
-            methods = dict.fromkeys(str(run.method.name) for run in ignoring.values())
-            sentences.append(
-                f"{text} has no effect in {count} of {len(runs)} runs of this sweep "
-                f"(method={', '.join(methods)})"
-            )
-    return sentences
-
-
-def _ignores(config: DictConfig, text: str) -> bool:
-    """Return whether a run does not read a word; not if it is wrong, as its own check says."""
-    try:
-        return any(True for _ in unread(config, [text]))
-    except (UserError, OmegaConfBaseException):
-        return False

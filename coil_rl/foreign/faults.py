@@ -32,9 +32,9 @@ def foreign(name: str, call: str) -> Iterator[None]:
     """
     try:
         yield
-    except ForeignError:
+    except (ForeignError, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:  # also what a library derives from it
         # A tail such as ": " without a text would say nothing.
         text = shortened(str(error)) or "without a text"
         raise ForeignError(f"{name}: {call} raised {type(error).__name__}: {text}") from error

@@ -49,7 +49,8 @@ def _go_to(folder: str | None) -> None:
 
 
 def _logging() -> tuple[int, ...]:
-    return (logging.root.manager.disable, *(logger.level for logger in LOGGERS))
+    root, own = LOGGERS
+    return root.manager.disable, root.level, own.level
 
 
 def _set_logging(levels: tuple[int, ...]) -> None:
@@ -80,8 +81,22 @@ def _set_printing(state: tuple[Any, ...]) -> None:
     vars(tensor_str.PRINT_OPTS).update(of_torch)
 
 
-def _set_device(device: torch.device) -> None:
-    torch.set_default_device(None if device.type == "cpu" else device)
+def _device() -> Any:
+    # `torch.get_default_device` takes thirty times as long, because it makes a tensor.
+    return getattr(torch._GLOBAL_DEVICE_CONTEXT, "device_context", None)
+
+
+def _set_device(context: Any) -> None:
+    torch.set_default_device(None if context is None else context.device)
+
+
+def _set_path(folders: list[str]) -> None:
+    sys.path[:] = folders
+
+
+def _set_recursion(limit: int) -> None:
+    with suppress(RecursionError):  # one that is reached already
+        sys.setrecursionlimit(limit)
 
 
 def _set_streams(streams: tuple[Any, ...]) -> None:
@@ -111,10 +126,12 @@ SETTINGS: list[tuple[Callable[[], Any], Callable[[Any], Any]]] = [
     (_warnings, _set_warnings),
     (_printing, _set_printing),
     (lambda: (sys.stdout, sys.stderr), _set_streams),
+    (_device, _set_device),
+    (lambda: sys.path[:], _set_path),
+    (sys.getrecursionlimit, _set_recursion),
 ]
 QUICK = len(SETTINGS)
 SETTINGS += [
-    (torch.get_default_device, _set_device),
     (torch.are_deterministic_algorithms_enabled, torch.use_deterministic_algorithms),
     (torch.get_float32_matmul_precision, torch.set_float32_matmul_precision),
     (_handlers, _set_handlers),
@@ -221,8 +238,8 @@ def _set_torch(states: Sequence[Tensor]) -> None:
 
 def _equal(states: Sequence[Tensor], others: Sequence[Tensor]) -> bool:
     """Return whether states have the same bytes."""
-    pairs = zip(states, others, strict=True)
-    return all(one.numpy().tobytes() == other.numpy().tobytes() for one, other in pairs)
+    one, other = ([state.numpy().tobytes() for state in each] for each in (states, others))
+    return one == other
 
 
 class Guard:
@@ -263,15 +280,19 @@ class Guard:
             _STATE.raw, _PYTHON.gauss_next = python, self.gauss
             _set_torch(of_torch)
             self.bits, self.same_bits = np.random.MT19937(0), np.random.MT19937(0)
-        for place, before in enumerate(self.settings):
-            get, put = SETTINGS[place]
-            now = get()
-            if now == before:
+        now = [get() for get, _ in SETTINGS[: len(self.settings)]]
+        if now != self.settings:
+            self._restore(now)
+        self.count = QUICK if not self.theirs else len(SETTINGS)
+
+    def _restore(self, now: list[Any]) -> None:
+        for place, (before, after) in enumerate(zip(self.settings, now, strict=True)):
+            if after == before:
                 continue
+            put = SETTINGS[place][1]
             put(before)
             if put is not _set_handlers:  # without ours a Ctrl-C would be missed
-                self.theirs[place] = now
-        self.count = QUICK if not self.theirs else len(SETTINGS)
+                self.theirs[place] = after
 
 
 class Held:

@@ -6,7 +6,6 @@ What it is is decided here only, see `role_of`.
 import inspect
 import math
 import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -195,7 +194,6 @@ class Host:
         self.thing: Any = None
         self.steps: int | None = None  # of the episode; unknown after a resume
         self.numbers = Numbers(torch.initial_seed() + row)  # those of its env, where it is beside
-        self.seconds = math.inf  # of the processor, the shortest that an action took
 
     @property
     def place(self) -> str:
@@ -234,10 +232,8 @@ class Host:
         """
         if self.thing is None:
             self.open()
-        start = time.process_time()
         with self.of_call(), foreign(self.place, "act"):
             answer = self.thing.act(*observed)
-        self.seconds = min(self.seconds, time.process_time() - start)
         try:
             return action_array(answer)
         except ForeignError as error:

@@ -195,7 +195,7 @@ class GymnasiumPlant(Plant):
         self.steps += 1
         try:  # without `foreign` and `placed`, which cost as much as a step of a small env
             answer: Any = self.env.step(action)
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             with foreign(self.place, "step"):
                 raise error
         try:

@@ -6,6 +6,7 @@ again.
 """
 
 import warnings
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -21,57 +22,109 @@ from coil_rl.foreign.guard import Guard
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key
 from coil_rl.transforms.hosted import HostedGuide
 
-# Share of the largest number of the actions by which they may differ: for the same question, and in
-# a batch of another size, in which a network adds up in another order.
-SAME, BESIDE_OTHERS = 1e-5, 1e-2
+# Share of the largest number of the actions by which they may differ: for the same question; in a
+# batch of another size, in which a network adds up in another order; and of NumPy and torch.
+SAME, BESIDE_OTHERS, ROUNDING = 1e-5, 1e-2, 1e-4
 # Factor and offset of a row, and of two others that must not be mixed with it: one of its size, and
 # one beyond all limits of a sum or a maximum.
 ROWS = ((1.0, 0.0), (0.37, 1.61), (-1000.0, 1000.0))
 COMPARED = 2  # of these; the numbers of the last one are too large to show a small difference
-ROUNDING = 1e-4  # of the largest number of an action
+
+Ask = Callable[[Sequence[Tensor]], Tensor]  # entries [n, ...] to actions [n, A]
 
 
 class SharedError(ForeignError):
     """A controller cannot be shared by all rows."""
 
 
-def check_shared(
-    title: str, ask: Callable[[Sequence[Tensor]], Tensor], rows: Sequence[Tensor]
-) -> None:
-    """Ask a controller that all rows share for some rows: each alone, together, and alone again.
+def takes_batch(
+    title: str, rows: Sequence[Tensor], together: Ask, each: Ask | None, form: Callable[..., bool]
+) -> bool:
+    """Return whether a controller takes all rows at once; false: one after the other.
+
+    It is asked for the first row and others like it, or for the rows where it refuses those.
 
     Args:
         title: name of the controller, for messages.
-        ask: returns its actions for entries.
         rows: what it reads, [n, ...] each.
+        together: asks it for all rows at once.
+        each: asks it for one row after the other; None if it cannot be.
+        form: returns whether an answer for all rows has the form of actions, beside those alone.
 
     Raises:
         SharedError: if it remembers or draws something, or mixes the rows.
     """
-    count = len(rows[0])
+    if each is not None:
+        try:
+            each([entry[:1] for entry in rows])
+        except Exception:
+            each = None
+    try:
+        return _agrees(title, [_beside_others(entry[0]) for entry in rows], together, each, form)
+    except SharedError:
+        raise
+    except Exception:
+        first = [entry[: len(ROWS)] for entry in rows]
+        if each is None:
+            return _agrees(title, first, together, None, form)
+        _agrees(title, first, each, None, form)
+        return False
+
+
+def _agrees(
+    title: str, rows: Sequence[Tensor], together: Ask, each: Ask | None, form: Callable[..., bool]
+) -> bool:
+    """Ask for rows alone, together in two orders, and alone again; see `takes_batch`."""
+    count, single = len(rows[0]), each or together
 
     def alone(row: int) -> Tensor:
-        return _numbers(ask([entry[row : row + 1].clone() for entry in rows]))
+        return _numbers(single([entry[row : row + 1].clone() for entry in rows]))
 
-    before, actions = list(map(alone, range(count))), ask([entry.clone() for entry in rows])
+    before, batches = list(map(alone, range(count))), []
+    orders = list(range(count)), list(reversed(range(count)))
+    try:
+        batches = [together([entry[order].clone() for entry in rows]) for order in orders]
+    except Exception:
+        if each is None:
+            raise
     # In another order, as a mean over so many calls is the same in the same one.
-    after = list(map(alone, reversed(range(count))))[::-1]
-    for row, (one, other) in enumerate(zip(before, after, strict=True)):
+    after = list(map(alone, orders[1]))[::-1]
+    for one, other in zip(before, after, strict=True):
         if not _near(one, other, SAME, before):
             raise SharedError(
                 f"the controller {title} returned {shown(one)} and then {shown(other)} for the "
                 "same observation: all rows share it, so it must not remember or draw anything; "
                 "write a class with act(observation) and reset()"
             )
-        if actions.shape[:1] != rows[0].shape[:1] or row >= COMPARED:
-            continue  # other shapes are refused as actions
-        beside = _numbers(actions[row])
-        if not _near(one, beside, BESIDE_OTHERS if actions.is_floating_point() else 0.0, before):
+    for batch, order in zip(batches, orders, strict=True):
+        row = _other_row(batch, order, before, ROUNDING if each else BESIDE_OTHERS)
+        if each is not None and (row is not None or not form(batch, before[0])):
+            return False
+        if row is not None:
+            beside = shown(_numbers(batch[order.index(row)]))
             raise SharedError(
-                f"the controller {title} returned {shown(one)} for an observation alone, but "
-                f"{shown(beside)} for it in a batch of {count}: it mixes the rows, as by a mean "
-                "over the batch; write a class with act(observation), which gets one row"
+                f"the controller {title} returned {shown(before[row])} for an observation alone, "
+                f"but {beside} for it in a batch of {count}: it mixes the rows, as by a mean over "
+                "the batch; write a class with act(observation), which gets one row"
             )
+    return bool(batches)
+
+
+def _other_row(
+    batch: Tensor, order: list[int], alone: Sequence[Tensor], tolerance: float
+) -> int | None:
+    """Return a row with other actions in a batch than alone; None if there is none.
+
+    Others than one for each row are refused as actions.
+    """
+    if batch.shape[:1] != (len(order),):
+        return None
+    if not batch.is_floating_point():
+        tolerance = 0.0
+    for row in range(min(COMPARED, len(order))):
+        if not _near(alone[row], _numbers(batch[order.index(row)]), tolerance, alone):
+            return row
+    return None
 
 
 def _numbers(action: Tensor) -> Tensor:
@@ -96,7 +149,11 @@ class _Shared(HostedGuide):
     guard: Guard
     space: ActionSpace | None = None  # unknown outside of an env
     choices: OwnChoices = {}  # noqa: RUF012  replaced, never changed
-    asked = False  # whether it was checked that it can be shared
+    for_batch: bool | None = None  # unknown before the first call
+
+    @abstractmethod
+    def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
+        """Return the actions for all rows."""
 
     def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Take the space of the actions, which decides what has the form of actions."""
@@ -108,35 +165,42 @@ class _Shared(HostedGuide):
         """Return the error for an action that does not fit the env."""
         return ForeignError(f"the controller {self.title}: its action {problem}")
 
-    def _actions(
-        self, ask: Callable[[Sequence[Tensor]], Tensor], entries: Sequence[Tensor], dims: int
-    ) -> Tensor:
-        """Return the actions for entries; before the first ones it is checked, see `check_shared`.
+    def _actions(self, entries: Sequence[Tensor], dims: int, each: Ask | None = None) -> Tensor:
+        """Return the actions for entries; before the first ones it is tried, see `takes_batch`.
 
         Args:
-            ask: returns the actions of the controller for entries.
             entries: [*batch, ...].
             dims: number of dimensions of the batch.
+            each: asks for one row after the other; None if that is not possible.
         """
         if torch.compiler.is_compiling():  # a traced function cannot raise
-            return ask(entries)
+            return self._of_batch(entries)
         with self.guard:
-            if not self.asked:
-                rows = [entry.flatten(0, dims - 1) if dims else entry[None] for entry in entries]
-                self._check(ask, rows)
-                self.asked = True
-            return ask(entries)
+            if self.for_batch and dims:
+                return self._of_batch(entries)
+            rows = [entry.flatten(0, dims - 1) if dims else entry[None] for entry in entries]
+            if self.for_batch is None:
+                with torch.no_grad(), warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # of numbers that no env has
+                    form = self._has_form
+                    self.for_batch = takes_batch(self.title, rows, self._of_batch, each, form)
+            if self.for_batch or each is None:
+                return self._of_batch(entries)
+            action = each(rows).to(rows[0].device)
+            return action.reshape(*entries[0].shape[:dims], *action.shape[1:])
 
-    def _check(self, ask: Callable[[Sequence[Tensor]], Tensor], rows: Sequence[Tensor]) -> None:
-        """Check it with the first row and others like it, or with rows where it refuses those."""
-        with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of numbers that no env has
-            try:
-                check_shared(self.title, ask, [_beside_others(entry[0]) for entry in rows])
-            except SharedError:
-                raise
-            except Exception:
-                check_shared(self.title, ask, [entry[: len(ROWS)] for entry in rows])
+    def _has_form(self, together: Tensor, alone: Tensor) -> bool:
+        """Return whether an answer for a batch has the form of actions.
+
+        Args:
+            alone: the numbers of the first row alone.
+        """
+        count = len(ROWS)
+        if together.numel() != count * alone.numel() or not together.isfinite().all():
+            return False
+        if together.shape == (count, *alone.shape):
+            return True
+        return self.space is not None and self.space.takes(together, torch.Size([count]))
 
     def _write(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
         """Write the action, which may be one number for each row, as regressors predict it."""
@@ -164,17 +228,16 @@ class NetworkGuide(_Shared, TensorDictModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        forward = super().forward
-
-        def ask(entries: Sequence[Tensor]) -> Tensor:
-            data = TensorDict({}, [], device=tensordict.device)
-            for key, entry in zip(self.in_keys, entries, strict=True):
-                data.set(key, entry)
-            action: Tensor = forward(data)["action"]
-            return action
-
         entries = [tensordict[key] for key in self.in_keys]
-        return self._write(tensordict, self._actions(ask, entries, tensordict.batch_dims))
+        return self._write(tensordict, self._actions(entries, tensordict.batch_dims))
+
+    def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
+        """Return the actions for all rows."""
+        data = TensorDict({}, [], device=entries[0].device)
+        for key, entry in zip(self.in_keys, entries, strict=True):
+            data.set(key, entry)
+        action: Tensor = super().forward(data)["action"]
+        return action
 
 
 class FunctionGuide(_Shared):
@@ -187,7 +250,7 @@ class FunctionGuide(_Shared):
     in the numbering of the env, as a Gymnasium env gives them. Which of the two it is, is found out
     at its first call: it is for a batch if it gives the same for a row beside quite other ones as
     for the row alone, in the form of actions, or if it cannot take a row alone. A function that
-    remembers something would mix the rows: `check_shared` finds it.
+    remembers something would mix the rows: `takes_batch` finds it.
 
     Args:
         function: takes one value for each of `in_keys`; it must give the same action for the same
@@ -211,20 +274,13 @@ class FunctionGuide(_Shared):
         super().__init__()
         self.function = function
         self.title = title or getattr(function, "__name__", type(function).__name__)
-        self.for_batch: bool | None = None  # unknown before the first call
         self.guard = Guard()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        if self.for_batch is None:
-            with self.guard:
-                self.for_batch = self._takes_batch(self._rows(tensordict))
-        if self.for_batch:  # traced for an export, so that nothing here may depend on the rows
-            entries = [tensordict[key] for key in self.in_keys]
-            action = self._actions(self._of_batch, entries, tensordict.batch_dims)
-            return self._write(tensordict, action)
-        action = self._actions(self._of_rows, self._rows(tensordict), 1).to(tensordict.device)
-        return self._write(tensordict, action.reshape(*tensordict.batch_size, *action.shape[1:]))
+        entries = [tensordict[key] for key in self.in_keys]
+        action = self._actions(entries, tensordict.batch_dims, self._of_rows)
+        return self._write(tensordict, action)
 
     def unfit(
         self, action: Tensor, batch: torch.Size, space: ActionSpace, problem: str
@@ -235,11 +291,6 @@ class FunctionGuide(_Shared):
         number, returned, problem = space.unfit_row(action, batch)
         place = f"the controller {self.title} (row {number})"
         return ForeignError(f"{place}: it returned {shown(returned)}, which {problem}")
-
-    def _rows(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Return the entries that the function gets, with one dimension of rows."""
-        flat = tensordict.select(*self.in_keys).reshape(-1)
-        return [flat[key] for key in self.in_keys]
 
     def _as_given(self, entries: Sequence[Tensor]) -> list[Tensor]:
         """Return entries as the env gives them, [*batch, ...]."""
@@ -265,7 +316,7 @@ class FunctionGuide(_Shared):
             raise ForeignError(
                 f"the controller {self.title} returned actions of the shapes {shapes} in one step"
             )
-        return torch.as_tensor(np.stack(rows))
+        return torch.from_numpy(np.stack(rows))
 
     def _alone(self, entries: Sequence[Tensor], row: int) -> NDArray[Any]:
         """Return the action for one row, as an array of at least one dimension."""
@@ -276,47 +327,6 @@ class FunctionGuide(_Shared):
             return action_array(action)
         except ForeignError as error:
             raise ForeignError(f"the controller {self.title} (row {row}): {error}") from error
-
-    def _takes_batch(self, entries: Sequence[Tensor]) -> bool:
-        """Return whether the function takes a batch, see the class."""
-        try:
-            self._alone(entries, 0)
-        except Exception:
-            return True
-        rows = [_beside_others(entry[0]) for entry in entries]
-        try:
-            each = [torch.as_tensor(self._alone(rows, row)) for row in range(len(rows[0]))]
-            alone = torch.stack(each).double()
-            return all(self._agrees(rows, alone, order) for order in ([0, 1, 2], [2, 1, 0]))
-        except Exception:
-            return False
-
-    def _agrees(self, rows: Sequence[Tensor], alone: Tensor, order: list[int]) -> bool:
-        """Return whether the function gives rows together what it gives each of them alone.
-
-        Args:
-            rows: entries of the rows, [n, ...].
-            alone: the action of each row alone, [n, A].
-        """
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of NumPy, which gets tensors here
-            entries = self._as_given([entry[order] for entry in rows])
-            together = torch.as_tensor(self.function(*entries))
-        if together.numel() != alone.numel() or not self._has_form(together, alone):
-            return False
-        difference = (together.cpu().reshape(alone.shape) - alone[order]).abs()
-        # NumPy and torch may add up in another order.
-        return bool((difference <= ROUNDING * alone[order].abs().amax(-1, keepdim=True)).all())
-
-    def _has_form(self, together: Tensor, alone: Tensor) -> bool:
-        """Return whether an answer for a batch has the form of actions.
-
-        Args:
-            alone: the action of each row alone, [n, A].
-        """
-        if together.shape == alone.shape:
-            return True
-        return self.space is not None and self.space.takes(together, alone.shape[:1])
 
 
 def _beside_others(entry: Tensor) -> Tensor:

@@ -44,6 +44,7 @@ from coil_rl.transforms.guide_actions import UnfitActionError
 STEPS, FEWEST = 10, 3
 PATIENCE = 0.02  # s, of a rollout; a slower env takes fewer steps
 PAUSE, PAUSED = 0.02, 3  # s, and how many steps have it
+JUMP = 10.0  # s, of the clock of Python in a pause
 QUICK, SLOW = 1e-6, 1e-4  # s, of a reading of the clock, without and with pauses
 # What classes may hold of their rows.
 DATA = (int, float, list, dict, set, deque, np.ndarray, Tensor)
@@ -75,14 +76,12 @@ class Trial:
 
     Attributes:
         findings: what is wrong.
-        seconds: the shortest time of an action of one row, by the title of the controller.
     """
 
     def __init__(self, env: EnvBase, steps: int = STEPS, patience: float = math.inf) -> None:
         self.env, self.steps, self.patience = env, steps, patience
         self.base = env.base_env if isinstance(env, TransformedEnv) else env
         self.findings: list[Finding] = []
-        self.seconds: dict[str, float] = {}
         self.clock = Clock()
         if isinstance(self.base, GymnasiumEnv):
             self.base.stay_in_process()
@@ -114,7 +113,7 @@ class Trial:
             elif isinstance(self.base, SeededRows):
                 changed = difference(first, self._rollout(0, state, pause=PAUSE))
                 if changed is not None:
-                    self.find("clock", f"{_title(changed)} differs when {PAUSE:g} s pass {CLOCK}")
+                    self.find("clock", f"{_title(changed)} differs when time passes {CLOCK}")
             self._look_at_bounds(first)
             self._step_leaves_its_input()
             if changed is None and self.env.batch_size and self.env.batch_size[0] > 1:
@@ -299,7 +298,7 @@ class Trial:
                 "the guide's action after the reset of a row depends on what was before it",
             )
         if not torch.equal(first, asked.advice(pause=PAUSE)) and torch.equal(first, again):
-            self.find("clock", f"the guide's action is another one when {PAUSE:g} s pass {CLOCK}")
+            self.find("clock", f"the guide's action is another one when time passes {CLOCK}")
 
     def _asked(
         self,
@@ -334,7 +333,6 @@ class Trial:
         if slow > 1:
             recorded = recorded[:, : max(FEWEST, recorded.shape[1] // slow)]
             advice = advice[:, : recorded.shape[1]]
-        self.seconds[own.title] = min(host.seconds for host in first.hosts.values())
 
         def ask(data: TensorDictBase, **how: Any) -> Tensor:
             again = _new(own, lambda: _reseeded(own.make(), first))
@@ -352,7 +350,7 @@ class Trial:
             return
         # First, because the readings of one row pass the time of the others.
         if not torch.allclose(advice, ask(recorded, pause=PAUSE)):
-            self.find("clock", f"{title} gives other actions when {PAUSE:g} s pass {CLOCK}")
+            self.find("clock", f"{title} gives other actions when time passes {CLOCK}")
             return
         alone, reset = ask(recorded[:1]), ask(recorded, reset_at=recorded.shape[1] // 2)
         if not torch.allclose(advice[:1], alone) or not torch.allclose(advice[1:], reset[1:]):
@@ -419,8 +417,8 @@ class Clock:
         return self.start[name] + since
 
     def pause(self, seconds: float) -> None:
-        """Wait, also by every other clock."""
-        self.passed += seconds
+        """Let time pass: much of it by this clock, and some by every other one."""
+        self.passed += JUMP
         self.tick = SLOW
         time.sleep(seconds)
 
@@ -439,7 +437,7 @@ class _Shared:
 
     def changed(self) -> str:
         """Return the names of what has changed; empty for nothing."""
-        return " and ".join(name for name, *_ in self._changed())
+        return " and ".join(dict.fromkeys(name for name, *_ in self._changed()))
 
     def restore(self) -> None:
         """Restore the values that have changed."""

@@ -22,7 +22,6 @@ from coil_rl.learners.policy import Entries, Policy
 from coil_rl.learners.ppo import PPO, PPOSettings
 from coil_rl.ranges import Count, Interval, NonNegative, Seed, checked
 from coil_rl.schedules import Linear, Schedule, schedule
-from coil_rl.transforms.action_space import ChoicesError
 from coil_rl.transforms.guide_actions import Guides
 from coil_rl.transforms.normalised_action import given_units
 
@@ -203,8 +202,9 @@ class DynamicCoil(PPO):
         **settings: Unpack[PPOSettings],
     ) -> None:
         if not env.action_spec.dtype.is_floating_point:
-            raise ChoicesError(
-                "Dynamic COIL needs continuous actions, but this env has discrete ones"
+            raise ValueError(
+                "Dynamic COIL needs continuous actions, but this env has discrete ones; take "
+                "method=coil_anchored"
             )
         self.guide_learning_rate = schedule(guide_learning_rate)
         self.advice = Guides(guides, trainable=True)

@@ -37,7 +37,7 @@ from coil_rl.learners.policy import ByKey, Entries, Policy, next_of
 from coil_rl.learners.weights import Weights
 from coil_rl.ranges import Interval, NonNegative, Positive, Share, checked
 from coil_rl.schedules import Schedule
-from coil_rl.transforms.action_space import ChoicesError, nested_key
+from coil_rl.transforms.action_space import nested_key
 
 
 class CrossQSettings(ReplaySettings, total=False):
@@ -132,9 +132,9 @@ class SAC(OffPolicy):
                 f"critics={critics}"
             )
         if not env.action_spec.dtype.is_floating_point:
-            raise ChoicesError(
+            raise ValueError(
                 f"{type(self).__name__} needs continuous actions, but this env has discrete ones; "
-                "use action=continuous, or a learner for discrete actions, such as DQN"
+                "use action=continuous, or learner=ppo with method=coil_anchored, or learner=dqn"
             )
         in_keys = [nested_key(key) for key in in_keys]
         network = without_memory(network or Mlp(hidden, "relu"), type(self).__name__)

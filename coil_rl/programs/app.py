@@ -44,7 +44,7 @@ from coil_rl.errors import NO_SPACE, UserError
 from coil_rl.output import SafeStream
 from coil_rl.plain_yaml import is_part
 from coil_rl.programs.folders import spelled
-from coil_rl.programs.sweeps import Jobs, command_of, is_sweep, remove_unused
+from coil_rl.programs.sweeps import command_of, failed, is_sweep, remove_unused
 from coil_rl.run.stopping import STOP
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
@@ -91,26 +91,24 @@ class OwnFolder(Callback):
 
     def __init__(self) -> None:
         self.folder = ""  # none in a sweep, whose folders are Hydra's
-        self.subfolder: str | None = None
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Take the folder out of the configuration."""
         with contextlib.suppress(OmegaConfBaseException):  # Hydra raises the same error next
             self.folder = os.path.abspath(str(config.hydra.run.dir))
-            self.subfolder = config.hydra.output_subdir
-            self._set(config, ".", None)
+            self._set(config, ".")
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Put it back, before the program begins."""
         if self.folder:
-            self._set(config, self.folder, self.subfolder)
+            self._set(config, self.folder)
             config.hydra.runtime.output_dir = self.folder
             HydraConfig.instance().set_config(config)
 
     @staticmethod
-    def _set(config: DictConfig, folder: str, subfolder: str | None) -> None:
+    def _set(config: DictConfig, folder: str) -> None:
         OmegaConf.set_readonly(config.hydra, False)
-        config.hydra.run.dir, config.hydra.output_subdir = folder, subfolder
+        config.hydra.run.dir, config.hydra.output_subdir = folder, None
 
 
 def overrides() -> list[tuple[str, str]]:
@@ -219,7 +217,7 @@ def run_program(
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
     bugs: list[Exception] = []
-    jobs, signals = Jobs(config_name), Signals()
+    signals = Signals()
 
     @functools.wraps(task)
     def checked(config: DictConfig) -> Any:
@@ -227,7 +225,7 @@ def run_program(
             return _do(task, check, config, signals)
         except Exception as error:
             if is_sweep() and not isinstance(error, NoSweepError):
-                return jobs.fail(error)
+                return failed(config_name, error)
             if is_sweep():
                 remove_unused(Path(HydraConfig.get().sweep.dir))
             if is_no_bug(error):
@@ -281,10 +279,7 @@ def _do(
         programs.imported()
         if signals.received:
             raise KeyboardInterrupt
-        result = task(config)
-        if has_folder and not is_sweep():
-            _keep_words(config)
-        return result
+        return task(config)
     except Exception:
         for folder in made:
             with contextlib.suppress(OSError):  # it is not empty, or was not made
@@ -295,16 +290,6 @@ def _do(
 def _missing(folder: Path) -> list[Path]:
     """Return what does not exist of a folder and those that it is in, the innermost first."""
     return [place for place in (folder, *folder.parents) if not os.path.exists(place)]
-
-
-def _keep_words(config: DictConfig) -> None:
-    """Keep what Hydra would keep of a finished program in its folder, for those that ask for it."""
-    subfolder = HydraConfig.get().output_subdir
-    if subfolder is not None:
-        place = Path(config.run_dir, subfolder)
-        place.mkdir(exist_ok=True)
-        OmegaConf.save(config, place / "config.yaml")
-        OmegaConf.save(HydraConfig.get().overrides.task, place / "overrides.yaml")
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from typing import Any
 from coil_rl import record
 from coil_rl.errors import UserError
 from coil_rl.extras import require
+from coil_rl.output import printable
 from coil_rl.programs import app
 from coil_rl.run.folder import is_begun, versions
 
@@ -67,11 +68,6 @@ def _parts(name: str, value: Any) -> Iterator[tuple[str, str]]:
         yield name, value if isinstance(value, str) else json.dumps(value)
 
 
-def printable(text: str) -> str:
-    """Return a text of a file, which may be somebody else's, without what a terminal obeys."""
-    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
-
-
 def main() -> None:
     """Print one name and its value a line."""
     arguments = sys.argv[1:]
@@ -86,9 +82,10 @@ def main() -> None:
             result = explain(path) if path.suffix == ".onnx" else describe(path)
         else:
             raise UserError(f"{' '.join(arguments)}: coil-info takes nothing, or run=FOLDER")
+        result = {printable(name): printable(value) for name, value in result.items()}
         width = max(map(len, result))
         for name, value in result.items():
-            print(f"{name:{width}}  {printable(value)}")
+            print(f"{name:{width}}  {value}")
 
 
 if __name__ == "__main__":

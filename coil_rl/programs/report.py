@@ -14,6 +14,7 @@ from omegaconf import DictConfig, ListConfig
 
 from coil_rl.config.folder import PREFIX
 from coil_rl.errors import UserError, did_you_mean
+from coil_rl.output import printable
 from coil_rl.programs import app
 from coil_rl.programs.sweeps import is_sweep
 
@@ -150,6 +151,7 @@ def report(config: DictConfig) -> None:
         )
     )
     text = "\n\n".join(filter(None, map(_markdown, sections)))
+    text = "\n".join(map(printable, text.split("\n")))
     write_text(folder / "report.md", text)
     write_csv(_rows(parts, EnvPart.tables), folder / "report.csv")
     write_csv(_rows(parts, _cases), folder / "report_cases.csv")

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.config.default_learner import default_learner
@@ -42,8 +41,7 @@ def train(config: DictConfig) -> float:
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration, or for what nothing reads.
 
-    In a sweep a word may be meant for other runs. They are known to Hydra's own sweeper only, for
-    which `sweeps.Plan` has compared them; for another one each run says what it ignores.
+    In a sweep a word may be meant for other runs, so each run says what it ignores.
     """
     from coil_rl.config.unread import check_read, unread
 
@@ -51,9 +49,9 @@ def check(config: DictConfig) -> None:
     words = app.typed().task
     if not sweeps.is_sweep():
         check_read(config, words)
-    elif not sweeps.knows_all_runs(HydraConfig.get().sweeper):
-        for sentence in unread(config, words):
-            say(f"{sentence}, if no other run of this sweep reads it", error=True)
+        return
+    for sentence in unread(config, words):
+        say(f"{sentence}, if no other run of this sweep reads it", error=True)
 
 
 def resume(

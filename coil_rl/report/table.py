@@ -74,7 +74,7 @@ class Table:
 
     def latex(self) -> str:
         """Return the table as LaTeX, for the package booktabs."""
-        columns = "".join("r" if each else "l" for each in self.numeric or [False])
+        columns = "".join("r" if each else "l" for each in self.numeric)
         rows = [self.headings, *([cell.text for cell in row] for row in self.cells)]
         first, *others = (rf"{' & '.join(map(_latex, row))} \\" for row in rows)
         lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", first, r"\midrule"]
@@ -87,8 +87,8 @@ class Table:
 
     @property
     def numeric(self) -> list[bool]:
-        """Whether each column has only numbers."""
-        return _numeric(_values(self.rows, self.columns))
+        """Whether each column has only numbers; none has without rows."""
+        return _numeric(_values(self.rows, self.columns)) or [False] * len(self.columns)
 
     @property
     def cells(self) -> list[list[Cell]]:

@@ -20,8 +20,7 @@ class Metrics:
     """Log of a run: its rows in memory, in a CSV file, and in any TorchRL logger.
 
     After a resume the rows since the checkpoint are written again. They are removed from the CSV
-    file, from TensorBoard and from the files of `CSVLogger` first; other loggers may show a point
-    twice, with the same value.
+    file and from TensorBoard first; other loggers may show a point twice, with the same value.
 
     Args:
         path: of the CSV file, `metrics.csv`.
@@ -174,7 +173,6 @@ class Metrics:
         else:
             self.path.unlink(missing_ok=True)
         self._truncate_tensorboard()
-        self._truncate_csv()
 
     def check_columns(self, names: list[str]) -> None:
         """Raise a `UserError` if the rows lack one of some columns."""
@@ -190,23 +188,3 @@ class Metrics:
         writer = type(self.tensorboard)
         self.tensorboard = writer(self.tensorboard.log_dir, purge_step=frames + 1)
         self.logger.experiment = self.tensorboard
-
-    def _truncate_csv(self) -> None:
-        """Keep of the files of TorchRL's `CSVLogger` the lines that the rows have, once each."""
-        from torchrl.record.loggers import CSVLogger
-
-        if not isinstance(self.logger, CSVLogger):
-            return
-        known = {int(row["frames"]): row for row in self.rows}
-        folder = Path(self.logger.experiment.log_dir, "scalars")
-        for path in list(folder.rglob("*.csv")):
-            name = path.relative_to(folder).as_posix().removesuffix(".csv")
-            kept: dict[int, bytes] = {}
-            with file_of_a_run(path, "remove it"):
-                for line in read_file(path, LARGEST_TABLE).splitlines(keepends=True):
-                    step = int(line.partition(b",")[0])
-                    is_whole = line.endswith(b"\n")  # the last one may have been cut off
-                    if is_whole and not math.isnan(known.get(step, {}).get(name, math.nan)):
-                        kept[step] = line
-            with whole_file(path) as unfinished:
-                unfinished.write_bytes(b"".join(kept.values()))

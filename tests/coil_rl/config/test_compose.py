@@ -8,7 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 from programs import CONF, called, shipped
 
-from coil_rl import UserError, compose_train
+from coil_rl import compose_train
 from coil_rl.config.compose import covers
 
 METHODS = shipped("method")
@@ -116,15 +116,6 @@ def test_command_line_is_stronger_than_a_file(tmp_path):
     write(tmp_path, "env", {"learner": {"gamma": 0.5, "clip": 0.1}}, "gym")
     config = composed(tmp_path, "env=mine", "method=coil", "guide=zero", "learner.gamma=0.7")
     assert (config["learner"]["gamma"], config["learner"]["clip"]) == (0.7, 0.1)
-
-
-def test_files_that_contradict_each_other_are_named(tmp_path):
-    write(tmp_path, "env", {"learner": {"gamma": 0.5}}, "gym")
-    write(tmp_path, "guide", {"learner": {"gamma": 0.6}}, "zero")
-    with pytest.raises(
-        UserError, match=r"learner\.gamma is 0\.\d in (env|guide)/mine\.yaml and 0\.\d in "
-    ):
-        composed(tmp_path, "env=mine", "guide=mine", "method=coil")
 
 
 @pytest.mark.parametrize("between", [(), ("between",)], ids=["listed", "listed by a listed one"])

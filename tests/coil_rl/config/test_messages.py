@@ -52,15 +52,6 @@ def test_unknown_argument_of_a_part_is_not_said_to_be_added_by_a_plus():
     assert "adds it" not in called("train", "learner.lr=0.1", code=2).stderr
 
 
-def test_folder_of_a_run_is_no_argument_but_that_of_a_key(tmp_path):
-    (tmp_path / "tank").mkdir()
-    (tmp_path / "tank" / "config.yaml").write_text("label: coil\n")
-    refused = called("evaluate", "tank", cwd=tmp_path, code=2).stderr
-    assert "'tank' is the folder of a run; write run=tank" in refused
-    refused = called("train", "guide=tank", cwd=tmp_path, code=2).stderr
-    assert "write guide=learned guide.learned.run=tank" in refused
-
-
 def test_method_file_without_its_package_line_is_told_the_line(tmp_path):
     file = Path(tmp_path / "conf" / "method" / "mine.yaml")
     file.parent.mkdir(parents=True)

@@ -1,11 +1,11 @@
 """A word that nothing in a run reads is refused, by all that take words."""
 
 import pytest
-from programs import called
+from programs import SHORT_LAP, called
 
 import coil_rl
 from coil_rl import UserError, compose_train
-from coil_rl.config.unread import check_read, check_sweep
+from coil_rl.config.unread import check_read
 
 GUIDE = "(method=guide); leave it out"
 
@@ -114,61 +114,11 @@ def test_value_that_an_env_refers_to_is_read_by_a_guide_alone():
     assert "(method=guide)" in unread("method=guide", "budget.steps=3")
 
 
-def swept(word, *runs):
-    """Return what is said before a sweep about a word that all of its runs get."""
-    return check_sweep([word], [compose_train([*run.split(), word, "run_dir=run"]) for run in runs])
-
-
-@pytest.mark.fast(3)
-@pytest.mark.parametrize(
-    ("word", "others", "readers"),
-    [
-        ("budget.frames=100", "guide", "coil"),
-        ("learner.gamma=0.9", "tune,guide", "ppo"),
-        ("training.tests.starts=5", "ppo,coil", "coil_anchored"),
-        ("proxy.seed=3", "ppo", "dynamic_coil_sequential"),
-        ("+degrade@evaluation.advice.zeroed=zeroed", "ppo,guide", "coil"),
-    ],
-)
-def test_word_that_some_runs_of_a_sweep_read_is_accepted_and_said_once(word, others, readers):
-    runs = [f"method={name}" for name in f"{others},{readers}".split(",")]
-    [said] = swept(word, *runs)
-    names = others.replace(",", ", ")
-    count = others.count(",") + 1
-    expected = f"{word} has no effect in {count} of {count + 1} runs of this sweep (method={names})"
-    assert said == expected
-    assert swept(word, f"method={readers}") == []
-
-
-@pytest.mark.parametrize(
-    ("word", "runs"),
-    [
-        ("proxy.seed=3", ("method=ppo", "method=coil")),
-        ("learner.gamma=0.9", ("method=guide", "method=guide guide=zero")),
-        ("learner.gamma=0.9", ("method=guide", "method=tune")),
-        ("training.learning_rate=1", ("learner=sac", "learner=dqn action=choices")),
-    ],
-)
-def test_word_that_no_run_of_a_sweep_reads_is_refused(word, runs):
-    with pytest.raises(UserError, match="has no effect in any run of this sweep: ") as caught:
-        swept(word, *runs)
-    assert str(caught.value).startswith(f"{word} has no effect in any run")
-
-
 @pytest.mark.slow
-def test_sweep_says_before_its_first_run_what_runs_do_not_read(tmp_path):
-    words = ["-m", "method=guide,guide", "+experiment=placebo", "budget.frames=100"]
-    refused = called("train", *words, cwd=tmp_path, code=2)
-    sentence = "budget.frames=100 has no effect in any run of this sweep: nothing in this run"
-    assert sentence in refused.stderr
-    assert "#0" not in refused.stdout
-    assert not (tmp_path / "outputs").exists()
-    words = ["-m", "method=guide,ppo", "proxy.seed=3,4", "env.rate=0"]
-    refused = called("train", *words, cwd=tmp_path, code=2)
-    assert "proxy.seed=3,4 has no effect in any run of this sweep: nothing" in refused.stderr
-    words = ["-m", "method=guide,ppo", "learner.gamma=0.9", "env.rate=0"]  # each run is refused
-    said = called("train", *words, cwd=tmp_path, code=2).stderr
-    assert said.count("learner.gamma=0.9 has no effect in 1 of 2 runs of this sweep (method=g") == 1
+def test_each_run_of_a_sweep_says_what_it_does_not_read(tmp_path):
+    words = ["-m", "method=guide", "seed=0,1", *SHORT_LAP, "evaluation.gif=false"]
+    said = called("train", *words, "learner.gamma=0.9", cwd=tmp_path).stderr
+    assert said.count("learner.gamma=0.9 has no effect: nothing in this run reads") == 2
 
 
 def test_noise_is_read_where_actions_are_numbers():

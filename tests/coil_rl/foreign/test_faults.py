@@ -1,5 +1,6 @@
 """What envs and controllers of others do wrong is one sentence with its place, or no harm."""
 
+import asyncio
 import decimal
 import fractions
 import itertools
@@ -134,6 +135,7 @@ def is_one_sentence(caught, length=400):
         (fail(ValueError("two\n\nlines  " + 500 * "x")), "step raised ValueError: two lines"),
         (fail(SystemExit(0)), "step raised SystemExit: 0"),
         (fail(StopIteration()), "step raised StopIteration"),
+        (fail(asyncio.CancelledError()), "step raised CancelledError: without a text"),
     ],
 )
 def test_fault_in_a_step_has_its_place(answer, message):
@@ -563,6 +565,16 @@ class OfClock:
         return self.output
 
 
+class OfBudget(Remembers):
+    """Stops after two seconds."""
+
+    def reset(self):
+        self.began = time.time()
+
+    def act(self, observation):
+        return [float(observation[0]) * (time.time() < self.began + 2)]
+
+
 class Slow(Drift):
     """Moves with the time that has passed."""
 
@@ -596,10 +608,11 @@ def findings(env=Drift, controller=None):
         (
             {"controller": OfClock},
             "clock",
-            "when 0.02 s pass between two steps: it reads the clock",
+            "when time passes between two steps: it reads the clock",
         ),
+        ({"controller": OfBudget}, "clock", "the controller OfBudget gives other actions when"),
         ({"controller": OfClock()}, "clock", "the controller OfClock gives other actions when"),
-        ({"env": Slow}, "clock", "observation of the env differs when 0.02 s pass between two"),
+        ({"env": Slow}, "clock", "observation of the env differs when time passes between two"),
     ],
 )
 def test_trial_names_what_rows_share_and_what_lives_by_the_clock(asked, kind, message):
@@ -677,10 +690,12 @@ CHANGES = {
     "level": lambda: logging.root.setLevel(1),
     "disable": lambda: logging.disable(logging.CRITICAL),
     "output": lambda: setattr(sys, "stderr", sys.stdout),
+    "device": lambda: torch.set_default_device("meta"),
+    "path": lambda: sys.path.clear(),
+    "recursion": lambda: sys.setrecursionlimit(900),
 }
 MADE = {
     "signal": lambda: signal.signal(signal.SIGTERM, signal.SIG_IGN),
-    "device": lambda: torch.set_default_device("meta"),
     "deterministic": lambda: torch.use_deterministic_algorithms(True),
 }
 
@@ -896,8 +911,13 @@ class Ranks(nn.Module):
         return observation.argsort(0)
 
 
-@pytest.mark.parametrize("kind", [Mean, Ranks])
-@pytest.mark.parametrize("rows", [[1.0], [0.0, 0.0], [3.0, -1.0, 2.0]])
+class Sorts(nn.Module):
+    def forward(self, observation):
+        return observation.sort(0).values
+
+
+@pytest.mark.parametrize("kind", [Mean, Ranks, Sorts])
+@pytest.mark.parametrize("rows", [[1.0], [0.5], [0.0, 0.0], [3.0, -1.0, 2.0]])
 def test_network_that_mixes_the_rows_is_refused(kind, rows):
     message = r"for an observation alone, but \[.*\] for it in a batch of 3: it mixes the rows"
     with pytest.raises(ForeignError, match=message):

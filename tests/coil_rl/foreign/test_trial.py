@@ -1,7 +1,6 @@
 """Controllers that draw random numbers which no seed of a run reaches."""
 
 import random
-import time
 import warnings
 
 import numpy as np
@@ -182,35 +181,6 @@ def test_generator_that_all_objects_share_is_left_alone():
 
     found(Shares)
     assert shared.bit_generator.state == before
-
-
-class Slow(Still):
-    def draw(self):
-        end = time.process_time() + 0.005
-        while time.process_time() < end:
-            pass
-        return 0.0
-
-
-@pytest.mark.fast(1)
-@pytest.mark.parametrize(
-    ("of", "words", "said"),
-    [
-        (Slow, [], "so the evaluation curve takes"),
-        (Slow, ["evaluation.curve.points=4"], ""),
-        (Slow, ["method=ppo"], ""),
-        (Still, [], ""),
-    ],
-)
-def test_cost_of_a_slow_controller_in_the_curve_is_said(of, words, said, tmp_path, capsys):
-    given = named("Pendulum-v1", of, str(tmp_path))
-    given.words.extend(words)
-    check(composed(given, tmp_path))
-    lines = [line for line in capsys.readouterr().err.splitlines() if "evaluation curve" in line]
-    assert len(lines) == bool(said)
-    for line in lines:
-        assert said in line
-        assert "340 episodes (17 policies); evaluation.curve.points=4 keeps fewer" in line
 
 
 def test_env_that_ignores_its_seed_is_noticed():

@@ -65,7 +65,7 @@ def test_values_out_of_range_are_refused(kind):
         ),
         (
             lambda: SAC(worlds.pendulum(DiscreteActions(5)), ["th"]),
-            r"SAC needs continuous actions, .* action=continuous, or a learner .* DQN",
+            r"SAC needs continuous actions, .* action=continuous, or learner=ppo",
         ),
         (
             lambda: actor(worlds.cones(), ["observation", "advice"]),

@@ -5,6 +5,7 @@ import json
 import onnx
 import pytest
 from exported_sums import model, write
+from programs import called
 
 from coil_rl.errors import UserError
 from coil_rl.export.files import explained
@@ -46,3 +47,15 @@ def test_damaged_command_is_named(tmp_path):
     (tmp_path / "command.txt").write_bytes(b"\xff\xfe")
     with pytest.raises(UserError, match=r"command.txt is damaged .*; remove it"):
         describe(tmp_path)
+
+
+def test_what_a_terminal_obeys_is_shown_as_text(tmp_path):
+    (tmp_path / "config.yaml").touch()
+    (tmp_path / "command.txt").write_text("coil-train '\x1b]0;title\x07'")
+    (tmp_path / "versions.json").write_text(json.dumps({"a\x1b[2J": "\x9b31m\u202e"}))
+    done = called("info", f"run={tmp_path}")
+    assert r"\x1b]0;title\x07" in done.stdout
+    assert r"a\x1b[2J" in done.stdout
+    assert r"\x9b31m\u202e" in done.stdout
+    gone = called("info", "run=\x1b[2J", code=2)
+    assert not {"\x1b", "\x9b", "\x07", "\u202e"} & {*done.stdout, *gone.stderr}

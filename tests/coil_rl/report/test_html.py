@@ -101,6 +101,12 @@ def test_cells_carry_the_numbers_that_rows_are_sorted_by():
     assert "<p>a paragraph</p>" in text
 
 
+def test_table_without_rows_is_its_headings():
+    table = Table([], {"driver": ("who drives", "")})
+    assert "who drives" in html_page("title", [Section("", [table])])
+    assert "who drives" in table.latex()
+
+
 def test_equal_pictures_are_equal_texts():
     runs = {"coil": [[{"frames": n, "evaluation/return": n} for n in range(3)]]}
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.envs import Compose, RewardSum, Transform, TransformedEnv
-from torchrl.record.loggers import CSVLogger, TensorboardLogger
+from torchrl.record.loggers import TensorboardLogger
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
@@ -365,34 +365,3 @@ def test_tensorboard_shows_no_point_twice(tmp_path, count):
     again.flush()
     points = EventAccumulator(str(tmp_path / "board")).Reload().Scalars("loss")
     assert [point.step for point in points] == [10, 20, 30, 40, 50]
-
-
-@pytest.mark.parametrize("count", [0, 3])
-def test_files_of_the_csv_logger_have_no_line_twice(tmp_path, count):
-    def logger(name):
-        return CSVLogger("csv", str(tmp_path / name))
-
-    def filled(metrics):
-        metrics.fill({2: {"return": 7.0}})
-
-    whole = write_metrics(tmp_path / "whole.csv", ROWS, logger("whole"))
-    filled(whole)
-    first = logger("stopped")
-    metrics = write_metrics(tmp_path / "metrics.csv", ROWS, first)
-    if count:
-        filled(metrics)
-        first.log_scalar("return", 8.0, step=20)  # and killed before it is in the table
-    with (tmp_path / "stopped" / "csv" / "scalars" / "loss.csv").open("a") as file:
-        file.write("10,0.")
-    again = Metrics(tmp_path / "metrics.csv", logger("stopped"))
-    again.truncate(count)
-    for row in ROWS[count:]:
-        again.append(row)
-    if not count:
-        filled(again)
-    for name in ("frames", "loss", "return"):
-        ours, expected = (
-            (tmp_path / each / "csv" / "scalars" / f"{name}.csv").read_text()
-            for each in ("stopped", "whole")
-        )
-        assert ours == expected
