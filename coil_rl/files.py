@@ -3,32 +3,69 @@
 A folder of a run may come from anybody, and a process may be killed while it writes one.
 """
 
+import errno
 import os
 import re
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from coil_rl.errors import UserError
 
 FAILED_JOBS = "failed_jobs.txt"  # in the folder of a sweep, a line for each
 LARGEST_NUMBERS = 1_000_000  # bytes of a small file, such as guide_return.json
 LARGEST_TABLE = 200_000_000  # bytes of a table, such as metrics.csv
+BLOCK = 65_536  # bytes
+_OPTIONS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+
+def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
+    """Open a file to read its bytes.
+
+    Args:
+        path: of the file; a link to a file is one.
+
+    Raises:
+        OSError: if there is none, or it is a folder, a pipe, a socket or a device; `strerror` says
+            which.
+    """
+    # A pipe without a writer would wait here, were it not for O_NONBLOCK.
+    descriptor = os.open(path, _OPTIONS)
+    try:
+        mode = os.fstat(descriptor).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "it is a pipe or a device, not a file", os.fspath(path))
+        return open(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
 
 
 def read_file(path: str | os.PathLike[str], largest: int) -> bytes:
-    """Return the bytes of a file that somebody else may have made.
+    """Return the bytes of a file, as `open_regular`.
 
     Args:
         largest: allowed size, in bytes.
 
     Raises:
-        OSError: for anything but a file of at most this size, such as a pipe or a device.
+        OSError: as `open_regular`, and for a larger file.
     """
-    from coil_rl.envs.regular_files import read_regular  # imports torch
-
-    return read_regular(path, largest)
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        blocks: list[bytes] = []
+        read = 0
+        # Some files of the system have no size before they are read.
+        while size <= largest and read <= largest and (block := file.read(max(size, BLOCK))):
+            blocks.append(block)
+            read += len(block)
+    if max(size, read) > largest:
+        raise OSError(errno.EINVAL, f"it has more than {largest:,} bytes", os.fspath(path))
+    return b"".join(blocks)
 
 
 def read_text(path: str | os.PathLike[str], largest: int) -> str:

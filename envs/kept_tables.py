@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coil_rl.envs.regular_files import read_regular
+from coil_rl.errors import UserError
+from coil_rl.files import read_file, whole_file
 
 SMALLEST, LARGEST = 500_000, 100_000_000  # bytes of tables that are kept
 MOST_FILES = 16  # in the folder; those that were not used for the longest time are removed
@@ -45,14 +46,14 @@ def kept(name: str, source: Iterable[bytes], make: Callable[[], dict[str, Tensor
     except RuntimeError:  # there is no home
         return make()
     with suppress(OSError, ValueError, EOFError, BadZipFile):
-        content = io.BytesIO(read_regular(file, LARGEST + 1_000_000))
+        content = io.BytesIO(read_file(file, LARGEST + 1_000_000))
         with np.load(content, allow_pickle=False) as arrays:
             tables = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
         os.utime(file)
         return tables
     made = make()
     if SMALLEST <= sum(table.nbytes for table in made.values()) <= LARGEST:
-        with suppress(OSError):
+        with suppress(OSError, UserError):  # a file in the place of the folder
             _write(file, made)
     return made
 
@@ -66,16 +67,10 @@ def _digest(parts: Iterable[bytes]) -> str:
 
 
 def _write(file: Path, tables: Tables) -> None:
-    """Write a file whole or not at all, and remove the oldest ones of the folder if it is full."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = file.with_name(f".{file.stem}.{os.getpid()}{SUFFIX}")
-    try:
-        with unfinished.open("wb") as stream:
-            arrays: dict[str, Any] = {name: table.numpy() for name, table in tables.items()}
-            np.savez(stream, **arrays)
-        unfinished.replace(file)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    """Write a file, and remove the oldest ones of the folder if it is full."""
+    arrays: dict[str, Any] = {name: table.numpy() for name, table in tables.items()}
+    with whole_file(file) as unfinished:
+        np.savez(unfinished, **arrays)
     files = [path for path in file.parent.glob(f"*{SUFFIX}") if path.is_file()]
     newest = sorted(files, key=lambda path: path.stat().st_mtime, reverse=True)
     for path in newest[MOST_FILES:]:

@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from coil_rl.envs.regular_files import read_regular
 from coil_rl.envs.simulator_files import is_of_simulator, simulator_track
 from coil_rl.envs.track import Track, TrackError
+from coil_rl.files import read_file, whole_file
 
 Row = tuple[int, list[str]]  # number of the line, and its cells
 Split = Literal["train", "test", "all"]
@@ -142,11 +142,8 @@ def save_track(track: Track, path: str | os.PathLike[str]) -> None:
     for number, (side, x, y) in enumerate(cones):
         # Adding zero turns -0.0 into 0.0.
         lines.append(f"{number},{side},{round(x, 5) + 0.0},{round(-y, 5) + 0.0}")
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="")
-    unfinished.replace(path)
+    with whole_file(path) as unfinished:
+        unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="")
 
 
 def shipped_tracks(split: Split) -> list[Track]:
@@ -213,7 +210,7 @@ def _table(path: Path) -> tuple[list[str], list[Row]]:
 def _read(path: Path) -> str:
     """Return the text of a level file; a `TrackError` says why it cannot be read."""
     try:
-        text = read_regular(path, MAX_BYTES).decode("utf-8-sig")
+        text = read_file(path, MAX_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise TrackError(f"{path} is not a text file; save the level as CSV in UTF-8.") from None
     except (OSError, ValueError) as error:

@@ -57,7 +57,8 @@ ALLOWED = {
     | {"numpy", "scipy", "mcap", "lz4", "zstandard", "rosbags", "gymnasium"},
     "conf": set(),
 }
-BELOW = ("coil_rl.extras", "coil_rl.lazy", "coil_rl.ranges")  # which everything may import
+# What everything may import.
+BELOW = ("coil_rl.errors", "coil_rl.extras", "coil_rl.files", "coil_rl.lazy", "coil_rl.ranges")
 
 
 def source_files(folder: str) -> list[Path]:

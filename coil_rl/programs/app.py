@@ -44,7 +44,7 @@ from coil_rl.errors import NO_SPACE, UserError
 from coil_rl.output import SafeStream
 from coil_rl.plain_yaml import is_part
 from coil_rl.programs.folders import spelled
-from coil_rl.programs.sweeps import Jobs, command_of, is_sweep, remove_unused
+from coil_rl.programs.sweeps import command_of, failed, is_sweep, remove_unused
 from coil_rl.run.stopping import STOP
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
@@ -217,7 +217,7 @@ def run_program(
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
     bugs: list[Exception] = []
-    jobs, signals = Jobs(config_name), Signals()
+    signals = Signals()
 
     @functools.wraps(task)
     def checked(config: DictConfig) -> Any:
@@ -225,7 +225,7 @@ def run_program(
             return _do(task, check, config, signals)
         except Exception as error:
             if is_sweep() and not isinstance(error, NoSweepError):
-                return jobs.fail(error)
+                return failed(config_name, error)
             if is_sweep():
                 remove_unused(Path(HydraConfig.get().sweep.dir))
             if is_no_bug(error):

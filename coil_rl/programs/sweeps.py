@@ -67,44 +67,31 @@ def is_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-class Jobs:
-    """The jobs of a sweep, which may run in other processes.
+def failed(name: str, error: Exception) -> float:
+    """Note that a job of a sweep failed, and return NaN, its result: the others go on.
 
-    One that fails leaves the others alone.
-
-    A job that fails writes a line into a file in the folder of the sweep.
+    A job whose run another process is working on has not failed: it is left to that process, so
+    that several programs can share a sweep.
 
     Args:
         name: of the program.
+        error: a mistake of the user, or a bug, whose traceback is printed.
     """
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def fail(self, error: Exception) -> float:
-        """Note that a job failed, and return NaN, its result.
-
-        A job whose run another process is working on has not failed: it is left to that process,
-        so that several programs can share a sweep.
-
-        Args:
-            error: a mistake of the user, or a bug, whose traceback is printed.
-        """
-        hydra_config = HydraConfig.get()
-        job = f"job {hydra_config.job.num} ({' '.join(hydra_config.overrides.task)})"
-        if isinstance(error, RunningError):
-            say(f"{self.name}: {job} is left to the process that works on it", error=True)
-            return math.nan
-        line = f"{job}: {reason_of(error)}"
-        say(f"{self.name}: {line}; the other jobs go on", error=True)
-        with contextlib.suppress(OSError):  # it is empty
-            Path(hydra_config.runtime.output_dir).rmdir()
-        path = Path(hydra_config.sweep.dir, FAILED_JOBS)
-        # Another program of the same sweep, all of whose jobs failed, may have removed the folder.
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", encoding="utf-8") as file:
-            file.write(f"{line}\n")
+    hydra_config = HydraConfig.get()
+    job = f"job {hydra_config.job.num} ({' '.join(hydra_config.overrides.task)})"
+    if isinstance(error, RunningError):
+        say(f"{name}: {job} is left to the process that works on it", error=True)
         return math.nan
+    line = f"{job}: {reason_of(error)}"
+    say(f"{name}: {line}; the other jobs go on", error=True)
+    with contextlib.suppress(OSError):  # it is empty
+        Path(hydra_config.runtime.output_dir).rmdir()
+    path = Path(hydra_config.sweep.dir, FAILED_JOBS)
+    # Another program of the same sweep, all of whose jobs failed, may have removed the folder.
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f"{line}\n")
+    return math.nan
 
 
 def _by_reason(lines: Sequence[str]) -> str:

@@ -9,7 +9,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from coil_rl.envs.regular_files import open_regular, read_regular
+from coil_rl.files import open_regular, read_file
 
 MAGIC = b"\x89MCAP0\r\n"
 LARGEST_METADATA = 1_000_000  # bytes of the metadata.yaml of a folder
@@ -57,7 +57,7 @@ def files_of(path: Path) -> Folder:
         return Folder([path])
     metadata = path / "metadata.yaml"
     try:
-        text = read_regular(metadata, LARGEST_METADATA).decode()
+        text = read_file(metadata, LARGEST_METADATA).decode()
     except (OSError, UnicodeDecodeError):
         raise RecordingError(
             f"{path} is a folder without a readable metadata.yaml; let ROS write it: ros2 bag "

@@ -23,7 +23,7 @@ from mcap.writer import CompressionType, Writer
 
 from coil_rl.envs.recordings.folders import CONVERT, MAGIC, RecordingError, files_of
 from coil_rl.envs.recordings.messages import definition, encode
-from coil_rl.envs.regular_files import open_regular
+from coil_rl.files import open_regular, whole_file
 
 # If a recording is cut off, only the last chunk is lost: ten seconds of a small scanner.
 CHUNK = 128 * 1024  # bytes
@@ -217,16 +217,8 @@ class RecordingWriter:
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
         if error is not None:
             return
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = self.path.with_name(f".{self.path.stem}.{os.getpid()}{self.path.suffix}")
-        try:
-            with unfinished.open("wb") as stream:
-                self._write(Writer(stream, CHUNK, CompressionType.ZSTD, enable_data_crcs=True))
-                stream.flush()
-                os.fsync(stream.fileno())
-            unfinished.replace(self.path)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        with whole_file(self.path) as unfinished, unfinished.open("wb") as stream:
+            self._write(Writer(stream, CHUNK, CompressionType.ZSTD, enable_data_crcs=True))
 
     def _write(self, writer: Writer) -> None:
         writer.start(profile="ros2", library="coil-rl")

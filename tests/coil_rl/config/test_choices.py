@@ -1,4 +1,4 @@
-"""A method that needs numbers as actions is refused by name where they are choices."""
+"""A method that needs numbers as actions is refused where they are choices."""
 
 import gymnasium
 import numpy as np

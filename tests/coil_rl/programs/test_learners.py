@@ -101,7 +101,7 @@ def test_compatible_method_and_learner_train(method, learner, tmp_path):
         ),
         (
             "learner=sac action=choices",
-            "learner=sac needs numbers as actions, but action=choices makes choices of them",
+            "learner: SAC needs continuous actions, but this env has discrete ones",
         ),
         (
             "method=ppo learner=dynamic_coil",
@@ -109,7 +109,7 @@ def test_compatible_method_and_learner_train(method, learner, tmp_path):
         ),
         (
             "method=dynamic_coil_sequential action=choices",
-            "method=dynamic_coil_sequential needs numbers as actions, but action=choices",
+            "learner: Dynamic COIL needs continuous actions, but this env has discrete ones",
         ),
         ("learner=dqn action.choices=1", "action: choices=1 must be at least 2"),
         (

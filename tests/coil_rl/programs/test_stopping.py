@@ -15,7 +15,6 @@ import pytest
 from programs import TINY, called, command, environment, program
 
 from coil_rl.programs import app
-from coil_rl.programs.sweeps import Jobs
 from coil_rl.run import checkpoint, stopping
 from coil_rl.run.folder import is_evaluated, locked
 
@@ -134,15 +133,15 @@ def test_sweep_whose_jobs_are_all_refused_leaves_no_folder(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("removed", [False, True])
 def test_jobs_that_fail_in_two_programs_of_a_sweep_count_once(tmp_path, monkeypatch, removed):
-    fail, folder = Jobs.fail, tmp_path / "sweep"
+    fail, folder = app.failed, tmp_path / "sweep"
 
-    def fail_after_another_program(jobs, error):
-        fail(jobs, error)
+    def fail_after_another_program(name, error):
+        fail(name, error)
         if removed:
             shutil.rmtree(folder)
-        return fail(jobs, error)
+        return fail(name, error)
 
-    monkeypatch.setattr(Jobs, "fail", fail_after_another_program)
+    monkeypatch.setattr(app, "failed", fail_after_another_program)
     sweep = ["-m", *SMALL, "learner.gamma=7", "hydra.sweep.dir=sweep"]
     error = called("train", *sweep, cwd=tmp_path, code=2).stderr
     assert "train: 1 job of this sweep failed: job 0" in error
