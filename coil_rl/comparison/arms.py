@@ -16,6 +16,7 @@ ANCHORED, ANCHORED_SAC = "coil_anchored", "coil_anchored_sac"
 SHARE = 0.1  # of the budget, for each job
 POINTS = 4  # kept policies of a training, besides the first one
 MOST_CURVE_CASES = 8
+TESTED_CASES = 4  # of a start test, at least: after two only a very large difference is certain
 # What a comparison decides itself, and the reason.
 OWN = {
     "method": "it compares methods",
@@ -124,6 +125,8 @@ def job_of(given: Named, arm: Arm, seed: int, frames: int | None, short: Sequenc
     if frames is not None:
         words = [word for word in words if key_of(word) != "budget.frames"]
         words.append(f"budget.frames={frames}")
+        if arm.name in (ANCHORED, ANCHORED_SAC):
+            words.append(f"learner.anchor.least_cases={TESTED_CASES}")
     words += [*short, *arm.words, f"label='{arm.name}'", f"seed={seed}"]
     nodes = dict(given.nodes)
     if arm.name != TUNE:

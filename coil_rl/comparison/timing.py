@@ -11,10 +11,18 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.comparison.arms import POINTS, PPO, SAC, SHARE, TUNE, Arm, curve_cases
+from coil_rl.comparison.arms import (
+    POINTS,
+    PPO,
+    SAC,
+    SHARE,
+    TESTED_CASES,
+    TUNE,
+    Arm,
+    curve_cases,
+)
 from coil_rl.comparison.baselines import Acting
 from coil_rl.config.parts import build_learner, env_maker
-from coil_rl.learners.anchor import LEAST_CASES
 from coil_rl.run.evaluation import episodes
 from coil_rl.run.parts import TEST
 from coil_rl.run.rollout import Rollout
@@ -231,7 +239,7 @@ def _frames(config: DictConfig, arm: Arm, affordable: float, length: float) -> i
     batch, budget = config.budget.num_envs * config.budget.steps, config.budget.frames
     least = math.ceil(LEAST_FRAMES / batch) if arm.learner == SAC else LEAST_BATCHES
     if arm.asks and arm.name != TUNE:  # the start test: a guide, its opposite and the new policy
-        least += math.ceil(3 * LEAST_CASES * length / batch)
+        least += math.ceil(3 * TESTED_CASES * length / batch)
     tenth = max(round(SHARE * budget / batch), least)
     return min(min(max(int(affordable / batch), least), tenth) * batch, budget)
 
