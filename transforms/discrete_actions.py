@@ -13,7 +13,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
-from torchrl.data import Bounded, Categorical, Composite
+from torchrl.data import Bounded, Categorical, Composite, TensorSpec
 
 from coil_rl.transforms.action_space import ActionSpace, ActionTransform
 from coil_rl.transforms.link import State
@@ -69,40 +69,30 @@ class DiscreteActions(ActionTransform):
     def values(self) -> Tensor:
         """[n], values of the choices in the unit of the agent; RuntimeError outside an env."""
         spec = self.action_space.spec
-        size = spec.shape[self.parent.batch_dims :].numel()
-        real = spec.dtype.is_floating_point
-        if real and size != 1:
-            raise ValueError(
-                "DiscreteActions needs an action of one bounded number, but this env's action is "
-                f"{size} numbers"
-            )
-        bounded = isinstance(spec, Bounded) and bool(
-            (spec.space.high - spec.space.low).isfinite().all()
-        )
-        if not real:
+        if not spec.dtype.is_floating_point:
             raise ValueError(
                 "DiscreteActions makes choices of one number, but the action of this env is "
                 f"choices already ({type(spec).__name__}); leave it out: action=continuous"
             )
-        if not bounded:
+        size = spec.shape[self.parent.batch_dims :].numel()
+        if size != 1 or not _is_bounded(spec):
+            found = f"{size} numbers" if size != 1 else type(spec).__name__
             raise ValueError(
                 "DiscreteActions needs an action of one bounded number, but this env's action is "
-                f"{type(spec).__name__}"
+                f"{found}"
             )
+        bounds, units = (spec.space.low, spec.space.high), self.given_units
         if isinstance(self.choices, int):
-            low, high = (float(bound.flatten()[0]) for bound in (spec.space.low, spec.space.high))
+            low, high = (float(bound.flatten()[0]) for bound in bounds)
             return torch.linspace(low, high, self.choices, dtype=spec.dtype, device=spec.device)
-        bounds = (spec.space.low, spec.space.high)
-        if self.given_units is not None:
-            bounds = self.given_units.bounds
-        low, high = (float(bound.flatten()[0]) for bound in bounds)
+        low, high = (float(bound.flatten()[0]) for bound in (units.bounds if units else bounds))
         if self.choices[0] < low or self.choices[-1] > high:
             raise ValueError(
                 f"choices={list(self.choices)} must lie between the action's bounds {low} and "
                 f"{high}"
             )
         values = torch.tensor(self.choices, dtype=spec.dtype, device=spec.device)
-        return values if self.given_units is None else self.given_units.normalise(values)
+        return units.normalise(values) if units else values
 
     def observe(self, data: TensorDictBase, state: State) -> State:
         """Write the advice as the nearest choices, one-hot, and as numbers, where there is any."""
@@ -141,3 +131,10 @@ class DiscreteActions(ActionTransform):
         return Categorical(
             len(self.values), self.parent.batch_size, device=self.values.device, dtype=torch.int64
         )
+
+
+def _is_bounded(spec: TensorSpec) -> bool:
+    """Return whether the action has finite bounds."""
+    return isinstance(spec, Bounded) and all(
+        bool(bound.isfinite().all()) for bound in (spec.space.low, spec.space.high)
+    )

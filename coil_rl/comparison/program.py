@@ -4,7 +4,7 @@
   coil-compare env=gym env.id=Pendulum-v1 guide=controller guide.controller.of=my_package:PID
   coil-compare env=pendulum tune='{gain: [0.1, 10, log]}'  would tuning the rule do it?
 
-minutes=2       that it may take, about; it says before how long it takes
+minutes=2       that it may take, about; the forecast is printed first
 folder=FOLDER   for everything that is written; the same command with it goes on after a stop
 seed=0          of the first trainings; the others have the next one
 tune='{...}'    bounds of numbers of the guide, as of method=tune

@@ -122,7 +122,7 @@ class Trial:
     def chance(self) -> float:
         """Return the mean reward of random actions in the cases of the test.
 
-        It is the zero of a scale; that of the rewards themselves means nothing.
+        It is the zero of the scale of returns: a reward of 0 means nothing by itself.
         """
         rows = len(self.evaluation.cases)
         env = self.make_env.plain(rows, TEST, count=self.count, controllers=False)
