@@ -24,6 +24,7 @@ from pathlib import Path
 import fmpy
 import matplotlib
 import numpy as np
+import pandas as pd
 from IPython.display import Image
 from pythonfmu.builder import FmuBuilder
 
@@ -66,8 +67,8 @@ file = folder / FmuBuilder.build_FMU(str(source), dest=str(folder))
 # %% [markdown]
 # ## The task
 #
-# The speed follows a setpoint that jumps each half second. Each episode draws an inertia. The reward
-# is minus the error.
+# The speed follows a setpoint that jumps each half second. Each episode draws an inertia. The
+# reward is minus the error.
 
 # %%
 PLANT = [
@@ -115,11 +116,11 @@ policy = coil_rl.train(
 # All drive the same 100 drawn plants, which were in no training.
 
 # %%
-first, second = tuned.evaluate(), policy.evaluate()
+first, second = (pd.read_csv(run.folder / "evaluation.csv") for run in (tuned, policy))
 returns = {
     "the PI": first[first.driver == "guide"],
     "tuned": first[first.driver == "tune"],
-    "policy on top": second[~second.driver.isin(["guide"]) & (second.actions == "deterministic")],
+    "policy on top": second[(second.driver != "guide") & (second.actions == "deterministic")],
 }
 for name, rows in returns.items():
     cases = rows[rows.case != "mean"]
