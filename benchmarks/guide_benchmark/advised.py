@@ -26,7 +26,7 @@ from benchmarks.guide_benchmark.rows import read_rows
 from benchmarks.promise import ALONE, PPO
 from coil_rl.comparison.arms import ANCHORED, GUIDE, OPPOSITE, TUNE
 from coil_rl.comparison.compare import FOUND, TABLE
-from coil_rl.comparison.verdict import NOTHING
+from coil_rl.comparison.entry import IDLE
 from coil_rl.files import write_text
 from coil_rl.report import markdown_table, write_csv
 
@@ -34,6 +34,7 @@ Row = Mapping[str, str]
 DETUNED = "detuned"
 ARMS = tuple(arm for arm in picture.ARMS if arm != "shuffled")  # one placebo is enough
 RULES = (GUIDE, PPO, ANCHORED)  # that say the same everywhere, to compare with
+UNTRAINED = (GUIDE, OPPOSITE, TUNE, *IDLE)  # in place of these a training is judged by its end
 RIGHT = (1.0, 5.0, 20.0)  # percent of regret
 OWN = Path(__file__).parent / "conf" / "task"  # tasks of other packages
 COLUMNS = {
@@ -74,7 +75,7 @@ def judged(rows: Sequence[Row], task: str, arm: str, folder: Path) -> dict[str, 
     """Return the row of a comparison: what it said, and what that is worth."""
     values = ends(rows, task, arm)
     said = FOUND.need(folder)
-    use = said["train"] or GUIDE if said["use"] == NOTHING else said["use"]
+    use = said["use"] if said["use"] in UNTRAINED else said["train"] or GUIDE
     # The benchmark has no row for the opposite of a guide, nor for each method of coil-compare.
     value = values[use] if use in values else _measured(folder, use)
     if use == OPPOSITE:
@@ -151,9 +152,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("rows", type=Path, help="table of the guide benchmark")
     parser.add_argument("folder", type=Path, help="of the comparisons")
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="of the guides")
+    parser.add_argument("--arms", nargs="+", choices=picture.ARMS, default=ARMS, help="of guides")
     parser.add_argument("--tasks", nargs="+", help="all of the table by default")
     parser.add_argument("--minutes", type=float, default=2.0, help="of each comparison")
+    parser.add_argument("--words", nargs="+", default=[], help="further ones of each comparison")
     given = parser.parse_args()
     try:
         rows = [row for row in read_rows(given.rows) if row["effort"] != "smoke"]
@@ -167,7 +169,8 @@ def main() -> None:
         place = given.folder / f"{task}_{arm}"
         frames = max(round(float(row["frames"])) for row in rows if row["task"] == task)
         try:
-            run(place, [f"minutes={given.minutes}", *words(task, arm, place, frames)])
+            arguments = [f"minutes={given.minutes}", *words(task, arm, place, frames)]
+            run(place, [*arguments, *given.words])
         except ChildProcessError as error:
             parser.error(str(error))
         found.append(judged(rows, task, arm, place))

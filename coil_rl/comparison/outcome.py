@@ -12,14 +12,10 @@ import pandas as pd
 from coil_rl.comparison.arms import GUIDE, OPPOSITE, TUNE, ZERO
 from coil_rl.comparison.baselines import NAME, action_words, read_baselines
 from coil_rl.comparison.entry import ZERO_ACTIONS, Entry
-from coil_rl.learners.anchor import StartTest
 from coil_rl.report.curves import points
 from coil_rl.report.runs import RETURN, Run, read_runs
 from coil_rl.run.reasons import POLICIES, still_rising
 from coil_rl.tune.run import TUNED
-
-FEW = 4  # cases of a start test, below which only a very large difference is certain
-NOT_JUDGED = "not judged: the start test had too few cases, of which a whole training has more"
 
 
 @dataclass(frozen=True)
@@ -61,30 +57,12 @@ def read_outcome(folder: Path, arms: Sequence[str], failed: Mapping[str, str]) -
             if reasons:
                 rows.append({"policy": name, "note": f"failed: {reasons[0]}"})
             continue
-        judged = [run for run in runs[name] if not few_cases(run)]
-        if not judged:
-            rows.append({"policy": name, "note": NOT_JUDGED})
-            continue
-        tables = [_own(run) for run in judged]
+        tables = [_own(run) for run in runs[name]]
         returns = np.stack([table["reward"].to_numpy() for table in tables])
-        rising = any(still_rising(run.curve) for run in judged)
+        rising = any(still_rising(run.curve) for run in runs[name])
         entries[name] = Entry(name, returns, rising)
-        rows.append(_learned_row(entries[name], tables, judged, reasons))
-        if len(judged) < len(runs[name]):
-            of = f"{len(runs[name]) - len(judged)} of {len(runs[name])} seeds {NOT_JUDGED}"
-            rows[-1]["note"] = "; ".join(filter(None, (of, rows[-1]["note"])))
+        rows.append(_learned_row(entries[name], tables, runs[name], reasons))
     return Outcome(entries, rows, {name: each for name, each in runs.items() if each})
-
-
-def few_cases(run: Run) -> int:
-    """Return after how few cases a start test held no guide, which shows nothing; 0 if otherwise.
-
-    What such a run learned without its guide is no result of its method.
-    """
-    *_, cases, weight = StartTest.names
-    first = run.curve[0] if run.curve else {}
-    found = first.get(cases, math.nan)
-    return int(found) if found < FEW and not first[weight] else 0
 
 
 def _baseline(name: str, table: pd.DataFrame) -> Entry:
@@ -165,6 +143,5 @@ def _failures(tables: Sequence[pd.DataFrame]) -> float:
 
 
 def first_of(outcome: Outcome, name: str) -> Run | None:
-    """Return the first run of an arm that is judged; None for what does not learn."""
-    runs = sorted(outcome.runs.get(name, ()), key=lambda run: few_cases(run) > 0)
-    return runs[0] if runs else None
+    """Return the first run of an arm; None for what does not learn."""
+    return next(iter(outcome.runs.get(name, ())), None)

@@ -12,7 +12,7 @@ from hydra.errors import HydraException
 
 from coil_rl.comparison.arms import ARMS, GUIDE, RANDOM, TUNE
 from coil_rl.comparison.entry import Entry, difference
-from coil_rl.comparison.outcome import Outcome, few_cases
+from coil_rl.comparison.outcome import Outcome
 from coil_rl.comparison.sentences import COMPARE
 from coil_rl.comparison.verdict import Verdict
 from coil_rl.config.compose import key_of
@@ -57,7 +57,7 @@ def page_of(
     if command:
         lead = "Train it to the end"
         if verdict.use != verdict.train:
-            lead = "To see whether a whole training changes that"
+            lead = "To see what a whole training of anchored COIL changes"
         parts += ["", f"{lead}: {command}"]
     return "\n".join(parts)
 
@@ -134,11 +134,7 @@ def draw(outcome: Outcome, cases: int | None, path: Path) -> None:
     """
     known = [run.guide_returns for runs in outcome.runs.values() for run in runs]
     guides = next(filter(None, known), {})
-    curves = {
-        name: [run.curve for run in runs if not few_cases(run)]
-        for name, runs in outcome.runs.items()
-    }
-    curves = {name: runs for name, runs in curves.items() if runs}
+    curves = {name: [run.curve for run in runs] for name, runs in outcome.runs.items()}
     if curves:
         least = lowest_shown(outcome.entries)
         draw_learning_curves(curves, path, guides=guides, cases=cases, least=least)

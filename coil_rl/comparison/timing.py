@@ -11,9 +11,10 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.comparison.arms import POINTS, PPO, SAC, SHARE, Arm, curve_cases
+from coil_rl.comparison.arms import POINTS, PPO, SAC, SHARE, TUNE, Arm, curve_cases
 from coil_rl.comparison.baselines import Acting
 from coil_rl.config.parts import build_learner, env_maker
+from coil_rl.learners.anchor import LEAST_CASES
 from coil_rl.run.evaluation import episodes
 from coil_rl.run.parts import TEST
 from coil_rl.run.rollout import Rollout
@@ -24,7 +25,7 @@ ROWS, STEPS = 16, 32  # of the env in which a step is timed: many rows share wha
 TIMED = 128  # frames of training, at least
 LEAST_BATCHES = 4  # of a training: with fewer there is nothing to compare
 LEAST_FRAMES = 2_000  # of a training with replay, whose batches are small
-LEAST_CASES = 5
+FEWEST_CASES = 5  # of the table
 MEASURING = 0.4  # share of the time that the evaluations may take
 SEEDS = 2
 
@@ -213,17 +214,24 @@ def plan(
     }
     for arm in sorted(arms, key=lambda arm: costs[arm.name]):
         share = max(left, 0.0) / (SEEDS * (len(arms) - len(frames)))
-        frames[arm.name] = _frames(configs.get(arm.learner, config), arm, share / costs[arm.name])
+        affordable = share / costs[arm.name]
+        frames[arm.name] = _frames(configs.get(arm.learner, config), arm, affordable, pace.length)
         left -= SEEDS * frames[arm.name] * costs[arm.name]
     number = cases if isinstance(config.evaluation.cases, int) else None
     in_order = {arm.name: frames[arm.name] for arm in arms}
     return Plan(in_order, number, SEEDS, 60 * minutes - left)
 
 
-def _frames(config: DictConfig, arm: Arm, affordable: float) -> int:
-    """Return the frames of a training of an arm, of which some are affordable."""
+def _frames(config: DictConfig, arm: Arm, affordable: float, length: float) -> int:
+    """Return the frames of a training of an arm, of which some are affordable.
+
+    Args:
+        length: of an episode.
+    """
     batch, budget = config.budget.num_envs * config.budget.steps, config.budget.frames
     least = math.ceil(LEAST_FRAMES / batch) if arm.learner == SAC else LEAST_BATCHES
+    if arm.asks and arm.name != TUNE:  # the start test: a guide, its opposite and the new policy
+        least += math.ceil(3 * LEAST_CASES * length / batch)
     tenth = max(round(SHARE * budget / batch), least)
     return min(min(max(int(affordable / batch), least), tenth) * batch, budget)
 
@@ -234,7 +242,7 @@ def _cases(config: DictConfig, pace: Pace, arms: Sequence[Arm], minutes: float) 
     if not isinstance(given, int):
         return len(given)
     allowed = MEASURING * 60 * minutes / (_measuring(config, pace, arms, given) / given)
-    return min(given, max(int(allowed), LEAST_CASES))
+    return min(given, max(int(allowed), FEWEST_CASES))
 
 
 def _measuring(config: DictConfig, pace: Pace, arms: Sequence[Arm], cases: int) -> float:

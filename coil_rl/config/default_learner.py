@@ -5,7 +5,7 @@ Hydra composes the learner before the env exists. So the env is made once before
 becomes words of the command, which the folder of the run keeps.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing, suppress
 
 from omegaconf import DictConfig
@@ -14,6 +14,7 @@ from coil_rl.config.compose import compose_train, key_of
 from coil_rl.output import say
 
 ANY_ENV = ("fmu", "gym", "torchrl")  # files of conf/env that stand for any env
+STARTS = 500  # of conf/learner/sac.yaml
 FRAMES = 100_000  # 3.5 minutes of the processor with SAC, where the steps of an env are fast
 
 
@@ -40,9 +41,21 @@ def default_learner(
     with suppress(Exception):
         if _acts_in_numbers(compose(of_env)):
             say("learner=sac, because actions are numbers (for PPO write learner=ppo)")
-            frames = [] if "budget.frames" in given else [f"budget.frames={FRAMES}"]
-            return ["learner=sac", *frames]
+            return ["learner=sac", *_budget(given)]
     return []
+
+
+def _budget(given: Mapping[str, str]) -> list[str]:
+    """Return the words for the frames and, in a very short run, for when learning starts.
+
+    Args:
+        given: the words of the command line by key.
+    """
+    if "budget.frames" not in given:
+        return [f"budget.frames={FRAMES}"]
+    frames = int(given["budget.frames"].partition("=")[2])
+    is_short = frames < 4 * STARTS and "learner.starts" not in given
+    return [f"learner.starts={frames // 4}"] if is_short else []
 
 
 def _acts_in_numbers(config: DictConfig) -> bool:

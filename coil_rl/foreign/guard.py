@@ -238,8 +238,8 @@ def _set_torch(states: Sequence[Tensor]) -> None:
 
 def _equal(states: Sequence[Tensor], others: Sequence[Tensor]) -> bool:
     """Return whether states have the same bytes."""
-    one, other = ([state.numpy().tobytes() for state in each] for each in (states, others))
-    return one == other
+    one = [state.numpy().tobytes() for state in states]
+    return one == [state.numpy().tobytes() for state in others]
 
 
 class Guard:

@@ -44,6 +44,7 @@ ADVISED = 0.9  # probability of the advised one of several options at a choice w
 # difference must exceed: quantiles of the t distribution, 0.5 % of one tail up to 8 cases, and 1 %
 # at the last. Two cases have no such quantile of use; theirs was chosen on eight tasks.
 BARS = {2: 20.0, 4: 5.8, 8: 3.5, 12: 2.7}
+LEAST_CASES = 4  # before a start test gives up: after two only a very large difference is certain
 # Shares that the start test may take while something is ahead in every case, or for lower gains.
 PROMISING = 1.6
 GAIN_CASES = (4, 12)  # numbers of cases after which the comparison of gains may end
@@ -62,8 +63,8 @@ class Anchor:
         choice_weight: of an advised option: 0 for none; with 1 the option has a probability of 0.9
             at first. In DQN the share of the range of the values that the advised action gains.
         share: of the frames of the run that the start test may take, and 1.6 times this share while
-            something is ahead in every case, or for lower gains. Its first cases may take more.
-            None: 0.05, or 0.15 of a learner with replay, which learns from these steps too.
+            something is ahead in every case, or for lower gains. Its first four cases may take
+            more. None: 0.05, or 0.15 of a learner with replay, which learns from these steps too.
         advice_key: entry with the advice, [*batch, n_guides, A].
 
     Raises:
@@ -350,7 +351,7 @@ class StartTest:
         for total in BARS:
             more = total - done
             steps = more * sum(map(self._length, [new, *guides, *opposites]))
-            if not self._affordable(steps, shares):
+            if total > LEAST_CASES and not self._affordable(steps, shares):
                 break
             self.cases.renew(more)
             self._act([new, *guides])

@@ -214,7 +214,7 @@ def normaliser(
     elif isinstance(normalise, bool):
         chosen = vectors_of_measurements(env, in_keys) if normalise else []
         if normalise:
-            _warn_of_pictures(env, in_keys)
+            _warn_of_others(env, in_keys)
     else:
         chosen = list(normalise)
         if unread := [str(key) for key in chosen if key not in in_keys]:
@@ -225,13 +225,15 @@ def normaliser(
     return Normaliser(env, chosen, automatic=normalise == "auto") if chosen else None
 
 
-def _warn_of_pictures(env: EnvBase, in_keys: Sequence[NestedKey]) -> None:
+def _warn_of_others(env: EnvBase, in_keys: Sequence[NestedKey]) -> None:
     """Say which entries keep their numbers although all are to be normalised."""
     for key, spec in zip(in_keys, entry_specs(env, in_keys), strict=True):
         if spec.dtype == torch.uint8:
             why = "it holds bytes, which networks divide by 255"
         elif _is_image(env, spec):
             why = "it is a picture"
+        elif isinstance(spec, CHOICES):
+            why = "it holds choices"
         else:
             continue
         warnings.warn(f"normalise=true leaves {_name(key)} as it is: {why}", stacklevel=3)

@@ -158,7 +158,8 @@ def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> l
             name = key.removeprefix("env.")
             if name not in config.env:
                 target = config.env["_target_"].rpartition(".")[2]
-                raise UserError(f"{text} has no effect on {target}, the env of run={folder}")
+                word = text.lstrip("+")
+                raise UserError(f"{word} has no effect on {target}, the env of run={folder}")
             value = resolved["env"][name]
             if isinstance(value, list):  # beside the entries that the policy may observe
                 value = [*dict.fromkeys([*config.env[name], *value])]

@@ -292,19 +292,19 @@ class Experiment:
 
     @contextmanager
     def resume_hint(self) -> Iterator[None]:
-        """Add to an error with a cause outside of the program how the run is continued."""
+        """Add to an error with a cause outside of the program how a saved run is continued."""
         try:
             yield
         except Exception as error:
             if not is_outside(error):
                 raise
-            kept = "there is no checkpoint yet"
+            kept = ""
             if (self.folder / checkpoint.NEWEST).exists():
-                kept = "the last good checkpoint is kept"
-            raise UserError(
-                f"{error}; {kept}: correct the cause and continue with "
-                f"{self.resume_command}, or train again with other values"
-            ) from error
+                kept = (
+                    "; the last good checkpoint is kept: correct the cause and continue with "
+                    f"{self.resume_command}, or train again with other values"
+                )
+            raise UserError(f"{error}{kept}") from error
 
     def _describe(self, batch: TensorDictBase) -> dict[str, float]:
         after = batch["next"]

@@ -43,9 +43,7 @@ def test_table_has_everything_that_acts(compared):
     without = ["guide", "opposite", "zero", "random", "first network"]
     learned = ["tune", "ppo", "coil_anchored", "sac", "coil_anchored_sac"]
     assert list(rows) == [*without, *learned]
-    judged = [rows[name] for name in learned if "not judged" not in rows[name]["note"]]
-    assert len(judged) >= 3, "those without a start test"
-    assert all(row["seeds"] == "2" for row in judged)
+    assert all(rows[name]["seeds"] == "2" for name in learned)
     assert all(float(rows[name]["frames"]) == 0 for name in without)
     assert [float(rows[name]["frames"]) for name in ("ppo", "sac")] == [128, 640]
     assert float(rows["ppo"]["calls"]) == 0 < float(rows["tune"]["calls"])
@@ -55,7 +53,7 @@ def test_table_has_everything_that_acts(compared):
 @pytest.mark.slow
 def test_it_says_before_what_it_runs_and_how_to_go_on(compared):
     folder, done = compared
-    assert "ppo 128, coil_anchored 128, sac 640" in done.stderr
+    assert "ppo 128, coil_anchored 384, sac 640" in done.stderr
     assert "go on with: coil-compare env=pendulum" in done.stderr
     assert "minutes=0.01 is not enough" in done.stderr
     assert shlex.quote(f"folder={folder}") in done.stderr

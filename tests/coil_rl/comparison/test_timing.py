@@ -5,6 +5,7 @@ from omegaconf import OmegaConf
 
 from coil_rl.comparison.arms import ANCHORED, ARMS, PPO, SAC
 from coil_rl.comparison.timing import LEAST_BATCHES, LEAST_FRAMES, Clock, Pace, plan
+from coil_rl.learners.anchor import LEAST_CASES
 
 BATCH = 8 * 256
 CONFIG = OmegaConf.create(
@@ -36,7 +37,8 @@ def test_training_gets_what_the_minutes_allow():
 
 def test_slow_guide_leaves_a_few_batches_and_fewer_cases_and_it_is_said():
     found = planned(minutes=2, guide=5e-3)
-    assert found.frames[ANCHORED] == LEAST_BATCHES * BATCH < found.frames[PPO]
+    assert found.frames[ANCHORED] == (LEAST_BATCHES + 2) * BATCH < found.frames[PPO]
+    assert 2 * BATCH > 3 * LEAST_CASES * 200 > BATCH, "steps of the start test"
     assert found.cases == 5
     assert found.seconds > 120
     assert "minutes=2 is not enough" in found.described(2)

@@ -63,9 +63,14 @@ def test_policy_may_be_better_than_the_opposite_of_a_reversed_guide():
 
 def test_ppo_is_recommended_where_it_is_best():
     found = verdict(entries(guide=20.0, ppo=[90.0, 92.0], coil_anchored=[70.0, 71.0]))
-    assert (found.use, found.train) == ("ppo", "ppo")
+    assert (found.use, found.train) == ("ppo", "coil_anchored"), "the rule to train"
     assert "over the guide" in found.sentences[1]
     assert "over PPO" not in found.sentences[1]
+
+
+def test_anchored_sac_is_to_be_trained_where_actions_are_numbers():
+    found = verdict(entries(ppo=90.0, coil_anchored=95.0, sac=10.0, coil_anchored_sac=20.0))
+    assert (found.use, found.train) == ("coil_anchored", "coil_anchored_sac")
 
 
 def test_anchored_policy_is_recommended_where_it_is_best():
@@ -130,7 +135,7 @@ def test_doing_nothing_is_used_where_it_is_clearly_better_than_everything_else(n
     low = {"zero": -120.0, "first network": -130.0}
     given = {"random": -160.0, "guide": -40.0, "opposite": -150.0, "ppo": [-90.0, -80.0]}
     found = verdict(entries(**(low | given | {name: 40.0})))
-    assert (found.use, found.train) == (name, "ppo")
+    assert (found.use, found.train) == (name, "")
     assert found.score == pytest.approx(0.6)
     assert found.sentences[0].startswith(words)
     assert "40.0) is clearly better than everything else here; your guide" in found.sentences[0]
@@ -174,7 +179,7 @@ def test_policy_is_used_where_doing_nothing_is_clearly_better_than_the_guide_onl
 def test_doing_nothing_may_be_all_that_is_better_than_random_actions():
     given = {"random": -200.0, "opposite": -220.0, "zero": -100.0, "first network": -210.0}
     found = verdict(entries(guide=-230.0, ppo=[-300.0, 0.0], **given))
-    assert (found.use, found.train) == ("zero", "ppo")
+    assert (found.use, found.train) == ("zero", "")
     assert "random actions (-200.0), which no guide and no trained policy" in found.sentences[0]
 
 
@@ -189,7 +194,7 @@ def test_guide_that_is_not_clearly_better_than_random_gives_way_to_a_policy_that
     low = {"random": -200.0, "opposite": -210.0, "zero": -220.0, "first network": -230.0}
     made = variable(entries(ppo=-100.0, coil_anchored=-101.0, **low), "guide", mean, 900.0)
     found = verdict(made)
-    assert (found.use, found.train) == ("ppo", "ppo")
+    assert (found.use, found.train) == ("ppo", "coil_anchored")
     assert found.sentences[0].startswith(
         "Your guide is not clearly better than random actions (-200.0). Use ppo: -100.0"
     )

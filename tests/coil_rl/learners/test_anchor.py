@@ -9,7 +9,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Anchor, Gru, Reinforce
-from coil_rl.learners.anchor import BARS, PROMISING, Hold, hold_of, start_tests
+from coil_rl.learners.anchor import BARS, LEAST_CASES, PROMISING, Hold, hold_of, start_tests
 from coil_rl.learners.policy import UNCLIPPED
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions, Takeover
@@ -326,8 +326,8 @@ def test_start_test_ends_when_it_would_take_more_than_its_share():
     cases = Returns(lambda weights: -5.0 * abs(weights[0]), frames=20_000)
     weights, numbers, _ = decided(None, cases=cases, share=0.05)
     assert weights == [0]
-    assert numbers["start/cases"] == 2, "the next two cases would take 600 steps more"
-    assert cases.steps == 600
+    assert numbers["start/cases"] == LEAST_CASES, "four further ones would take 1,200 steps more"
+    assert cases.steps == 300 * LEAST_CASES
 
 
 @pytest.mark.parametrize("frames", [1_000, 12_000, 18_000, 30_000, 50_000, 200_000])
@@ -335,7 +335,7 @@ def test_start_test_ends_when_it_would_take_more_than_its_share():
 def test_start_test_takes_no_more_than_its_share_after_its_first_cases(gain, frames):
     cases = Returns(lambda weights: gain * weights[0], frames=frames)
     decided(None, cases=cases)
-    assert cases.steps <= max(600, PROMISING * 0.05 * frames)
+    assert cases.steps <= max(300 * LEAST_CASES, PROMISING * 0.05 * frames)
 
 
 def test_guide_that_is_ahead_in_every_case_gets_more_cases():

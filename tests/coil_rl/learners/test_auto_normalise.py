@@ -135,6 +135,7 @@ def test_an_entry_is_never_in_scale_and_far_out_of_scale_in_one_batch():
     [
         (spaces.Box(0, 255, (4,), np.uint8), "leaves observation as it is: it holds bytes, which"),
         (spaces.Box(0, 1, (8, 8, 3), np.float32), "leaves observation as it is: it is a picture"),
+        (spaces.Discrete(3), "leaves observation as it is: it holds choices"),
         (spaces.Box(-1, 1, (4,)), ""),
     ],
 )
