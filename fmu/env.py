@@ -125,10 +125,10 @@ def _wiring(
     model.named("start", start or (), "parameter", "input", "local", "output")
     for name in [*drawn.keys() & set(own)]:
         raise ValueError(f"parameters: {name} is an action; leave one out")
-    actions = [_bounded(each, (bounds or {}).get(each.name)) for each in inputs]
+    moved = [_bounded(each, (bounds or {}).get(each.name)) for each in inputs]
     return Wiring(
-        actions,
-        action_space(actions, model.name),
+        moved,
+        action_space(moved, model.name),
         seen,
         wanted,
         drawn,

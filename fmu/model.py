@@ -123,6 +123,7 @@ class Model:
         require("an FMU", "fmu", "fmpy")
         import fmpy
 
+        self.description: Any = None
         self.file = os.fspath(file)
         path = Path(file).expanduser()
         if not path.is_file():
