@@ -132,9 +132,7 @@ class Model:
             with zipfile.ZipFile(path) as archive:
                 names, text = archive.namelist(), archive.read("modelDescription.xml")
             old = re.search(rb"fmiVersion=[\"']1", text)  # is read in another way
-            self.description: Any = (
-                None if old else fmpy.read_model_description(path, validate=False)
-            )
+            self.description = None if old else fmpy.read_model_description(path, validate=False)
         except Exception as error:  # of XML, of ZIP, and plain ones of FMPy
             raise ValueError(f"file={self.file} is no FMU: {str(error).splitlines()[0]}") from error
         if old:
