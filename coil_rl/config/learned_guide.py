@@ -20,8 +20,8 @@ from coil_rl.transforms.guide_memory import primer_of
 from coil_rl.transforms.hosted import HostedGuide
 
 LONGEST_CHAIN = 4  # learned guides of learned guides
-# Runs that are being loaded, each of which is a guide of the one before.
-_LOADING: ContextVar[tuple[Path, ...]] = ContextVar("loading", default=())
+# Number of runs that are being loaded, each of which is a guide of the one before.
+_DEPTH: ContextVar[int] = ContextVar("depth", default=0)
 
 
 class LearnedGuide(HostedGuide):
@@ -106,17 +106,15 @@ class LearnedGuide(HostedGuide):
 
 @contextmanager
 def _guarded(folder: Path) -> Iterator[None]:
-    """Refuse a run that is already being loaded as a guide, and too long a chain of them."""
-    place, loading = folder.resolve(), _LOADING.get()
-    if place in loading:
-        raise UserError(f"run={folder} is its own guide; give a run that does not depend on itself")
-    if len(loading) == LONGEST_CHAIN:
+    """Refuse a run that is its own guide, or too long a chain of learned guides."""
+    depth = _DEPTH.get()
+    if depth == LONGEST_CHAIN:
         raise UserError(
-            f"run={folder} ends a chain of more than {LONGEST_CHAIN} learned guides; give a "
-            "shorter one"
+            f"run={folder} ends a chain of more than {LONGEST_CHAIN} learned guides, or is its own "
+            "guide; give a run with a shorter chain"
         )
-    token = _LOADING.set((*loading, place))
+    token = _DEPTH.set(depth + 1)
     try:
         yield
     finally:
-        _LOADING.reset(token)
+        _DEPTH.reset(token)

@@ -71,12 +71,12 @@ class EnvPart:
         figures = draw_report(self.runs, self.compared, folder, strokes, f"{suffix}.{kind}")
         sections: list[Section] = []
         for actions, rows in self.tables().items():
-            heading = ", ".join(filter(None, (self.env, f"{actions} actions")))
+            heading = f"{actions} actions"
+            heading = f"{self.env}, {heading}" if self.env else heading.capitalize()
             blocks = page.section(self.compared[actions], rows, self.against)
             if not sections:
                 blocks += page.what_differs(self.differing, "policy")
-            named = f"{heading[0].upper()}{heading[1:]}"
-            sections.append(Section(named, blocks, [] if sections else figures))
+            sections.append(Section(heading, blocks, [] if sections else figures))
         training = [*page.training(self.runs), *page.guide_training(self.runs)]
         return [*sections, Section("", [*training, *self._notes()])]
 

@@ -103,7 +103,9 @@ def by_test(runs: Sequence[Run]) -> tuple[dict[str, list[Run]], Differing]:
 def env_name(run: Run) -> str:
     """Return the name of the env of a run; empty for one that was made from parts."""
     node = run.settings.get("env") or {}
-    return str(node.get("id") or str(node.get("_target_", "")).rpartition(".")[2])
+    if node.get("id"):
+        return str(node["id"]).rpartition(":")[2]
+    return str(node.get("_target_", "")).rpartition(".")[2]
 
 
 def _is_of_test(key: str) -> bool:
@@ -164,6 +166,8 @@ def _what_differs(groups: Sequence[Sequence[Run]], keys: Sequence[str]) -> list[
     common = [_common([_typed(run) for run in runs]) for runs in groups]
     typed = list(dict.fromkeys(itertools.chain.from_iterable(common)))
     typed = [key for key in typed if len({words.get(key) for words in common}) > 1]
+    if all(map(_is_of_test, keys)):
+        typed = list(filter(_is_of_test, typed))
     values = [_common([relevant(run) for run in runs]) for runs in groups]
     telling = _telling_first(keys, values)
     texts = [

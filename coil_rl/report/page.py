@@ -134,7 +134,12 @@ def training(runs: Sequence[Run]) -> list[Table]:
         if not math.isnan(row["area"]):
             rows.append(row)
     rows.sort(key=lambda row: -float(row["area"]))
-    return [Table(rows, TABLES["learning"]["columns"])] if rows else []
+    spec = return_format(row[key] for row in rows for key in ("guide", "area"))
+    columns = {
+        key: (heading, spec if each == AUTO_FORMAT else each)
+        for key, (heading, each) in TABLES["learning"]["columns"].items()
+    }
+    return [Table(rows, columns)] if rows else []
 
 
 def _mean_of_some(
@@ -288,18 +293,17 @@ def cases_table(groups: Sequence[Group], file: str) -> Block:
     names = dict.fromkeys(chain.from_iterable(group.cases for group in groups))
     if len(names) > MAX_CASES:
         return f"The rewards in each of the {len(names)} cases are in {file}."
+    spec = return_format(group.reward.mean for group in groups)
     rows = []
     for group in groups:
         row: dict[str, Any] = {"driver": group.title}
         for index, case in enumerate(group.cases):
             means = group.means(index)
             reward, completed = means["reward"], means.get("completed", 1.0)
-            spec = return_format([reward])
             row[f"{IN_CASE}{case}"] = (
                 f"{reward:{spec}} ({completed:.0%} completed)" if completed < 1 else reward
             )
         rows.append(row)
-    columns = {"driver": ("mean reward", "")}
-    for name in names:
-        columns[f"{IN_CASE}{name}"] = (name, AUTO_FORMAT)
-    return Table(rows, columns)
+    return Table(
+        rows, {"driver": ("mean reward", "")} | {f"{IN_CASE}{name}": (name, spec) for name in names}
+    )

@@ -137,6 +137,18 @@ def test_cases_belong_to_their_env(runs):
     assert [row["differs"] for row in rows] == ["disturb.late.steps=null", "disturb.late.steps=1"]
 
 
+def test_env_of_a_module_has_its_own_name_and_words_of_no_test_are_left_out(runs):
+    one = {"env": {"id": "plants.tanks:Tank", "size": 1}, "learner": {"gamma": 0.9}}
+    read = runs(one, {"env": {"id": "plants.tanks:Tank", "size": 2}})
+    read = [
+        replace(run, command=["coil-train", f"env.size={size}", f"learner.gamma=0.{size}"])
+        for size, run in enumerate(read, 1)
+    ]
+    envs, rows = by_test(read)
+    assert list(envs) == ["Tank 1", "Tank 2"]
+    assert [row["differs"] for row in rows] == ["env.size=1", "env.size=2"]
+
+
 def test_only_the_policy_of_a_label_is_renamed(tmp_path):
     for seed in range(2):
         drivers = ("guide", "g", "g or guide")
