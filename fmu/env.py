@@ -11,7 +11,7 @@ import gymnasium
 import torch
 
 from coil_fmu.model import Model, Variable
-from coil_fmu.plant import FAILED, FMU, Clock, Reward, Wiring, numbers_of
+from coil_fmu.plant import FAILED, FMU, Clock, Reward, Wiring, action_space, numbers_of
 from coil_fmu.reward import Follow
 from coil_fmu.setpoints import Course, course_of
 from coil_rl import GymnasiumEnv
@@ -125,8 +125,10 @@ def _wiring(
     model.named("start", start or (), "parameter", "input", "local", "output")
     for name in [*drawn.keys() & set(own)]:
         raise ValueError(f"parameters: {name} is an action; leave one out")
+    moved = [_bounded(each, (bounds or {}).get(each.name)) for each in inputs]
     return Wiring(
-        [_bounded(each, (bounds or {}).get(each.name)) for each in inputs],
+        moved,
+        action_space(moved, model.name),
         seen,
         wanted,
         drawn,

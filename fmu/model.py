@@ -42,10 +42,6 @@ class SolverError(Exception):
     """What an FMU says when it cannot go on with its simulation."""
 
 
-class OldError(ValueError):
-    """An FMU of FMI 1."""
-
-
 @dataclass(frozen=True)
 class Variable:
     """A variable of an FMU.
@@ -127,6 +123,7 @@ class Model:
         require("an FMU", "fmu", "fmpy")
         import fmpy
 
+        self.description: Any = None
         self.file = os.fspath(file)
         path = Path(file).expanduser()
         if not path.is_file():
@@ -134,12 +131,14 @@ class Model:
         try:
             with zipfile.ZipFile(path) as archive:
                 names, text = archive.namelist(), archive.read("modelDescription.xml")
-            self._check_version(text)
-            self.description = fmpy.read_model_description(path, validate=False)
-        except OldError:
-            raise
+            old = re.search(rb"fmiVersion=[\"']1", text)  # is read in another way
+            self.description = None if old else fmpy.read_model_description(path, validate=False)
         except Exception as error:  # of XML, of ZIP, and plain ones of FMPy
             raise ValueError(f"file={self.file} is no FMU: {str(error).splitlines()[0]}") from error
+        if old:
+            raise ValueError(
+                f"file={self.file} is of FMI 1, but FMI 2 and 3 are read; export it again"
+            )
         self._check(names)
         self.variables = {
             own.name: _variable(own, self.description.fmiVersion)
@@ -148,14 +147,6 @@ class Model:
         self.path, self.name, self.said = path, path.name, set[str]()
         self.single = self.description.coSimulation.canBeInstantiatedOnlyOncePerProcess
         self.folder = self.unpacked()
-
-    def _check_version(self, text: bytes) -> None:
-        """Raise an `OldError` for a description of FMI 1, which is read in another way."""
-        version = re.search(rb"fmiVersion=[\"']1", text)
-        if version is not None:
-            raise OldError(
-                f"file={self.file} is of FMI 1, but FMI 2 and 3 are read; export it again"
-            )
 
     def _check(self, names: Iterable[str]) -> None:
         """Raise a `ValueError` for an FMU that this program cannot simulate."""

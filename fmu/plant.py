@@ -45,6 +45,7 @@ class Wiring:
 
     Attributes:
         actions: inputs that are actions.
+        space: of them, one after the other.
         observations: outputs that are observed.
         setpoints: courses, by the name of the output.
         parameters: what is drawn for each episode, by name.
@@ -52,6 +53,7 @@ class Wiring:
     """
 
     actions: Sequence[Variable]
+    space: spaces.Box
     observations: Sequence[Variable]
     setpoints: Mapping[str, Course]
     parameters: Mapping[str, Course]
@@ -88,7 +90,7 @@ class FMU(gymnasium.Env[dict[str, Floats], Floats]):
         self.instance = Instance(model, wiring.observations)
         self.metadata = {"render_modes": [], "render_fps": 1 / clock.step}
         self.max_steps = clock.steps
-        self.action_space: spaces.Space[Any] = action_space(wiring.actions, model.name)
+        self.action_space: spaces.Space[Any] = wiring.space
         self.observation_space: spaces.Space[Any] = observation_space(wiring)
         self.meanings = meanings(wiring)
         self.courses: dict[str, Drawn] = {}

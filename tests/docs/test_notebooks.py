@@ -10,6 +10,7 @@ NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.py"))
 SHOWN = {
     "your_env_and_controller": ("coil_anchored", "l/s"),
     "is_my_guide_worth_it": ("coil_anchored", "coil_rl.train(env"),
+    "from_an_fmu_to_a_verdict": ("policy on top: mean", "onnxruntime alone"),
     "from_a_recording": ("scans with a command", "network  reward"),
 }
 

@@ -163,13 +163,20 @@ def open_files() -> int:
     return len(os.listdir("/proc/self/fd")) + Path("/proc/self/maps").read_text().count(".so")
 
 
+def megabytes() -> float:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
+
+
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="it counts handles as Linux does")
-def test_a_thousand_episodes_leave_no_handle() -> None:
+def test_a_thousand_episodes_leave_no_handle_and_no_memory() -> None:
     env = tank(seconds=0.5)
     driven(env, 10)
-    before = open_files()
+    for _ in range(100):
+        env.reset()
+    before, used = open_files(), megabytes()
     for _ in range(1_000):
         env.reset()
+    assert megabytes() - used < 10
     for _ in range(20):
         driven(tank(num_envs=2, fresh=True), 3, 0.5).clear()
         gc.collect()

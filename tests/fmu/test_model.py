@@ -137,6 +137,7 @@ def test_what_is_odd_is_one_sentence(
     with pytest.raises(ValueError, match=sentence) as caught:
         fmu_env(make(tmp_path), **(SETTINGS | settings))
     assert "\n" not in str(caught.value)
+    assert "..." not in str(caught.value)  # what to do is at the end
 
 
 def test_texts_are_left_out_and_flags_are_numbers() -> None:
