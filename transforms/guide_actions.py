@@ -28,7 +28,7 @@ from coil_rl.transforms.action_space import (
     space_of,
 )
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
-from coil_rl.transforms.hosted import HostedGuide, ToldGuide
+from coil_rl.transforms.hosted import HostedGuide, ToldGuide, guide_of
 from coil_rl.transforms.link import State
 from coil_rl.transforms.normalised_action import ActionUnits
 
@@ -95,7 +95,7 @@ class Guides(TensorDictModuleBase):
         units: of the actions of the guides; None: of the advice.
 
     Raises:
-        TypeError: if `guides` is not a mapping to guides.
+        TypeError: if `guides` is not a mapping.
         ValueError: without a guide, for an invalid name, for a guide that does not write
             `action_key`, for one that cannot be trained although it has to be, and for a memory
             that `GuideMemory` refuses.
@@ -103,7 +103,7 @@ class Guides(TensorDictModuleBase):
 
     def __init__(
         self,
-        guides: Mapping[str, TensorDictModuleBase],
+        guides: Mapping[str, Any],
         action_key: NestedKey = "action",
         out_key: NestedKey = "guide_action",
         trainable: bool = False,
@@ -113,6 +113,7 @@ class Guides(TensorDictModuleBase):
             raise TypeError(
                 f"guides must be a mapping from name to guide, not {type(guides).__name__}"
             )
+        guides = {name: guide_of(guide) for name, guide in guides.items()}
         if not guides:
             raise ValueError("at least one guide is required, none was given")
         for name, guide in guides.items():
@@ -233,12 +234,7 @@ def _is_by_row(guide: nn.Module) -> bool:
 
 
 def _check_guide(name: str, guide: TensorDictModuleBase, action_key: NestedKey) -> None:
-    """Raise an error for what is no guide, does not write `action_key` or has an invalid name."""
-    if not isinstance(guide, TensorDictModuleBase):
-        raise TypeError(
-            f"guide {name!r} is {type(guide).__name__}, not a TensorDictModule: give it as "
-            "ControllerGuide(...)"
-        )
+    """Raise a `ValueError` for a guide that does not write `action_key` or has an invalid name."""
     if action_key not in guide.out_keys:
         raise ValueError(f"guide {name!r} must write {action_key!r}; it writes {guide.out_keys}")
     if not name or "." in name or hasattr(nn.ModuleDict, name):
@@ -317,7 +313,7 @@ class GuideActions(ActionTransform):
             an action for each of several agents [*batch, n_agents, n_guides, A].
 
     Raises:
-        TypeError: if `guides` is not a mapping to guides.
+        TypeError: if `guides` is not a mapping.
         ValueError: without a guide, for an invalid name, or for a guide that does not write
             `action_key`; at the first step for an action of another shape, or one that is not
             finite.
@@ -334,7 +330,7 @@ class GuideActions(ActionTransform):
 
     def __init__(
         self,
-        guides: Mapping[str, TensorDictModuleBase],
+        guides: Mapping[str, Any],
         action_key: NestedKey = "action",
         out_key: NestedKey = "guide_action",
     ) -> None:

@@ -1,10 +1,22 @@
 """Guides that are told about their env, among them those that run the code of somebody else."""
 
+import importlib
+from typing import Any
+
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices
+
+
+def guide_of(thing: Any) -> TensorDictModuleBase:
+    """Return a TensorDictModule itself, and anything else as a `ControllerGuide`."""
+    if isinstance(thing, TensorDictModuleBase):
+        return thing
+    # By its public name, as nothing here knows other people's code.
+    guide: TensorDictModuleBase = importlib.import_module("coil_rl").ControllerGuide(thing)
+    return guide
 
 
 class ToldGuide(TensorDictModuleBase):

@@ -105,7 +105,7 @@ CONTROLLERS = {
 
 def in_a_transform(controller):
     env = GymnasiumEnv("Pendulum-v1", first_seed=3)
-    env = TransformedEnv(env, GuideActions({"it": ControllerGuide(controller)}))
+    env = TransformedEnv(env, GuideActions({"it": controller}))
     return advice(env, "guide_action")
 
 
