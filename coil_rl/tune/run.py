@@ -118,12 +118,15 @@ class TunedRun(Run):
     def _say_next(self) -> None:
         """Print what usually follows: a training with the guide itself, faster than this run."""
         values = read_tuned(self.folder, self.numbers) or {}
+        tuned = self.words(values)
         if self.in_python:
             numbers = ", ".join(f"{name}={value:.6g}" for name, value in values.items())
-            say(f"Next: coil_rl.train(env, guide=functools.partial(GUIDE, {numbers}))")
+            own = f"guide=functools.partial(GUIDE, {numbers})"
+            if not all(word.startswith("++guide.controller.") for word in tuned):
+                own = f"guide=GUIDE, overrides={tuned}"  # a guide of this package has a name
+            say(f"Next: coil_rl.train(ENV, {own})")
             return
         typed = [*self.command] or record.COMMAND.read(self.folder) or ["coil-train"]
-        tuned = self.words(values)
         own = ["method=", "method.run.", "tune=", "tune.", "label=", "run_dir=", "existing="]
         own += [f"{word.lstrip('+').partition('=')[0]}=" for word in tuned]
         kept = [word for word in typed if not word.lstrip("+").startswith(tuple(own))]

@@ -44,3 +44,21 @@ def test_next_command_names_each_number_of_the_guide_once(tmp_path, capsys):
         "++guide.swing_up.gain=3.5",
         "method=coil_anchored",
     ]
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("++guide.controller.options.gain=3.5", "guide=functools.partial(GUIDE, gain=3.5)"),
+        ("++guide.pid.kp=3.5", "guide=GUIDE, overrides=['++guide.pid.kp=3.5']"),
+    ],
+)
+def test_next_step_in_python_gives_the_numbers_as_the_guide_takes_them(
+    word, said, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr("coil_rl.tune.run.read_tuned", lambda folder, numbers: {"gain": 3.5})
+    run = TunedRun.__new__(TunedRun)
+    run.folder, run.in_python, run.numbers = tmp_path, True, ()
+    run.words = lambda values: [word]
+    run._say_next()
+    assert capsys.readouterr().out == f"Next: coil_rl.train(ENV, {said})\n"
