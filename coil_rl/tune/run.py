@@ -121,10 +121,10 @@ class TunedRun(Run):
         tuned = self.words(values)
         if self.in_python:
             numbers = ", ".join(f"{name}={value:.6g}" for name, value in values.items())
-            own = f"guide=functools.partial(GUIDE, {numbers})"
+            guide = f"guide=functools.partial(GUIDE, {numbers})"
             if not all(word.startswith("++guide.controller.") for word in tuned):
-                own = f"guide=GUIDE, overrides={tuned}"  # a guide of this package has a name
-            say(f"Next: coil_rl.train(ENV, {own})")
+                guide = f"guide=GUIDE, overrides={tuned}"  # a guide of this package has a name
+            say(f"Next: coil_rl.train(ENV, {guide})")
             return
         typed = [*self.command] or record.COMMAND.read(self.folder) or ["coil-train"]
         own = ["method=", "method.run.", "tune=", "tune.", "label=", "run_dir=", "existing="]
