@@ -5,6 +5,7 @@ import json
 import shlex
 import sys
 import time
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -208,20 +209,19 @@ def test_dictionary_and_a_reversed_guide(tmp_path):
 
 
 class Fragile:
-    """A controller that fails at the hundredth observation of its process."""
+    """A controller that fails once a file exists."""
 
-    asked = 0
+    last = Path()
 
     def act(self, observation):
-        Fragile.asked += 1
-        if Fragile.asked > 2500:
+        if Fragile.last.is_file():
             raise RuntimeError("no more")
         return [0.0]
 
 
 @pytest.mark.slow
 def test_failed_training_is_one_failed_training(tmp_path):
-    Fragile.asked = 0
+    Fragile.last = tmp_path / "it" / "ppo_seed1" / "evaluation.csv"
     words = [f"guide.controller.of={__name__}:Fragile", "guide=controller"]
     words += ["env=gym", "env.id=Pendulum-v1", *SMALL, "minutes=0.01", f"folder={tmp_path / 'it'}"]
     sys.path.insert(0, "tests/coil_rl/programs")
