@@ -47,7 +47,7 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def read_file(path: str | os.PathLike[str], largest: int) -> bytes:
-    """Return the bytes of a file, as `open_regular`.
+    """Return the bytes of a regular file, see `open_regular`.
 
     Args:
         largest: allowed size, in bytes.

@@ -62,7 +62,7 @@ class SafeStream:
 
 
 def printable(text: str) -> str:
-    """Return a text that may be somebody else's, without what a terminal obeys."""
+    """Return a text whose control characters, which a terminal obeys, are written as escapes."""
     return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 

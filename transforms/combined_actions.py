@@ -66,7 +66,7 @@ class CombinedAction(GuideTransform):
         return {EXECUTED: Unbounded(spec.shape, device=self.parent.device, dtype=spec.dtype)}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add what it writes; raises a `ValueError` if choices would have to be added."""
+        """Add the entries that it writes; a `ValueError` if choices would have to be added."""
         if self.adds and not self.action_space.continuous:
             raise ValueError(
                 f"{type(self).__name__} needs continuous actions, but this env has "

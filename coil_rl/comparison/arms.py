@@ -54,6 +54,11 @@ class Arm:
     asks: bool
     learner: str
 
+    @property
+    def is_tested(self) -> bool:
+        """Whether a start test decides what it holds."""
+        return self.asks and self.learner != TUNE
+
 
 ARMS = {
     TUNE: Arm(TUNE, ("method=tune",), asks=True, learner=TUNE),
@@ -125,8 +130,9 @@ def job_of(given: Named, arm: Arm, seed: int, frames: int | None, short: Sequenc
     if frames is not None:
         words = [word for word in words if key_of(word) != "budget.frames"]
         words.append(f"budget.frames={frames}")
-        if arm.name in (ANCHORED, ANCHORED_SAC):
-            words.append(f"learner.anchor.least_cases={TESTED_CASES}")
+        least = "learner.anchor.least_cases"
+        if arm.is_tested and least not in map(key_of, words):
+            words.append(f"{least}={TESTED_CASES}")
     words += [*short, *arm.words, f"label='{arm.name}'", f"seed={seed}"]
     nodes = dict(given.nodes)
     if arm.name != TUNE:

@@ -17,7 +17,6 @@ from coil_rl.comparison.arms import (
     SAC,
     SHARE,
     TESTED_CASES,
-    TUNE,
     Arm,
     curve_cases,
 )
@@ -238,7 +237,7 @@ def _frames(config: DictConfig, arm: Arm, affordable: float, length: float) -> i
     """
     batch, budget = config.budget.num_envs * config.budget.steps, config.budget.frames
     least = math.ceil(LEAST_FRAMES / batch) if arm.learner == SAC else LEAST_BATCHES
-    if arm.asks and arm.name != TUNE:  # the start test: a guide, its opposite and the new policy
+    if arm.is_tested:  # with a guide, its opposite and the new policy
         least += math.ceil(3 * TESTED_CASES * length / batch)
     tenth = max(round(SHARE * budget / batch), least)
     return min(min(max(int(affordable / batch), least), tenth) * batch, budget)

@@ -5,7 +5,7 @@ Hydra composes the learner before the env exists. So the env is made once before
 becomes words of the command, which the folder of the run keeps.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import closing, suppress
 
 from omegaconf import DictConfig
@@ -14,7 +14,6 @@ from coil_rl.config.compose import compose_train, key_of
 from coil_rl.output import say
 
 ANY_ENV = ("fmu", "gym", "torchrl")  # files of conf/env that stand for any env
-STARTS = 500  # of conf/learner/sac.yaml
 FRAMES = 100_000  # 3.5 minutes of the processor with SAC, where the steps of an env are fast
 
 
@@ -30,32 +29,27 @@ def default_learner(
 
     Args:
         words: of the command line.
-        compose: returns the configuration for those of the env.
+        compose: returns the configuration for some of them.
     """
     given = {key_of(word): word for word in words}
     kind, method = (given.get(key, "").partition("=")[2] for key in ("env", "method"))
     chosen = given.keys() & {"experiment", "init", "learner", "network", "resume"}
     if kind not in ANY_ENV or chosen or method not in ("", "coil_anchored"):
         return []
-    of_env = [word for key, word in given.items() if key.startswith(("env", "hydra.searchpath"))]
+    read = ("env", "hydra.searchpath", "budget.frames")
+    of_env = [word for key, word in given.items() if key.startswith(read)]
     with suppress(Exception):
-        if _acts_in_numbers(compose(of_env)):
+        config = compose([*of_env, "learner=sac"])
+        if _acts_in_numbers(config):
+            more = [f"budget.frames={FRAMES}"]
+            if "budget.frames" in given:
+                # A very short run learns too: its first quarter is stored without learning.
+                frames, starts = config.budget.frames, config.learner.starts
+                is_short = frames < 4 * starts and "learner.starts" not in given
+                more = [f"learner.starts={frames // 4}"] if is_short else []
             say("learner=sac, because actions are numbers (for PPO write learner=ppo)")
-            return ["learner=sac", *_budget(given)]
+            return ["learner=sac", *more]
     return []
-
-
-def _budget(given: Mapping[str, str]) -> list[str]:
-    """Return the words for the frames and, in a very short run, for when learning starts.
-
-    Args:
-        given: the words of the command line by key.
-    """
-    if "budget.frames" not in given:
-        return [f"budget.frames={FRAMES}"]
-    frames = int(given["budget.frames"].partition("=")[2])
-    is_short = frames < 4 * STARTS and "learner.starts" not in given
-    return [f"learner.starts={frames // 4}"] if is_short else []
 
 
 def _acts_in_numbers(config: DictConfig) -> bool:

@@ -113,7 +113,7 @@ def _agrees(
 def _other_row(
     batch: Tensor, order: list[int], alone: Sequence[Tensor], tolerance: float
 ) -> int | None:
-    """Return a row with other actions in a batch than alone; None if there is none.
+    """Return the first row whose actions differ in a batch and alone; None if there is none.
 
     Others than one for each row are refused as actions.
     """

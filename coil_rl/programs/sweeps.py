@@ -23,10 +23,10 @@ from coil_rl.output import say
 
 
 class Sweep(Callback):
-    """Say before a sweep how it goes on, and after it which of its jobs failed."""
+    """Print the command that continues a sweep before it, and after it which jobs failed."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Say the command that goes on with the sweep."""
+        """Print the command that continues the sweep."""
         if "existing" in config:  # the jobs are runs, which go on where they were stopped
             command = command_of(sys.argv, config.hydra.sweep.dir)
             say(f"if this sweep is stopped, go on with: {command}", error=True)

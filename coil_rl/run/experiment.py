@@ -292,7 +292,7 @@ class Experiment:
 
     @contextmanager
     def resume_hint(self) -> Iterator[None]:
-        """Add to an error with a cause outside of the program how a saved run is continued."""
+        """Add the command that continues a saved run to an error whose cause is outside of it."""
         try:
             yield
         except Exception as error:

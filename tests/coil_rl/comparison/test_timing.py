@@ -3,8 +3,9 @@
 import pytest
 from omegaconf import OmegaConf
 
-from coil_rl.comparison.arms import ANCHORED, ARMS, PPO, SAC, TESTED_CASES
+from coil_rl.comparison.arms import ANCHORED, ARMS, PPO, SAC, TESTED_CASES, job_of
 from coil_rl.comparison.timing import LEAST_BATCHES, LEAST_FRAMES, Clock, Pace, plan
+from coil_rl.config.python import Named
 
 BATCH = 8 * 256
 CONFIG = OmegaConf.create(
@@ -71,3 +72,15 @@ def test_clock_counts_the_processor_and_what_each_piece_waits():
     waits.laps = [(0.006, 0.001), (0.020, 0.001)]
     assert (busy.waiting, busy.seconds) == (0, pytest.approx(0.002))
     assert (waits.waiting, waits.seconds) == (pytest.approx(0.005), pytest.approx(0.006))
+
+
+def test_least_cases_that_were_given_are_kept():
+    word = "learner.anchor.least_cases=8"
+
+    def least(arm, *given):
+        words = job_of(Named(given, {}), ARMS[arm], 0, 100, []).words
+        return [each for each in words if "least_cases" in each]
+
+    assert least(ANCHORED, word) == [word]
+    assert least(ANCHORED) == [f"learner.anchor.least_cases={TESTED_CASES}"]
+    assert least(PPO) == []

@@ -19,6 +19,8 @@ SAC = ["learner=sac", "budget.frames=100000"]
         ([*PENDULUM, "seed=0,1"], SAC),
         (["env=torchrl", "env.of._target_=torchrl.envs.PendulumEnv"], SAC),
         ([*PENDULUM, "budget.frames=2_000"], SAC[:1]),
+        ([*PENDULUM, "budget.frames=1e3"], []),
+        ([*PENDULUM, "budget.frames=${evaluation.cases}"], ["learner=sac", "learner.starts=5"]),
         ([*PENDULUM, "method=ppo"], []),
         ([*PENDULUM, "network=gru"], []),
         ([*PENDULUM, "init=earlier"], []),
