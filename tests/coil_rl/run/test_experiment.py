@@ -70,6 +70,7 @@ def as_written(rows):
     return str([{name: float(value) for name, value in row.items()} for row in rows])
 
 
+@pytest.mark.slow
 def test_run_writes_its_files_and_a_row_per_update(tmp_path):
     rows = experiment(tmp_path / "run").run()
     names = {
@@ -260,7 +261,7 @@ def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, 
     corrected.run()
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("place", "message"),
     [

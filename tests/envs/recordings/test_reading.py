@@ -265,7 +265,7 @@ def test_recording_that_is_cut_off_is_read_as_far_as_it_goes(tmp_path, whole):
     assert "cut off before its first scan" in refusal(copy(whole, tmp_path, 0.01))
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @EITHER_COMPRESSION
 def test_recording_may_be_cut_off_anywhere(tmp_path, whole, compression):
     path = compression(copy(whole, tmp_path))
