@@ -99,6 +99,13 @@ def test_same_seed_same_metrics(tmp_path):
     assert logs[0] == logs[1] != logs[2]
 
 
+def test_tests_that_take_all_frames_leave_one_further_update(tmp_path):
+    run = experiment(tmp_path / "run")
+    run.reserve, run.updates = lambda: 10**6, 3
+    run._plan()
+    assert run.all_updates == 4
+
+
 class Killed(BaseException):
     pass
 
