@@ -142,7 +142,8 @@ def means(content: bytes) -> list[Row]:
     """Return the rows of an evaluation: the columns `DRIVER` are texts, all others numbers.
 
     Raises:
-        ValueError: for two rows of one driver in the same case, and without rows.
+        ValueError: for two rows of one driver in the same case, for a return that is infinite, and
+            without rows.
     """
     rows: list[Row] = []
     for line in table(content):
@@ -150,6 +151,8 @@ def means(content: bytes) -> list[Row]:
         rows.append(cells | {name: float(line[name]) for name in line if name not in cells})
     if not rows:
         raise ValueError("no rows")
+    if any(math.isinf(row["reward"]) for row in rows):
+        raise ValueError("a return that is infinite")
     if len({tuple(row[name] for name in DRIVER) for row in rows}) < len(rows):
         raise ValueError("two rows of one driver in the same case")
     return rows
