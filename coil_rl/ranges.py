@@ -35,6 +35,7 @@ WORDS = {
     "less_than_equal": "at most {le}",
     "sequence_str": "a list",
     "too_long": "at most {max_length} long",
+    "too_short": "at least {min_length} long",
 }
 
 Part = TypeVar("Part", bound=Callable[..., Any])

@@ -5,17 +5,17 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypedDict, Unpack
+from typing import Annotated, Any, TypedDict, Unpack
 
 import gymnasium
 import torch
 
-from coil_fmu.model import Model, Variable
-from coil_fmu.plant import FAILED, FMU, Clock, Reward, Wiring, action_space, numbers_of
+from coil_fmu.model import NO_NUMBERS, REAL, Model, Variable
+from coil_fmu.plant import FAILED, FMU, SETPOINT, Clock, Reward, Wiring, action_space
 from coil_fmu.reward import Follow
 from coil_fmu.setpoints import Course, course_of
 from coil_rl import GymnasiumEnv
-from coil_rl.ranges import Count, Positive, Seed, checked
+from coil_rl.ranges import Count, Len, Positive, Seed, checked
 
 
 class Rows(TypedDict, total=False):
@@ -43,7 +43,7 @@ def fmu_env(
     setpoints: Mapping[str, Any] | None = None,
     parameters: Mapping[str, Any] | None = None,
     start: Mapping[str, Any] | None = None,
-    bounds: Mapping[str, Sequence[float]] | None = None,
+    bounds: Mapping[str, Annotated[Sequence[float], Len(2, 2)]] | None = None,
     substeps: Count | None = None,
     reward: str | Reward | None = None,
     failure: float | None = None,
@@ -102,38 +102,48 @@ def _wiring(
     bounds: Mapping[str, Sequence[float]] | None,
 ) -> Wiring:
     """Return what is connected to an FMU; a `ValueError` for a name that it does not have."""
-    inputs = model.of("input") if actions is None else model.named("actions", actions, "input")
-    inputs = numbers_of(inputs) if actions is None else inputs
-    seen = numbers_of(model.of("output"))
-    if observations is not None:
-        seen = model.named("observations", observations, "output", "local")
-        for each in seen:
-            if each not in numbers_of(seen):
-                raise ValueError(
-                    f"observations: {each.name} of {model.name} is a {each.type}, not a number; "
-                    "leave it out"
-                )
+    inputs = _numbers(model, "actions", actions, "input")
+    seen = _numbers(model, "observations", observations, "output", "local")
     if not seen:
         raise ValueError(f"observations: {model.name} has no output that is a number")
-    own = [variable.name for variable in inputs]
     model.named("bounds", bounds or (), "input")
-    wanted = _courses("setpoints", setpoints)
-    for name in wanted.keys() - {variable.name for variable in seen}:
-        raise ValueError(f"setpoints: {name} is not observed; name it in env.observations")
+    wanted, names = _courses("setpoints", setpoints), {variable.name for variable in seen}
+    for name in wanted:
+        if name not in names:
+            raise ValueError(f"setpoints: {name} is not observed; name it in env.observations")
+        if f"{name}{SETPOINT}" in names:
+            raise ValueError(
+                f"setpoints: {model.name} has an output {name}{SETPOINT} itself; leave it out of "
+                "env.observations"
+            )
     drawn = _courses("parameters", parameters)
-    model.named("parameters", drawn, "parameter", "input", "local", "output")
+    for each in model.named("parameters", drawn, "parameter", "input", "local", "output"):
+        if each.type not in REAL:
+            raise ValueError(
+                f"parameters: {each.name} of {model.name} is a {each.type}, and only real numbers "
+                "are drawn; give it by env.start"
+            )
+        if each in inputs:
+            raise ValueError(f"parameters: {each.name} is an action; leave one out")
     model.named("start", start or (), "parameter", "input", "local", "output")
-    for name in [*drawn.keys() & set(own)]:
-        raise ValueError(f"parameters: {name} is an action; leave one out")
     moved = [_bounded(each, (bounds or {}).get(each.name)) for each in inputs]
-    return Wiring(
-        moved,
-        action_space(moved, model.name),
-        seen,
-        wanted,
-        drawn,
-        dict(start or {}),
-    )
+    space = action_space(moved, model.name)
+    return Wiring(moved, space, seen, wanted, drawn, dict(start or {}))
+
+
+def _numbers(
+    model: Model, key: str, names: Sequence[str] | None, *causalities: str
+) -> list[Variable]:
+    """Return the variables of some names; None: all of the first causality that are numbers."""
+    if names is None:
+        return [each for each in model.of(causalities[0]) if each.type not in NO_NUMBERS]
+    found = model.named(key, names, *causalities)
+    for each in found:
+        if each.type in NO_NUMBERS:
+            raise ValueError(
+                f"{key}: {each.name} of {model.name} is a {each.type}, not a number; leave it out"
+            )
+    return found
 
 
 def _bounded(variable: Variable, bounds: Sequence[float] | None) -> Variable:

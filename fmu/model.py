@@ -115,8 +115,8 @@ class Model:
         single: whether a process may hold only one instance of each copy of it.
 
     Raises:
-        ValueError: for a file that is none, of FMI 1, for model exchange only, for another
-            platform, or that needs its tool.
+        ValueError: for a file that is none, of FMI 1, not for co-simulation, or for another
+            platform.
     """
 
     def __init__(self, file: str | os.PathLike[str]) -> None:
@@ -153,10 +153,8 @@ class Model:
         import fmpy
 
         if self.description.coSimulation is None:
-            raise ValueError(
-                f"file={self.file} is for model exchange only, which needs a solver of the "
-                "importer; export it for co-simulation"
-            )
+            kind = "model exchange" if self.description.modelExchange else "scheduled execution"
+            raise ValueError(f"file={self.file} is for {kind} only; export it for co-simulation")
         places = [name.split("/")[1] for name in names if name.startswith("binaries/")]
         if not {fmpy.platform, fmpy.platform_tuple} & set(places):
             found = ", ".join(sorted(set(filter(None, places)))) or "no platform"
@@ -287,11 +285,12 @@ class Instance:
     def read(self) -> dict[str, Floats]:
         """Return the values of the outputs; a `SolverError` for one that is not finite."""
         found: dict[str, Floats] = {}
+        arrays = self.model.description.fmiVersion.startswith("3")
         with _calls(self):
             for call, variables in self.groups.items():
                 references = [each.own.valueReference for each in variables]
                 getter, sizes = getattr(self.fmu, f"get{call}"), [each.size for each in variables]
-                given = getter(references, sum(sizes)) if self._arrays else getter(references)
+                given = getter(references, sum(sizes)) if arrays else getter(references)
                 parts = np.split(np.array(given, dtype=np.float64), np.cumsum(sizes)[:-1])
                 for variable, part in zip(variables, parts, strict=True):
                     found[variable.name] = part.reshape(variable.shape or (1,))
@@ -299,10 +298,6 @@ class Instance:
             if not np.isfinite(value).all():
                 raise SolverError(f"its output {name} is {value.tolist()}")
         return found
-
-    @property
-    def _arrays(self) -> bool:
-        return self.model.description.fmiVersion.startswith("3")
 
     def advance(self, time: float, step: float) -> None:
         """Simulate a step; a `SolverError` if the FMU cannot, or wants to end.

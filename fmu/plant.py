@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from coil_fmu.model import NO_NUMBERS, REAL, Instance, Model, SolverError, Variable
+from coil_fmu.model import REAL, Instance, Model, SolverError, Variable
 from coil_fmu.reward import Moment
 from coil_fmu.setpoints import Course, Drawn
 
@@ -113,12 +114,11 @@ class FMU(gymnasium.Env[dict[str, Floats], Floats]):
         self.courses = {
             name: course.drawn(self.np_random, seconds) for name, course in wiring.setpoints.items()
         }
-        self.count = 0
-        self.info: dict[str, Any] = {FAILED: 0.0, **drawn}
+        self.count, self.worst = 0, 0.0
+        self.info: dict[str, Any] = {**drawn, FAILED: 0.0}
         self.instance.begin(self.clock.start, {**wiring.start, **drawn})
         inputs = {each.name: self._begun(each) for each in wiring.actions}
         self.now = Moment(0.0, self.instance.read(), inputs, self._wanted(0.0))
-        self.worst = min(0.0, self._rewarded(self.now, self.now)[0])
         return self._observed(), dict(self.info)
 
     def _begun(self, variable: Variable) -> Floats:
@@ -135,7 +135,10 @@ class FMU(gymnasium.Env[dict[str, Floats], Floats]):
     def _rewarded(self, now: Moment, before: Moment) -> tuple[Any, bool]:
         """Return the reward of a step, and whether the episode terminates."""
         given = self.reward(now, before)
-        return given if isinstance(given, tuple) and len(given) == 2 else (given, False)
+        reward, ends = given if isinstance(given, tuple) and len(given) == 2 else (given, False)
+        with suppress(TypeError, ValueError):  # the env says of a reward that it is no number
+            self.worst = min(self.worst, float(np.asarray(reward, np.float64).reshape(())))
+        return reward, ends
 
     def step(self, action: Floats) -> tuple[dict[str, Floats], float, bool, bool, dict[str, Any]]:
         """Set the inputs, and simulate until the next action.
@@ -162,8 +165,6 @@ class FMU(gymnasium.Env[dict[str, Floats], Floats]):
         # What was to be followed in this step: another setpoint is first seen at its end.
         ended = Moment(time, outputs, dict(named), before.setpoints)
         reward, terminated = self._rewarded(ended, before)
-        if isinstance(reward, (int, float)):
-            self.worst = min(self.worst, reward)
         self.now = ended._replace(setpoints=self._wanted(time))
         truncated = self.count >= clock.steps
         return self._observed(), reward, terminated, truncated, dict(self.info)
@@ -186,6 +187,8 @@ class FMU(gymnasium.Env[dict[str, Floats], Floats]):
                 stacklevel=2,
             )
         self.info = {**self.info, FAILED: 1.0, "message": message}
+        if self.failure is None and self.count == 0:
+            self._rewarded(self.now, self.now)  # there is no other yet
         left = self.clock.steps - self.count
         reward = left * self.worst if self.failure is None else self.failure
         return self._observed(), reward, True, False, dict(self.info)
@@ -264,8 +267,3 @@ def meanings(wiring: Wiring) -> dict[str, dict[str, str]]:
         "meaning": ", ".join(parts),
     }
     return found
-
-
-def numbers_of(variables: Sequence[Variable]) -> list[Variable]:
-    """Return the variables that hold numbers."""
-    return [each for each in variables if each.type not in NO_NUMBERS]

@@ -34,7 +34,7 @@ class Course:
     file: str | os.PathLike[str] | None = None
 
     def __post_init__(self) -> None:
-        if not self.low <= self.high:
+        if not float(self.low) <= float(self.high):
             raise ValueError(f"low={self.low} must be at most high={self.high}")
         if self.every is not None and not self.every > 0:
             raise ValueError(f"every={self.every} must be above 0 s")
@@ -84,10 +84,10 @@ def course_of(name: str, given: Any) -> Course:
     Raises:
         ValueError: for anything else.
     """
-    if isinstance(given, (int, float)) and not isinstance(given, bool):
-        return Course(given, given)
+    if isinstance(given, Course):
+        return given
     try:
-        return Course(**given) if isinstance(given, Mapping) else given
+        return Course(**given) if isinstance(given, Mapping) else Course(float(given), float(given))
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: {error}; give a number, or {{low: 0.8, high: 1.2}}") from error
 

@@ -124,9 +124,22 @@ def test_failure_ends_the_episode_and_is_said_and_counted() -> None:
     assert data["info", "failed"][0, :, 0].tolist()[: ends + 1] == [0.0] * ends + [1.0]
     assert torch.isfinite(data["level"]).all()
     # Each step that is left counts as the worst one: to fail early is never worth it.
-    worst = min(data["reward"][0, :ends].min().item(), -0.3)
+    worst = data["reward"][0, :ends].min().item()
     assert data["reward"][0, ends].item() == pytest.approx((20 - ends) * worst, rel=1e-5)
     assert driven(tank(failure=-7.0), 20, 0.5)["next", "reward"][0, ends].item() == -7.0
+
+
+def rising(now: Moment, before: Moment) -> np.float32:
+    rate = (now.outputs["level"] - before.outputs["level"]) / (now.time - before.time)
+    return np.float32(-rate.item())
+
+
+def test_a_failure_is_worth_the_worst_of_any_number_of_a_user() -> None:
+    data = driven(tank(reward=rising, setpoints={}), 20, 0.5)["next"]
+    ends = int(data["done"][0, :, 0].nonzero()[0])
+    worst = data["reward"][0, :ends].min().item()
+    assert worst < 0
+    assert data["reward"][0, ends].item() == pytest.approx((20 - ends) * worst, rel=1e-5)
 
 
 def test_env_goes_on_after_a_failure() -> None:
@@ -144,8 +157,9 @@ def test_restored_env_goes_on_to_the_bit() -> None:
     other.load_state_dict(env.state_dict())
     assert other.continues
     action = env.rand_action(data)
-    for key in ("speed", "reward"):
-        assert torch.equal(env.step(action)["next", key], other.step(action)["next", key]) or key
+    here, there = env.step(action.clone())["next"], other.step(action.clone())["next"]
+    for key in ("speed", "speed_setpoint", "reward"):
+        assert torch.equal(here[key], there[key])
 
 
 def test_workers_have_the_same_digits() -> None:
