@@ -1327,7 +1327,7 @@ def kind_10_changed_code_is_refused_at_a_resume_without(accept, folder):
 
 
 SPACES = {
-    "holds bytes, which": spaces.Box(0, 255, (4,), np.uint8),
+    "it holds bytes, which": spaces.Box(0, 255, (4,), np.uint8),
     "it is a picture": spaces.Box(0, 1, (8, 8, 3), np.float32),
     "it holds choices": spaces.Discrete(3),
 }
