@@ -192,18 +192,6 @@ def frozen(drive):
         scan["ranges"] = drive.scans[9][1]["ranges"]
 
 
-def fewer_and_fewer_points(drive):
-    for number, (_, scan) in enumerate(drive.scans):
-        points = 360 - 4 * number
-        scan["ranges"] = scan["ranges"][:points]
-        scan["angle_max"] = FIRST + STEP * (points - 1)
-
-
-def empty_scans(drive):
-    for _, scan in drive.scans[::3]:
-        scan["ranges"] = np.zeros(0, np.float32)
-
-
 def one_scan(drive):
     drive.scans = drive.scans[:1]
 
@@ -233,12 +221,6 @@ def stamps_a_million_times_too_slow(drive):
 
 def stamps_three_times_too_fast(drive):
     drive.stamps(lambda number, stamp: stamp * 3)
-
-
-def slow_scanner(drive):
-    for number, (time, scan) in enumerate(drive.scans):
-        drive.scans[number] = time * 20, scan
-    drive.stamps(lambda number, stamp: stamp * 20)
 
 
 def gaps(drive):
@@ -366,15 +348,6 @@ def commands_without_speed(drive):
         fields["linear"]["x"] = 0.0
 
 
-def robot_stands(drive):
-    drive.commands[20:30] = [(time, twist(0.0, 0.0)) for time, _ in drive.commands[20:30]]
-
-
-def robot_drives_backwards(drive):
-    for _, fields in drive.commands[20:30]:
-        fields["linear"]["x"] = -0.15
-
-
 def stamped_commands(drive):
     drive.command_type = TWIST_STAMPED
     drive.commands = [
@@ -453,8 +426,8 @@ ODD = {
     swapped_ends: "taken as exchanged",
     clockwise: None,
     clockwise_with_a_positive_step: "the scans are mirrored",
-    degrees: "angles in degrees",
-    step_in_degrees: "angles in degrees",
+    degrees: "so its angles mean little",
+    step_in_degrees: "does not lead to angle_max",
     no_step: "does not lead to angle_max",
     no_angles: "all its ranges have the same bearing",
     no_last_angle: "has no angle_max",
@@ -466,8 +439,6 @@ ODD = {
     blind: "no return at all in 44 of 44 scans",
     room: "boundaries",
     frozen: "equal to the one before",
-    fewer_and_fewer_points: "scans of 188 to 360 ranges",
-    empty_scans: "scans of 0 to 360 ranges",
     one_scan: "a single scan",
     zero_stamps: "stamps are zero",
     falling_stamps: "stamps fall 43 times",
@@ -475,7 +446,6 @@ ODD = {
     stamps_a_thousand_times_too_fast: "0.0055 times a second by their stamps",
     stamps_a_million_times_too_slow: "times a second by their stamps",
     stamps_three_times_too_fast: "run 3 times as fast",
-    slow_scanner: "0.275 scans a second",
     gaps: "2 gaps of more than 2.5 turns without a scan, the longest of 1.6 s",
     bursts: "logged up to 0.36 s late",
     bursts_of_scans: "logged up to 0.36 s late",
@@ -500,8 +470,6 @@ ODD = {
     commands_without_numbers: "5 of 44 commands",
     commands_of_zeros: "only zeros",
     commands_without_speed: "commands without a speed",
-    robot_stands: "told to stand at 10 of 44 scans",
-    robot_drives_backwards: "told to drive backwards at 10 of 44 scans",
     stamped_commands: None,
     ackermann: "those on /drive are read instead",
     ackermann_stamped: "those on /drive are read instead",

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.config.messages import sentence
-from coil_rl.config.old_names import renamed, with_todays_keys
+from coil_rl.config.old_names import renamed
 from coil_rl.config.schema import IGNORED_KEYS, TrainConfig
 from coil_rl.config.trust import check_config, shipped_logger
 from coil_rl.errors import UserError, did_you_mean
@@ -81,7 +81,7 @@ def read_config(
         logger = shipped_logger(values.get("logger"))
         if logger is not None or not goes_on:
             values["logger"] = None
-        saved = OmegaConf.create(renamed(with_todays_keys(values), path))
+        saved = OmegaConf.create(renamed(values))
         check_config(saved, path)
         if logger is not None:
             saved["logger"] = logger

@@ -22,14 +22,6 @@ from coil_rl.config.messages import similar
 from coil_rl.errors import UserError
 from coil_rl.ranges import adapter, settings_of, validation_message, yaml_text
 
-# Largest numbers of arguments of other libraries, by class: memory grows with them, and the
-# libraries do not check them.
-LARGEST_ARGUMENTS = {
-    ("CatFrames", "N"): 1000,
-    ("TimeMaxPool", "T"): 1000,
-}
-
-
 PLAIN = (bool, int, float, str, NoneType)
 HOLDERS = (np.ndarray, tuple, list, Sequence)  # of numbers, in annotations
 _TARGET = object()
@@ -98,20 +90,9 @@ def _check(node: Any, name: str, program: Iterable[str] = ()) -> None:
         if "_target_" in node:
             target = find_target(node["_target_"], name)
             check_arguments(target, node, name, program)
-            _check_size(target, node, name)
     elif isinstance(node, list):
         for index, value in enumerate(node):
             _check(value, f"{name}[{index}]")
-
-
-def _check_size(target: Callable[..., Any], node: Mapping[str, Any], name: str) -> None:
-    """Raise a `UserError` for an argument of another library that memory cannot hold."""
-    for key, value in node.items():
-        largest = LARGEST_ARGUMENTS.get((getattr(target, "__name__", ""), key))
-        if largest is not None and isinstance(value, int) and value > largest:
-            raise UserError(
-                f"{name}.{key}={yaml_text(value)} must be at most {largest}: memory grows with it"
-            )
 
 
 def _converted(node: Any) -> Any:

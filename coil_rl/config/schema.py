@@ -225,6 +225,7 @@ class EvaluateConfig(DrivingConfig):
 
     run: str | None = None
     exported: str | None = None
+    env: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -325,6 +326,8 @@ def open_to_measures(schema: type[DrivingConfig]) -> DictConfig:
     """Return a schema to which the command line may add measures without a plus sign."""
     config = OmegaConf.structured(schema)
     OmegaConf.set_struct(config.evaluation.measures, False)
+    if "env" in config:  # a run has its own, whose keys this configuration may not have
+        OmegaConf.set_struct(config.env, False)
     return config
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
-import sys
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -158,8 +157,7 @@ def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> l
             name = key.removeprefix("env.")
             if name not in config.env:
                 target = config.env["_target_"].rpartition(".")[2]
-                word = text.lstrip("+")
-                raise UserError(f"{word} has no effect on {target}, the env of run={folder}")
+                raise UserError(f"{text} has no effect on {target}, the env of run={folder}")
             value = resolved["env"][name]
             if isinstance(value, list):  # beside the entries that the policy may observe
                 value = [*dict.fromkeys([*config.env[name], *value])]
@@ -194,17 +192,7 @@ def check(config: DictConfig) -> None:
     app.check_run(config)
 
 
-def main() -> None:
-    """Entry point.
-
-    A run has its own env, with keys that the env of the default configuration may not have.
-    """
-    arguments = sys.argv[1:]
-    if any(argument.startswith("run=") for argument in arguments):
-        added = [re.sub(rf"^({'|'.join(OF_NO_TRAINING)})=", r"++\1=", each) for each in arguments]
-        sys.argv[1:] = added
-    app.run_program(evaluate, "evaluate", check)
-
+main = partial(app.run_program, evaluate, "evaluate", check)
 
 if __name__ == "__main__":
     main()

@@ -3,7 +3,6 @@
 import contextlib
 import math
 import os
-import re
 import shlex
 import shutil
 import sys
@@ -119,8 +118,6 @@ def command_of(arguments: Sequence[str], folder: str) -> str:
         arguments: of the program that began it, its own path first.
     """
     program, *others = arguments
-    if "evaluate" in program:  # adds the signs itself
-        others = [re.sub(r"^\+\+(env\.(info|workers)=)", r"\1", each) for each in others]
     if not any(argument.startswith("hydra.sweep.dir=") for argument in others):
         others.append(f"hydra.sweep.dir={folder}")
     return shlex.join([f"coil-{Path(program).stem.removeprefix('coil-')}", *others])

@@ -2,9 +2,7 @@
 
 import hashlib
 import io
-import pickle
 import zipfile
-from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,13 +18,6 @@ from coil_rl.output import say
 NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint_previous.pt"
 DIGITS = 64  # of a SHA-256
 LARGEST_FILE = 16 * 2**30  # bytes
-# What the states of this project consist of, besides plain values and the storages of tensors.
-PARTS = {
-    ("torch._utils", "_rebuild_tensor_v2"),
-    ("torch._utils", "_rebuild_parameter"),
-    ("torch", "Size"),
-    ("torch", "device"),
-}
 
 
 def save(state: Any, path: Path) -> None:
@@ -141,8 +132,7 @@ def load_newest(folder: Path) -> Any | None:
 def _check_archive(content: bytes) -> None:
     """Raise an error for an archive that takes more memory than its size, before that is taken.
 
-    Deflated entries may unpack to a thousand times their size, entries may share their bytes, and
-    a pickle may call a type that takes any amount of memory, such as `bytearray`.
+    Deflated entries may unpack to a thousand times their size, and entries may share their bytes.
     """
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         entries = archive.infolist()
@@ -150,47 +140,6 @@ def _check_archive(content: bytes) -> None:
             raise ValueError("an entry is compressed")
         if sum(entry.file_size for entry in entries) > len(content):
             raise ValueError("its entries are larger than the file")
-        for entry in entries:
-            if entry.filename.endswith(".pkl"):
-                _Outline(io.BytesIO(archive.read(entry))).load()
-
-
-class _Outline(pickle.Unpickler):
-    """Reads a pickle without making a tensor; parts that no state of a run has are refused."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Return a stand-in for a part."""
-        if (module, name) in MADE:
-            return MADE[module, name]
-        storage = module == "torch" and name.endswith("Storage")
-        if not storage and (module, name) not in PARTS:
-            raise pickle.UnpicklingError(f"{module}.{name} is no part of a state")
-        return _stand_in
-
-    def persistent_load(self, key: Any) -> None:
-        """Return nothing for the storage of a tensor."""
-
-
-def _encoded(text: Any, encoding: Any) -> bytes:
-    """Return bytes that a pickle holds as a text; other codecs may return more than they get."""
-    if not isinstance(text, str) or encoding != "latin1":
-        raise pickle.UnpicklingError("bytes are encoded in another way")
-    return text.encode(encoding)
-
-
-# Plain values that a pickle makes by a call.
-MADE = {
-    ("collections", "OrderedDict"): OrderedDict,
-    ("__builtin__", "set"): set,
-    ("builtins", "set"): set,
-    ("__builtin__", "complex"): complex,
-    ("builtins", "complex"): complex,
-    ("_codecs", "encode"): _encoded,
-}
-
-
-def _stand_in(*arguments: Any) -> None:
-    """Take the place of what makes a tensor, a size or a device."""
 
 
 def _content(state: Any) -> bytes:

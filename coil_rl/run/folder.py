@@ -22,7 +22,6 @@ from coil_rl.run.stopping import resume_command
 CONFIG = "config.yaml"
 CODE, CODE_BEFORE = "code", "code_before"  # keys of it, see `code_of`
 HANDED_OVER = "handed_over"  # the policy that `delivery` chose
-OLD_HANDED_OVER = "policy_best.pt"  # its file in older folders
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = (
     "coil-rl",
@@ -113,10 +112,7 @@ def changed_code(folder: Path, present: Mapping[str, str]) -> str:
 
 def weights_file(folder: Path, which: str = "last") -> Path:
     """Return the file with the weights of the `last` or the `handed_over` policy of a run."""
-    file = folder / f"policy_{which}.pt"
-    if which == HANDED_OVER and not file.exists() and (folder / OLD_HANDED_OVER).exists():
-        return folder / OLD_HANDED_OVER
-    return file
+    return folder / f"policy_{which}.pt"
 
 
 def check_same(

@@ -1,8 +1,8 @@
 """Bearings of the ranges of a scan, where a driver contradicts itself.
 
 A scan has the bearing of its first range, the step to the next one, and the bearing of its last
-range. Drivers give one of the three wrongly: a step for one range too many, degrees, the first and
-the last one exchanged. What is taken, and why, is said in a remark.
+range. Drivers give one of the three wrongly: a step for one range too many, the first and the last
+one exchanged. What is taken, and why, is said in a remark.
 """
 
 import math
@@ -16,10 +16,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 TURN = 2 * math.pi
-DEGREE = math.pi / 180
-# Units of the first and last bearing, and of the step, in radians; the first pair that fits is
-# taken.
-UNITS = ((1.0, 1.0), (DEGREE, DEGREE), (1.0, DEGREE), (DEGREE, 1.0))
 SLACK = 1.5  # steps, by which the last bearing may differ and still be meant
 EXACT = 0.4  # of a step over the number of ranges: differs no more than by rounding
 
@@ -75,20 +71,17 @@ def bearings(angles: Sequence[Angles], points: NDArray[np.int64]) -> tuple[Float
     return np.array([taken[each] for each in angles]).reshape(-1, 2), remarks
 
 
-def _decide(given: Angles, points: int) -> tuple[Angles, str, str]:
-    """Return the angles to take, what is wrong with those given, and an example; perhaps empty.
+def _decide(angles: Angles, points: int) -> tuple[Angles, str, str]:
+    """Return the angles to take, what is wrong with the given ones, and an example; perhaps empty.
 
     Args:
         points: number of its ranges, at least 2.
     """
-    angles, in_degrees = _in_radians(given, points)
     span, declared = angles.step * (points - 1), angles.last - angles.first
     example = (
-        f"angle_min={given.first:.4f}, angle_max={given.last:.4f}, "
-        f"angle_increment={given.step:.5f}, {points} ranges"
+        f"angle_min={angles.first:.4f}, angle_max={angles.last:.4f}, "
+        f"angle_increment={angles.step:.5f}, {points} ranges"
     )
-    if in_degrees:
-        return angles, "has angles in degrees, which are converted to radians,", example
     if span == 0 and (declared == 0 or not math.isfinite(declared)):
         raise ValueError("angle_increment is 0, so all its ranges have the same bearing")
     unset = _unset(angles, span)
@@ -117,21 +110,6 @@ def _decide(given: Angles, points: int) -> tuple[Angles, str, str]:
     step = declared / (points - 1)
     problem = "has an angle_increment that does not lead to angle_max, which is taken instead,"
     return angles._replace(step=step), problem, example
-
-
-def _in_radians(given: Angles, points: int) -> tuple[Angles, bool]:
-    """Return angles in radians, and whether some of those given are in degrees.
-
-    They are if only then the last bearing is where the step leads to.
-    """
-    for of_bearings, of_step in UNITS:
-        first, last = given.first * of_bearings, given.last * of_bearings
-        step = given.step * of_step
-        span = step * (points - 1)
-        fits = abs(abs(last - first) - abs(span)) <= SLACK * abs(step)
-        if fits and 0 < abs(span) <= 1.01 * TURN + abs(step):
-            return Angles(first, last, step), (of_bearings, of_step) != UNITS[0]
-    return given, False
 
 
 def _unset(angles: Angles, span: float) -> bool:

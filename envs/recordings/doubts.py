@@ -11,10 +11,8 @@ import numpy as np
 
 from coil_rl.envs.recordings.recording import Recording, Times, ascending, believed
 
-RATES = (2.0, 50.0)  # scans per second for which guides and policies are made
 GAP = 2.5  # turns without a scan
 MANY = 0.1  # share of the scans
-NARROW = 0.8  # of the largest number of ranges
 CLOCKS_DIFFER = 2.0  # times as fast
 FEWEST, CHECKED_SCANS = 12, 512  # scans that are compared, at most
 PAIRED = 0.5  # of a pause between scans, and of what changes between them
@@ -64,26 +62,20 @@ def _about_clock(recording: Recording) -> list[str]:
 
 
 def _about_turns(recording: Recording) -> list[str]:
-    """Return remarks on the rate of the scans, and on gaps."""
-    turn, remarks = recording.turn, []
+    """Return a remark on gaps between the scans."""
+    turn = recording.turn
     if len(recording.stamp) < 2:
         return []
     if turn == 0:
         return ["has no clock: most of its scans have the same time"]
-    if not RATES[0] <= 1 / turn <= RATES[1]:
-        remarks.append(
-            f"has {1 / turn:.3g} scans a second, and policies are made for {RATES[0]:g} to "
-            f"{RATES[1]:g}"
-        )
     between = np.diff(recording.seconds)
     gaps = between[between > GAP * turn]
-    if len(gaps):
-        number = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
-        remarks.append(
-            f"has {number} of more than {GAP:g} turns without a scan, the longest of "
-            f"{gaps.max():.1f} s"
-        )
-    return remarks
+    if not len(gaps):
+        return []
+    number = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+    return [
+        f"has {number} of more than {GAP:g} turns without a scan, the longest of {gaps.max():.1f} s"
+    ]
 
 
 def _fault(stamp: Times) -> str:
@@ -103,8 +95,8 @@ def _rate(times: Times) -> str:
 
 
 def _about_scans(recording: Recording) -> list[str]:
-    """Return remarks on scans that are empty, repeated, or of different length."""
-    ranges, points, remarks = recording.ranges, recording.points, []
+    """Return remarks on scans that are empty, repeated, or of two scanners."""
+    ranges, remarks = recording.ranges, list[str]()
     scans = len(ranges)
     returns = np.isfinite(ranges)
     blind = int((~returns.any(axis=1)).sum())
@@ -116,8 +108,6 @@ def _about_scans(recording: Recording) -> list[str]:
             f"has {same.sum()} of {scans} scans that are equal to the one before, as if the "
             "scanner stood still or the driver repeated them"
         )
-    if points.min() < NARROW * points.max():
-        remarks.append(f"has scans of {points.min()} to {points.max()} ranges")
     if _alternate(recording):
         remarks.append(
             "has scans that are taken by turns from two places, or come in pairs, as those of two "
@@ -177,10 +167,5 @@ def _about_commands(recording: Recording) -> list[str]:
         source = "the nominal speed"
         if recording.odometry is not None:
             source = f"that of the odometry, {np.median(recording.motion()[0]):.3g} m/s,"
-        return [*remarks, f"has commands without a speed on {topic}, so {source} is taken"]
-    standing, back = int((speed == 0).sum()), int((speed < 0).sum())
-    if standing:
-        remarks.append(f"has a robot that is told to stand at {standing} of {scans} scans")
-    if back:
-        remarks.append(f"has a robot that is told to drive backwards at {back} of {scans} scans")
+        remarks.append(f"has commands without a speed on {topic}, so {source} is taken")
     return remarks

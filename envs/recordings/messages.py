@@ -1,15 +1,12 @@
 """ROS 2 messages in CDR, encoded and decoded with the type store of rosbags.
 
-A recording stores the definition of each message type. rosbags turns definitions into code, so a
-forged one may take any time and memory. The types that are read here are standard ones: of a
-definition only the fields of the message itself are used, and only if they differ from the standard
-ones and are simple.
+The types that are read here are standard ones. The definitions that a recording stores are not
+used: rosbags turns them into code, so a forged one may take any time and memory.
 """
 
 import math
-import re
-from collections.abc import Collection, Mapping
-from functools import cache, lru_cache
+from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -37,18 +34,6 @@ float32 jerk
 ackermann_msgs/AckermannDrive drive
 """,
 }
-
-# Of a definition that comes with a recording.
-LARGEST_DEFINITION = 100_000  # bytes
-MOST_FIELDS = 100
-LARGEST_ARRAY = 1000  # numbers
-# Name of a type, which may be an array; name of the field; perhaps a default value.
-FIELD = re.compile(r"([A-Za-z][\w/]{0,99}(?:\[\d{0,4}\])?)[ \t]+([a-z]\w{0,99})(?:[ \t].*)?")
-CONSTANT = re.compile(r"[a-z]\w*(?:<=\d+)?[ \t]+[A-Za-z]\w*[ \t]*=.*")
-NUMBERS = frozenset(
-    ["bool", "byte", "char", "float32", "float64"]
-    + [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
-)
 
 
 @cache
@@ -83,18 +68,14 @@ def encode(message_type: str, fields: Mapping[str, Any]) -> bytes:
     return bytes(ros_types().serialize_cdr(message, message_type, little_endian=True))
 
 
-def decode(data: bytes, message_type: str, language: str = "ros2msg", text: bytes = b"") -> Any:
+def decode(data: bytes, message_type: str) -> Any:
     """Return a message in CDR of either byte order, with its fields as attributes.
 
     Args:
         data: the message; bytes that are not a message of this type are a `SerdeError`.
         message_type: such as "geometry_msgs/msg/Twist".
-        language: of the definition; one in another language than "ros2msg" is left out.
-        text: the definition that is stored with the message; the standard one is used instead if it
-            is empty, cannot be parsed, or has other fields than numbers, short arrays of numbers,
-            texts, and the standard parts of the type.
     """
-    return _types_of(message_type, language, text).deserialize_cdr(data, message_type)
+    return ros_types().deserialize_cdr(data, message_type)
 
 
 def twist(speed: float, turn_rate: float) -> dict[str, Any]:
@@ -135,54 +116,6 @@ def command_of(message: Any) -> tuple[float, float]:
     if hasattr(message, "steering_angle"):
         return message.speed, message.steering_angle
     return message.linear.x, message.angular.z
-
-
-@lru_cache(maxsize=16)
-def _types_of(message_type: str, language: str, text: bytes) -> Typestore:
-    """Return the types of a definition, or the standard ones if it is not to be used."""
-    if language != "ros2msg" or not 0 < len(text) <= LARGEST_DEFINITION:
-        return ros_types()
-    parts = get_types_from_msg(definition(message_type).decode(), message_type)
-    try:
-        fields = _simple_fields(text.decode(), list(parts))
-        own = get_types_from_msg("\n".join(fields), message_type)
-        if own[message_type][1] == parts[message_type][1]:
-            return ros_types()
-        types = get_typestore(Stores.EMPTY)
-        types.register(parts | own)
-        types.get_msgdef(message_type)
-    except Exception:  # the text may be anything
-        return ros_types()
-    return types
-
-
-def _simple_fields(text: str, parts: Collection[str]) -> list[str]:
-    """Return a line for each field of a definition; a `ValueError` for one that is not simple.
-
-    Args:
-        text: the definition; its sections after the first one define parts and are left out.
-        parts: names of the types that a field may have besides numbers and texts.
-    """
-    section = re.split(r"^=+[ \t]*$", text, maxsplit=1, flags=re.MULTILINE)[0]
-    lines = [line.partition("#")[0].strip() for line in section.splitlines()]
-    simple = []
-    for line in filter(None, lines):
-        if CONSTANT.fullmatch(line):
-            continue
-        field = FIELD.fullmatch(line)
-        if field is None:
-            raise ValueError(f"{line!r:.100} is not the definition of a field")
-        simple.append(f"{field[1]} {field[2]}")
-        kind, _, size = field[1].partition("[")
-        short = int(size.removesuffix("]") or 0) <= LARGEST_ARRAY
-        part = any(
-            each.replace("/msg/", "/").endswith(kind.replace("/msg/", "/")) for each in parts
-        )
-        if not (kind in NUMBERS and short) and not ((kind == "string" or part) and not size):
-            raise ValueError(f"{line!r:.100} has another type than is read here")
-    if len(simple) > MOST_FIELDS:
-        raise ValueError(f"there are {len(simple)} fields")
-    return simple
 
 
 def _fields_of(message_type: str) -> dict[str, Any]:

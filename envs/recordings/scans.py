@@ -104,9 +104,9 @@ def decoded(
     rows = []
     for index, (channel, log_time, sent, data) in enumerate(contents.messages[topic]):
         try:
-            message = decode(data, channel.message_type, channel.language, channel.definition)
+            message = decode(data, channel.message_type)
             rows.append(fields(message, sent))
-        except Exception as error:  # bytes and definition may be anything
+        except Exception as error:  # the bytes may be anything
             if data.startswith(ZSTD):
                 raise RecordingError(
                     f"{path}, topic {topic} has messages that are compressed one by one "

@@ -328,6 +328,7 @@ def test_page_of_all_tasks_is_of_the_whole_table_that_rows_join(folder, tmp_path
     assert (pages / "pendulum.webp").read_bytes() == (ROWS.parent / "pendulum.webp").read_bytes()
 
 
+@pytest.mark.slow
 def test_pages_of_the_docs_are_those_of_the_table(tmp_path, monkeypatch):
     for file in (ROWS, *ROWS.parent.glob("*.webp")):
         shutil.copyfile(file, tmp_path / file.name)

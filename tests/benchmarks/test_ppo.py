@@ -88,7 +88,7 @@ def as_tensordict(batch: Batch) -> TensorDict:
     return TensorDict(rows, [STEPS, CARS]).transpose(0, 1).contiguous()
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [0.0, 0.5], ids=["near ratios", "clipped ratios"])
 def test_update_gives_the_same_weights(made, shift):
     plain, ours, batch = made

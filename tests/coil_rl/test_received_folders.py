@@ -88,8 +88,6 @@ def test_guides_and_classifiers_refuse_a_file_without_an_end(tmp_path, endless):
 @pytest.mark.parametrize(
     "node",
     [
-        {"_target_": "torchrl.envs.CatFrames", "N": 10**9, "dim": -1},
-        {"_target_": "torchrl.envs.TimeMaxPool", "T": 10**9, "in_keys": ["observation"]},
         {"_target_": "coil_rl.transforms.DelayedAdvice", "steps": 10**9},
         {"_target_": "coil_rl.learners.Mlp", "hidden": [10**9]},
         {"_target_": "coil_rl.learners.Gru", "state": 10**9},

@@ -97,6 +97,7 @@ class ForgetsAlone(TensorDictModuleBase):
         return tensordict.set("action", self.total[rows].clone())
 
 
+@pytest.mark.slow
 def test_guides_with_a_memory_pass():
     check_guide(Guide(), cones())
     check_guide(PerRow(OneNumber, ["steering"]), cones())
@@ -336,6 +337,7 @@ class RemembersInTheData(RemembersInAnAttribute):
         return after.set("last", tensordict["steering"])
 
 
+@pytest.mark.slow
 def test_memory_of_a_transform_survives_a_resume():
     check_transform(cones(), RemembersInTheData())
     with pytest.raises(ValueError, match=r"InAnAttribute gives another last in step 1 of a res"):

@@ -88,6 +88,7 @@ def test_outputs_are_finite_and_within_their_specs(preset: dict) -> None:
         assert emitted.isfinite().all()
 
 
+@pytest.mark.slow
 def test_motion_is_the_way_in_the_frame_of_the_last_observation(tracks: list[Track]) -> None:
     env = ConeTrackEnv(tracks, 16, dtype=torch.float64)
     state = env.reset()
@@ -101,6 +102,7 @@ def test_motion_is_the_way_in_the_frame_of_the_last_observation(tracks: list[Tra
         assert torch.allclose(before + moved, emitted["info", "pose"], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_env_is_batch_invariant(tracks: list[Track]) -> None:
     cars, chosen = 384, (150, 381)
     env = ConeTrackEnv(tracks, cars, assignment="cyclic")
@@ -182,7 +184,7 @@ def test_cyclic_assignment_keeps_cars_on_their_tracks(rings: list[Track]) -> Non
         assert env.reset()["info", "track"].flatten().tolist() == [0, 1, 2, 0, 1, 2, 0]
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
 def test_restored_env_continues_bit_for_bit(tracks: list[Track], preset: dict) -> None:
     env = ConeTrackEnv(tracks, 16, seed=3, **preset)
@@ -216,6 +218,7 @@ def test_time_limit_truncates(rings: list[Track]) -> None:
     assert not rollout["terminated"].any()
 
 
+@pytest.mark.slow
 def test_reward_is_the_sum_of_its_weighted_terms(ring: Track) -> None:
     weights = {
         "finish": 3.0,

@@ -170,7 +170,7 @@ def test_env_agrees_with_the_oracle_over_two_laps(ring: Track) -> None:
     assert trace["terminated"][-1].all()
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("driver", ["random", "disturbed"])
 def test_env_agrees_with_the_oracle_under_other_steering(preset: str, driver: str) -> None:

@@ -227,6 +227,7 @@ degenerate = st.one_of(
 )
 
 
+@pytest.mark.slow
 @steady
 @given(
     degenerate,

@@ -54,6 +54,7 @@ def centre(track):
     return smooth[::5]
 
 
+@pytest.mark.slow
 def test_cones_have_the_spacing_of_tracks_drawn_by_hand(tracks):
     gaps = [
         np.linalg.norm(edges(getattr(track, side)), axis=1) for track in tracks for side in SIDES
@@ -124,6 +125,7 @@ def test_tracks_depend_only_on_their_seed():
     np.testing.assert_array_equal(np.random.get_state()[1], state)
 
 
+@pytest.mark.slow
 def test_shipped_tracks_are_those_of_the_recorded_seeds(tmp_path):
     for split, seeds in SHIPPED.items():
         tracks = {track.name: track for track in shipped_tracks(split)}

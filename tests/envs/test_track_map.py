@@ -51,7 +51,7 @@ def clearances(lookup: TrackMap, track: Tensor, position: Tensor) -> Tensor:
     return lookup.clearance(location, lookup.to_boundaries(location))
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_candidates_include_all_visible_cones(dtype: torch.dtype) -> None:
     lookup = track_map(dtype)
@@ -66,6 +66,7 @@ def test_candidates_include_all_visible_cones(dtype: torch.dtype) -> None:
             assert not (visible(pose.double().numpy(), ring) & ~ours).any()
 
 
+@pytest.mark.slow
 def test_candidates_are_the_cones_of_their_slots() -> None:
     lookup = track_map(torch.float64)
     for index, track in enumerate(tracks()):

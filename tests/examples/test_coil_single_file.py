@@ -63,7 +63,7 @@ def batch_of(single, batch):
     )
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("id", ["Pendulum-v1", "CartPole-v1"])
 def test_weights_are_those_of_the_library_after_some_updates(id, single):
     torch.manual_seed(0)

@@ -181,6 +181,7 @@ def megabytes() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="it counts handles as Linux does")
 def test_a_thousand_episodes_leave_no_handle_and_no_memory() -> None:
     env = tank(seconds=0.5)

@@ -20,7 +20,7 @@ def first(experiment, run_dir):
     return compose_train([*words, *choice, *TINY_SWEEP, f"run_dir={run_dir}"])
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", EXPERIMENTS[::5])
 def test_experiment_passes_the_check(experiment, tmp_path):
     check(first(experiment, tmp_path / "run"))

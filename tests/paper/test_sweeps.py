@@ -31,6 +31,7 @@ def finish(folder):
     (folder / "evaluation.csv").touch()
 
 
+@pytest.mark.slow
 def test_every_run_has_a_folder_with_its_fingerprint(authors):
     names = [folder.name for folder in authors.all_folders]
     assert [name.rpartition("_")[0] for name in names] == [

@@ -125,6 +125,7 @@ def test_run_is_evaluated_and_replayed_like_any_other(folder):
     assert "| oil " in called("replay", *arguments, cwd=folder).stdout
 
 
+@pytest.mark.slow
 def test_recording_that_is_there_twice_is_refused(folder, tmp_path):
     shutil.copy(folder / "a.mcap", tmp_path / "copy.mcap")
     done = trained(folder, f"recording=[a.mcap,{tmp_path / 'copy.mcap'}]", code=2)

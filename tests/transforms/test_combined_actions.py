@@ -36,7 +36,7 @@ def step(env, action):
     return env.step(env.reset().set("action", torch.full((6, 1), action)))
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("transform", "of_guide"),
     [
@@ -114,6 +114,7 @@ def test_agent_acts_alone_in_evaluation(transform):
     assert torch.equal(rollout["next", "steering"], rollout["action"])
 
 
+@pytest.mark.slow
 def test_guide_acts_in_the_first_steps_of_every_episode_with_jump_start():
     rollout = worlds.cones(JumpStart(7)).train().rollout(150, break_when_any_done=False)
     ended = rollout["next", "done"].squeeze(-1)

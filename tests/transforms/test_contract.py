@@ -81,7 +81,7 @@ def test_specs_hold_with_several_guides_and_another_key():
     assert env.reset()[key].eq(0).all()
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "transforms",
     [

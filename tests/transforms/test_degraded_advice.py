@@ -77,6 +77,7 @@ def reset_rows(env, data, *rows):
     return env.reset(data.clone().set("_reset", mask))
 
 
+@pytest.mark.slow
 def test_files_compose_in_the_given_order_with_the_seed():
     def composed(*names):
         with initialize_config_module("coil_rl.conf", version_base="1.3"):

@@ -131,7 +131,7 @@ def test_last_actions_are_those_that_the_agent_chose(kind):
     assert torch.equal(data["next", "last_action"][:, 1:, size:], vectors[:, :-1])
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make",
     [
@@ -228,7 +228,7 @@ class Ramp(gymnasium.Env):
         return self.observe(), 0.0, False, False, {}
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("lag", [0, 1])
 def test_noise_stays_within_the_bounds_of_a_gymnasium_env(lag):
     def seen(*transforms):

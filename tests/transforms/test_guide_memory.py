@@ -91,6 +91,7 @@ def driven(env, steps=80):
     return rollout
 
 
+@pytest.mark.slow
 def test_memory_begins_anew_with_every_episode_of_every_row():
     env = cones({"sum": Integrator(first=7.0), "spline": SplineGuide()})
     rollout = driven(env)

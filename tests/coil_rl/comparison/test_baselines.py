@@ -48,6 +48,7 @@ def test_delay_is_one_step_more_than_the_env_has():
     assert list(found["reward"]) != rewards_of_the_guide(car(observation_delay=1, action_delay=1))
 
 
+@pytest.mark.slow
 def test_words_for_the_action_are_kept_with_what_was_measured(tmp_path):
     measure_baselines(car(), tmp_path)
     outcome = read_outcome(tmp_path, [], {})

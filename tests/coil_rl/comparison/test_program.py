@@ -277,6 +277,7 @@ def test_second_process_is_refused_and_leaves_the_folder_of_the_first_one(tmp_pa
         assert (folder / ".lock").exists()
 
 
+@pytest.mark.slow
 def test_comparison_that_wrote_nothing_removes_what_it_made_only(tmp_path, monkeypatch):
     def stopped(*_):
         raise KeyboardInterrupt
@@ -299,6 +300,7 @@ def test_help_is_printed():
     assert "is my guide worth it?" in called("compare", "--help").stdout
 
 
+@pytest.mark.slow
 def test_steps_are_timed_with_the_threads_of_the_trainings(monkeypatch, tmp_path):
     threads = []
 

@@ -47,7 +47,7 @@ def test_figure_shows_tracks_cones_and_drivers(tmp_path):
     assert (image != pixels(tmp_path / "crash.png")).any()
 
 
-@pytest.mark.fast(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lines",
     [

@@ -168,7 +168,7 @@ coordinates = st.sampled_from([0.0, 1.0, 1.0 + 1e-7, -1.0, 2.0, 5.0]) | st.float
 points = st.lists(st.tuples(coordinates, coordinates), max_size=SLOTS)
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @every_guide
 @given(left=points, right=points, duplicated=st.booleans(), steering=st.floats(-1, 1, width=32))
 def test_advice_is_an_action_for_any_cones(

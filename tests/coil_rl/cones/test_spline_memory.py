@@ -40,7 +40,7 @@ def guided(
     return TransformedEnv(env, GuideActions({"memory": SplineMemoryGuide(**options)})).eval()
 
 
-@pytest.mark.fast("authors")
+@pytest.mark.slow
 @both_guides
 def test_guide_agrees_with_the_oracle(world: dict[str, Any], options: dict[str, Any]) -> None:
     tracks, steps = random_tracks(2, seed=5), 180
@@ -73,7 +73,7 @@ def test_guide_agrees_with_the_oracle(world: dict[str, Any], options: dict[str, 
     assert min(counts) >= 8
 
 
-@pytest.mark.fast("default")
+@pytest.mark.slow
 @both_guides
 def test_guide_contract_holds(
     rings: list[Track], world: dict[str, Any], options: dict[str, Any]

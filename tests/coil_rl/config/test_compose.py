@@ -69,7 +69,7 @@ def kept(result, written):
     return [key for key, value in written.items() if found.get(key) != value]
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("group", GLOBAL)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_value_of_a_users_file_survives_the_composition(group, method, tmp_path):
@@ -132,6 +132,7 @@ def test_file_overrides_the_files_that_its_defaults_list_leads_to(between, tmp_p
     assert (config["budget"]["frames"], config["budget"]["steps"]) == (2_000, 5)
 
 
+@pytest.mark.slow
 def test_value_that_a_learner_does_not_take_is_refused_by_its_name(tmp_path):
     write(tmp_path, "env", {"learner": {"gae_lambda": 0.5}}, "gym")
     arguments = ["--config-dir", str(tmp_path), "env=mine", "env.id=Pendulum-v1", "method=coil"]

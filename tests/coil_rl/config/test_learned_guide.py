@@ -82,7 +82,7 @@ def test_run_without_an_agent_is_refused(tmp_path):
         LearnedGuide(str(run))
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -116,7 +116,7 @@ def guided_by(run, guide):
     OmegaConf.save(config, run / "config.yaml")
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [1, 3, LONGEST_CHAIN + 1])
 def test_run_that_is_its_own_guide_is_refused(length, tmp_path):
     make_untrained_run(tmp_path / "0", *TINY, "method=coil")

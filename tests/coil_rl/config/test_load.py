@@ -80,6 +80,7 @@ def test_run_that_cannot_act_in_the_env_is_refused_with_its_folder(
     assert str(run) in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_weights_that_are_not_finite_are_refused(replay, tmp_path):
     run = make_untrained_run(tmp_path / "ppo", "method=ppo", *TRACK)
     state = checkpoint.load(run / "policy_last.pt")

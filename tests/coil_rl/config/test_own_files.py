@@ -19,6 +19,7 @@ FILES = {
 }
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("file", FILES)
 def test_mistake_in_a_file_of_the_user_names_the_file(file, tmp_path):
     text, said = FILES[file]

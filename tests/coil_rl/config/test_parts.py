@@ -37,7 +37,7 @@ def composed(*overrides, name="train"):
         return compose(name, [*SMALL, *overrides])
 
 
-@pytest.mark.fast(3)
+@pytest.mark.fast(1)
 @pytest.mark.parametrize(("method", "preset"), [*product(shipped("method"), shipped("preset"))])
 def test_env_of_every_method_passes_check_env(method, preset):
     env = env_maker(composed(f"preset={preset}", f"method={method}"))()

@@ -205,6 +205,7 @@ def test_other_name_of_a_policy_is_refused(tmp_path):
         run.controller("best")
 
 
+@pytest.mark.slow
 def test_tables_are_written_to_a_folder_that_is_a_text(tmp_path):
     words = ["evaluation.cases=1", "evaluation.gif=false", "env.max_steps=2"]
     run = coil_rl.prepare(
@@ -248,6 +249,7 @@ def test_maker_of_an_env_is_an_env(tmp_path):
         assert run.controller().act(np.zeros(2, np.float32)).shape == (1,)
 
 
+@pytest.mark.slow
 def test_torchrl_env_is_an_env(tmp_path):
     from torchrl.envs import PendulumEnv
 

@@ -354,6 +354,7 @@ def with_target(saved, target, **others):
     return changed(saved | others, "guide.theirs", {"_target_": target})
 
 
+@pytest.mark.slow
 def test_trusted_package_may_be_used_and_nothing_that_it_imports(package, saved, tmp_path):
     theirs = with_target(saved, "their_package.TheirGuide")
     with pytest.raises(UserError, match=r"trust=\[their_package\]"):

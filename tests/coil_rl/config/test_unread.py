@@ -120,6 +120,7 @@ def test_noise_is_read_where_actions_are_numbers():
     assert unread("method=coil", "training.noise_correlation=0.5") == ""
 
 
+@pytest.mark.slow
 def test_words_from_python_are_read_too(tmp_path):
     words = ["logger=none", "proxy.seed=3"]
     folder = tmp_path / "run"

@@ -68,6 +68,7 @@ def test_torch_guide_with_memory_is_inside(tmp_path):
     same_actions(run, policy, rooms())
 
 
+@pytest.mark.slow
 def test_python_guide_is_an_input_in_the_unit_of_the_env(tmp_path, capsys):
     run, policy = exported(tmp_path, "residual")
     assert "Python object for each row (thermostat.control:PI)" in capsys.readouterr().out
@@ -253,6 +254,7 @@ class OwnPast(Transform):
     needs_past = True
 
 
+@pytest.mark.slow
 def test_transform_that_remembers_is_refused_before_the_drive(tmp_path, monkeypatch):
     run = coil_rl.open_run(learned(tmp_path / "run", "ppo"))
     controller = run.controller()

@@ -141,6 +141,7 @@ def in_the_observation(controller):
     return torch.stack(seen)
 
 
+@pytest.mark.fast(2)
 @pytest.mark.parametrize("kind", CONTROLLERS)
 def test_controller_means_the_same_everywhere(kind, tmp_path):
     make = CONTROLLERS[kind]

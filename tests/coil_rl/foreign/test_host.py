@@ -91,6 +91,7 @@ def test_class_of_guides_is_the_guide():
     assert torch.equal(advice, rollout["steering"] / 2)
 
 
+@pytest.mark.slow
 def test_network_and_function_act_on_the_batch():
     guide = ControllerGuide("my_control:Net")
     rollout, advice = driven(cones(guide))

@@ -48,7 +48,7 @@ def stay(env):
     return TensorDictModule(torch.zeros_like, in_keys=["observation"], out_keys=["action"])
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [lambda: Endless(2), lambda: EnvBatch(Endless, num_envs=2)])
 def test_endless_env_is_truncated_and_says_so_once(make):
     env = EnvMaker(lambda rows, cases, count: make())(2)

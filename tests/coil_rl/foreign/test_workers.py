@@ -243,6 +243,7 @@ class Simulator(Plant):
         self.file.unlink()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 2, "auto"])
 def test_envs_are_closed_in_their_processes(workers, tmp_path) -> None:
     env = GymnasiumEnv(Simulator, 3, options={"file": tmp_path / "licence"}, workers=workers)

@@ -49,6 +49,7 @@ def batches(env):
     return rollout.collect(), rollout.collect()
 
 
+@pytest.mark.slow
 def test_samples_are_the_actions_of_the_guide_in_the_same_states(env, batches):
     learner, guide, batch = Imitation(env, **linear()), SplineGuide(), batches[1]
     assert batch["next", "done"].any()

@@ -79,6 +79,7 @@ def test_observations_in_scale_stay_as_they_are(tmp_path, capsys):
         assert any(torch.equal(value, each) for each in found)
 
 
+@pytest.mark.slow
 def test_decision_is_resumed_to_the_bit(tmp_path, capsys):
     words = [*TINY, *ON_POLICY]
     run = coil_rl.prepare(
@@ -97,6 +98,7 @@ def test_decision_is_resumed_to_the_bit(tmp_path, capsys):
     assert bool(other.learner.normaliser.moments[0].used)
 
 
+@pytest.mark.slow
 def test_raw_observations_far_out_of_scale_are_named(tmp_path):
     with pytest.warns(
         UserWarning,
@@ -135,6 +137,7 @@ def test_observations_that_leave_their_scale_later_are_named_once(tmp_path):
     assert named[0].endswith("; use learner.normalise=true")
 
 
+@pytest.mark.slow
 def test_cone_world_and_robot_are_not_normalised():
     from coil_rl import compose_train
 

@@ -145,6 +145,7 @@ def updates(learner, env, count):
     return result
 
 
+@pytest.mark.slow
 def test_each_phase_changes_its_networks_only_and_at_a_smaller_rate_than_the_last_of_its_kind():
     result = updates(make(env := cars(), shrink=0.5, epochs=1), env, 4)
     agent_phase, first, second = (
@@ -193,6 +194,7 @@ def test_dynamic_coil_with_frozen_guides_is_coil():
         )
 
 
+@pytest.mark.slow
 def test_state_resumes_in_the_middle_of_a_phase():
     env, first = cars(), make(cars(), frames=1024)
     batches = [Rollout(env, first.policy, 32, [*first.keys]).collect() for _ in range(5)]

@@ -348,6 +348,7 @@ def test_more_minibatches_than_envs_are_refused():
         learner.update(Rollout(env, learner.policy, 8, learner.keys).collect())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

@@ -38,7 +38,7 @@ def trained(kind, env, updates=2, steps=8, **options):
     return learner
 
 
-@pytest.mark.fast(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "make_env"),
     [*((kind, partial(CartPoles, 16)) for kind in LEARNERS), (PPO, partial(worlds.cones, cars=16))],
@@ -140,6 +140,7 @@ def test_minibatch_of_one_frame_is_refused(kind):
         trained(kind, CartPoles(2), steps=4, minibatches=5)
 
 
+@pytest.mark.slow
 def test_advantages_equal_those_of_torchrl_with_two_evaluations_per_state(ring):
     torch.manual_seed(0)
     env = ConeTrackEnv([ring], 16, time_limit=1.8)

@@ -121,6 +121,7 @@ def plants(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("program", "env", "words", "message"),
     [

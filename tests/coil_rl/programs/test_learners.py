@@ -77,7 +77,7 @@ def test_incompatible_method_and_learner_are_refused(method, learner, tmp_path):
         check(config)
 
 
-@pytest.mark.fast("residual_coil-dqn", "coil_anchored-sac")
+@pytest.mark.fast("coil_anchored-sac")
 @pytest.mark.parametrize(("method", "learner"), [pair for pair in PAIRS if not refusal(*pair)])
 def test_compatible_method_and_learner_train(method, learner, tmp_path):
     config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])

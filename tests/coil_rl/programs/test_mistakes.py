@@ -318,7 +318,7 @@ def run(tmp_path_factory):
     return folder
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

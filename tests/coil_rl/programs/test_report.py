@@ -38,6 +38,7 @@ def read_csv(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_report_prints_the_page_and_writes_its_files_again_and_again(sweep):
     before = all_files()
     code, out, error = report("folder=sweep")

@@ -56,6 +56,7 @@ def test_command_runs_no_code_from_a_folder(command, received, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} <= {"run", "drive.mcap", "outputs"}
 
 
+@pytest.mark.slow
 def test_outside_part_of_a_run_needs_trust_on_the_command_line(received, tmp_path, monkeypatch):
     shutil.copytree(received, tmp_path, dirs_exist_ok=True)
     (tmp_path / "neighbours_package.py").write_text(

@@ -60,6 +60,7 @@ def test_learning_curves_are_drawn_for_any_number_of_runs_and_values(runs, tmp_p
     assert list(tmp_path.iterdir()) == [tmp_path / "curve.png"]
 
 
+@pytest.mark.slow
 def test_grid_has_one_plot_per_label(tmp_path):
     heights = []
     for labels in (1, 7):

@@ -64,6 +64,7 @@ def evil(tmp_path_factory):
     return report(folder)
 
 
+@pytest.mark.slow
 def test_texts_of_run_folders_are_only_texts(evil):
     read = Reader(evil)
     assert [tag for tag in read.tags if tag in ("script", "img")] == ["img", "script"]

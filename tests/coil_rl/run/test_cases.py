@@ -122,6 +122,7 @@ def test_start_test_holds_no_useless_guide(degrade):
     assert start_test(*SHORT, f"degrade={degrade}")[0] == [0]
 
 
+@pytest.mark.slow
 def test_cases_of_the_cone_world_are_new_places_with_the_whole_time_limit():
     config, _ = configured("env=cone_track", "training.tests.time_limit=2.0")
     make_env = env_maker(config)
@@ -150,6 +151,7 @@ def test_rows_may_begin_in_the_same_cases(words):
     assert len(cases.env.reset()["observation"].reshape(6, -1).unique(dim=0)) > 2
 
 
+@pytest.mark.slow
 def test_policies_side_by_side_have_the_returns_of_each_alone():
     cases, learner = built(*SHORT)
     cases.renew(3)

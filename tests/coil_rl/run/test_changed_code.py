@@ -53,6 +53,7 @@ def place(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
+@pytest.mark.slow
 def test_change_of_a_file_is_said_and_refused_where_the_run_would_go_on(place, capsys):
     folder = place / "run"
     run = coil_rl.train("tank_of_mine:Tank", frames=32, folder=folder, overrides=TINY)

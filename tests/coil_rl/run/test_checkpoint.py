@@ -1,4 +1,3 @@
-import codecs
 import copy
 import io
 import os
@@ -74,16 +73,6 @@ def repacked(state, **options):
     return other
 
 
-class Bytes:
-    def __reduce__(self):
-        return (bytearray, (10**12,))
-
-
-class Hexadecimal:
-    def __reduce__(self):
-        return (codecs.encode, (b"a", "hex"))
-
-
 def sharing(count):
     """An archive in which many names have the bytes of one entry."""
     archive = repacked({"a": torch.zeros(10**5)})
@@ -104,12 +93,9 @@ def sharing(count):
         (lambda: repacked({"a": torch.zeros(10**6)}, compress_type=8), "ValueError"),
         (lambda: repacked({"a": torch.zeros(10**6)}, compress_type=14), "ValueError"),
         (lambda: sharing(1000), "ValueError"),
-        (lambda: repacked(Bytes()), "UnpicklingError"),
-        (lambda: repacked(Hexadecimal()), "UnpicklingError"),
-        (lambda: repacked({"a": torch.zeros(3).to_sparse()}), "UnpicklingError"),
         (lambda: io.BytesIO(pickle.dumps({"a": 1})), "BadZipFile"),
     ],
-    ids=["deflated", "lzma", "sharing", "bytearray", "hex", "sparse", "pickle"],
+    ids=["deflated", "lzma", "sharing", "pickle"],
 )
 def test_small_file_does_not_load_as_a_large_state(tmp_path, archive, reason):
     signed(archive(), tmp_path / "policy_last.pt")

@@ -16,7 +16,6 @@ from coil_rl.record import DELIVERY
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
 from coil_rl.run.delivery import GUIDE, Delivery, GuideActs
-from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import TESTS
 
 pytest.importorskip("gymnasium.envs.classic_control")
@@ -189,15 +188,6 @@ def test_run_without_a_start_test_knows_from_its_training_how_long_a_test_would_
     assert float(last["frames/tests"]) == 0
     assert float(last["frames"]) <= 1200
     assert report(run)["policy"] == "last_untested"
-
-
-def test_policy_of_an_older_folder_is_found_under_its_old_name(tmp_path):
-    assert weights_file(tmp_path, HANDED_OVER).name == "policy_handed_over.pt"
-    (tmp_path / "policy_best.pt").touch()
-    assert weights_file(tmp_path, HANDED_OVER).name == "policy_best.pt"
-    assert weights_file(tmp_path).name == "policy_last.pt"
-    (tmp_path / "policy_handed_over.pt").touch()
-    assert weights_file(tmp_path, HANDED_OVER).name == "policy_handed_over.pt"
 
 
 @pytest.mark.slow

@@ -190,7 +190,7 @@ def test_clipped_actions_have_equal_digits_too(squash, tmp_path):
     check_equal(tmp_path, boxes, "ppo", f"learner.squash={squash}")
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("box", [*BOXES, *HALF])
 @pytest.mark.parametrize("method", ["residual", "residual_coil", "policy_decorator"])
 def test_residual_policy_is_its_guide_at_first(method, box, tmp_path):

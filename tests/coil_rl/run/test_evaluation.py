@@ -21,6 +21,7 @@ TRACKS = random_tracks(2, seed=5)
 DRIVING = driving_measures()
 
 
+@pytest.mark.slow
 def test_measures_of_a_guide_that_completes_its_laps(ring):
     tracks = [ring, Track("wider", 1.1 * ring.left, 1.1 * ring.right)]
     env = ConeTrackEnv(tracks, 2, assignment="cyclic", laps=1, rate=6)

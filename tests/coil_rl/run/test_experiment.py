@@ -70,6 +70,7 @@ def as_written(rows):
     return str([{name: float(value) for name, value in row.items()} for row in rows])
 
 
+@pytest.mark.slow
 def test_run_writes_its_files_and_a_row_per_update(tmp_path):
     rows = experiment(tmp_path / "run").run()
     names = {
@@ -96,6 +97,13 @@ def test_same_seed_same_metrics(tmp_path):
         experiment(tmp_path / name, seed).run()
     logs = [(tmp_path / name / "metrics.csv").read_text() for name in ("first", "second", "other")]
     assert logs[0] == logs[1] != logs[2]
+
+
+def test_tests_that_take_all_frames_leave_one_further_update(tmp_path):
+    run = experiment(tmp_path / "run")
+    run.reserve, run.updates = lambda: 10**6, 3
+    run._plan()
+    assert run.all_updates == 4
 
 
 class Killed(BaseException):
@@ -260,7 +268,7 @@ def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, 
     corrected.run()
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("place", "message"),
     [

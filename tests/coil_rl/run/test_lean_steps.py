@@ -78,7 +78,7 @@ def collected(make_env, correlation, lean, options):
     return [*batches, rollout.collect(), rollout.collect()]
 
 
-@pytest.mark.fast(3)
+@pytest.mark.fast("choices-0.7")
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
 @pytest.mark.parametrize(
     ("make_env", "options"),

@@ -63,7 +63,7 @@ def learning(env, correlation, squash=True, observed="observation"):
     return ppo, Rollout(env, ppo.policy, 50, keys, noise_correlation=correlation)
 
 
-@pytest.mark.fast(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 @pytest.mark.parametrize("squash", [True, False])
 def test_noise_is_correlated_over_steps_and_batches_and_each_action_has_the_policys_distribution(

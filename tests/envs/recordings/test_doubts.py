@@ -36,6 +36,7 @@ def remarks(path):
             return [str(error)]
 
 
+@pytest.mark.slow
 def test_good_drive_leaves_no_doubts(good, tmp_path):
     assert remarks(good) == remarks(odd.write(tmp_path / "same.mcap", odd.messages_of(good))) == []
 

@@ -11,11 +11,8 @@ from mcap.writer import CompressionType, Writer
 
 from coil_rl.envs.recordings.folders import RecordingError
 from coil_rl.envs.recordings.mcap_files import digest, read_messages
-from coil_rl.envs.recordings.messages import SCAN, TWIST, decode, definition, encode, twist
+from coil_rl.envs.recordings.messages import SCAN, definition
 from coil_rl.envs.recordings.reading import read_recording
-
-TEXTS = "string[1000000] texts\n"
-NESTED = "".join(f"T{n}[1000] parts\n{'=' * 80}\nMSG: own/msg/T{n}\n" for n in range(5))
 
 
 @pytest.fixture(autouse=True)
@@ -28,44 +25,6 @@ def limits():
     tracemalloc.stop()
     assert most < 300e6
     assert time.monotonic() - start < 20
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        TEXTS,
-        "float64[999999999] numbers\n",
-        NESTED + "float32 a\n",
-        "string<=999999999 text\n",
-        "std_msgs/Header[100000] headers\n",
-        "std_msgs/Empty[] nothing\n",
-        "".join(f"float32 f{n}\n" for n in range(5000)),
-        "float32 a\n" * 9000,
-        "(" * 50_000,
-        f"string A={'x' * 90_000}\nfloat32 a\n" * 2,
-        "float32 __class__\n",
-    ],
-)
-def test_definition_cannot_take_time_or_memory(text):
-    data = encode(TWIST, twist(0.5, 0.25))
-    own = text + definition(TWIST).decode()
-    for language in ("ros2msg", "ros2idl", "jsonschema"):
-        message = decode(data, TWIST, language, own.encode())
-        assert message.linear.x == 0.5
-
-
-def test_constants_of_idl_are_not_evaluated():
-    idl = "module a { const long A = " + "*".join(["9" * 50_000] * 20) + "; };"
-    data = encode(TWIST, twist(0.5, 0.25))
-    assert decode(data, TWIST, "ros2idl", idl.encode()).angular.z == 0.25
-
-
-def test_definition_with_another_simple_field_is_used():
-    own = "uint8 A=1\nfloat64[3] more 1.0 # own\n" + definition(TWIST).decode()
-    data = encode(TWIST, twist(0.5, 0.25))
-    data = data[:4] + np.arange(3.0).tobytes() + data[4:]
-    message = decode(data, TWIST, "ros2msg", own.encode())
-    assert (message.linear.x, message.more.tolist()) == (0.5, [0, 1, 2])
 
 
 def bomb(path, compression, size):

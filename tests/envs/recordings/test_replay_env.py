@@ -69,6 +69,7 @@ def test_length_of_a_recording_is_that_of_the_file_as_it_is_now(tmp_path, monkey
     assert McapReplayEnv.whole_pass({"recordings": "a.mcap"}) == (1, 5)
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_cones_and_guide_are_those_of_the_drive():
     """Replay recordings of the drive by a robot of a seventh of the car's size."""

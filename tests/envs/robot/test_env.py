@@ -43,6 +43,7 @@ def steered(env, actions):
     return states
 
 
+@pytest.mark.slow
 def test_contract_and_entries_are_those_of_the_cone_world():
     robot, world = robots(3), ConeTrackEnv(shipped_tracks("test"), 3)
     testing.check_transform(robot, GuideActions({"spline": SplineGuide()}))

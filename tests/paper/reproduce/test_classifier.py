@@ -80,6 +80,7 @@ def drive_with_varying_scans(path, sides, seed):
     return drives
 
 
+@pytest.mark.slow
 def test_each_scan_is_measured_by_its_own_bearings(tmp_path):
     drives = drive_with_varying_scans(tmp_path / "both.mcap", "both", 7)
     recording = read_recording(tmp_path / "both.mcap")

@@ -20,6 +20,7 @@ def column(rows, key):
     return np.array([float(row[key]) for row in rows]).reshape(3, 3)
 
 
+@pytest.mark.slow
 def test_scores_of_the_guides_are_ordered_and_at_most_optimal(made):
     _, groups, _ = made
     assert {guide for _, guide in groups} == {"optimal", "noisy (20%)", "random", "worst"}

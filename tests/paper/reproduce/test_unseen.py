@@ -43,6 +43,7 @@ def test_drivers_are_the_guide_and_then_the_agents_by_reward(made):
     )
 
 
+@pytest.mark.slow
 def test_agents_are_compared_seed_by_seed_with_ppo_and_with_the_guide(made):
     coil = drivers(made[0], "Deterministic actions")["coil"]
     assert coil["difference to ppo (95 %)"] == "-0.055 (-0.055 to -0.055)"

@@ -34,6 +34,7 @@ OWN = [f"+controller._target_={__name__}.Guide", "rate=5.5"]
 SHORT = [*OWN, "simulation.seconds=6"]
 
 
+@pytest.mark.slow
 def test_an_object_with_act_and_reset_drives_and_its_log_is_driven_by_again(tmp_path):
     first = called("drive", *SHORT, "hydra.run.dir=first", cwd=tmp_path)
     assert "33 scans (driving 33); the time was over; 0 laps." in first.stdout
@@ -44,6 +45,7 @@ def test_an_object_with_act_and_reset_drives_and_its_log_is_driven_by_again(tmp_
     assert {file.name for file in (tmp_path / "second").iterdir()} == {"drive.mcap", "drive.md"}
 
 
+@pytest.mark.slow
 def test_topic_and_scanner_of_a_recording_are_chosen(tmp_path):
     called("drive", *SHORT, "hydra.run.dir=first", cwd=tmp_path)
     rows = read_messages(tmp_path / "first" / "drive.mcap", ["/scan"]).messages["/scan"]

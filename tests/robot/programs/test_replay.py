@@ -73,6 +73,7 @@ def messages(done):
     return found
 
 
+@pytest.mark.slow
 def test_files_and_printed_table(done):
     program, folder = done
     assert {path.name for path in folder.iterdir()} == FILES
