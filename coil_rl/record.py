@@ -24,6 +24,7 @@ from coil_rl.files import LARGEST_NUMBERS, LARGEST_TABLE, read_file, write_text
 T = TypeVar("T")
 Row = dict[str, Any]  # of a table
 
+MOST_MEANS = 50_000  # rows of an evaluation that a report can be made of
 DRIVER = ("driver", "advice", "actions", "case")  # columns of the tables of episodes: texts
 UNTESTED = "last_untested"  # in `Delivery`: the last policy, as no frames were left for a test
 
@@ -142,14 +143,17 @@ def means(content: bytes) -> list[Row]:
     """Return the rows of an evaluation: the columns `DRIVER` are texts, all others numbers.
 
     Raises:
-        ValueError: for two rows of one driver in the same case, and without rows.
+        ValueError: for two rows of one driver in the same case, for a return that is infinite, for
+            more than `MOST_MEANS` rows, and for none.
     """
     rows: list[Row] = []
     for line in table(content):
         cells = {name: line[name] for name in DRIVER} | {"reward": float(line["reward"])}
         rows.append(cells | {name: float(line[name]) for name in line if name not in cells})
-    if not rows:
-        raise ValueError("no rows")
+    if not 0 < len(rows) <= MOST_MEANS:
+        raise ValueError(f"{len(rows):,} rows, not 1 to {MOST_MEANS:,}")
+    if any(math.isinf(row["reward"]) for row in rows):
+        raise ValueError("a return that is infinite")
     if len({tuple(row[name] for name in DRIVER) for row in rows}) < len(rows):
         raise ValueError("two rows of one driver in the same case")
     return rows

@@ -11,8 +11,14 @@ from coil_rl.export.contract import CONTRACT, FORMAT, ONNX, VERSION, checksum
 Change = Callable[[dict], None]
 
 
-def model(advised: bool = True, batch: str | int = "b", seen: str = "observation") -> bytes:
-    """Return a file that adds the observation, the advice and what it remembers: their sum."""
+def model(
+    advised: bool = True, batch: str | int = "b", seen: str = "observation", zeros: int = 1
+) -> bytes:
+    """Return a file that adds the observation, the advice and what it remembers: their sum.
+
+    Args:
+        zeros: how many of them it adds, too.
+    """
     rows = [(seen, 2), *([("guide_action", 1)] if advised else []), ("state.sum", 1)]
     inputs = [
         helper.make_tensor_value_info(name, TensorProto.FLOAT, [batch, size]) for name, size in rows
@@ -25,10 +31,13 @@ def model(advised: bool = True, batch: str | int = "b", seen: str = "observation
     nodes = [
         helper.make_node("ReduceSum", [seen, "axes"], ["total"], keepdims=1),
         helper.make_node("Add", ["total", "guide_action" if advised else "total"], ["advised"]),
-        helper.make_node("Add", ["advised", "state.sum"], ["action"]),
+        helper.make_node("ConstantOfShape", ["zeros"], ["nothing"]),
+        helper.make_node("ReduceSum", ["nothing"], ["zero"], keepdims=0),
+        helper.make_node("Sum", ["advised", "state.sum", "zero"], ["action"]),
         helper.make_node("Identity", ["action"], ["next.sum"]),
     ]
-    graph = helper.make_graph(nodes, "sum", inputs, outputs, [axes])
+    size = helper.make_tensor("zeros", TensorProto.INT64, [1], [zeros])
+    graph = helper.make_graph(nodes, "sum", inputs, outputs, [axes, size])
     opset = [helper.make_opsetid("", 20)]
     return helper.make_model(graph, opset_imports=opset, ir_version=9).SerializeToString()
 

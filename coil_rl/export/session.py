@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,7 @@ from coil_rl.errors import UserError
 from coil_rl.extras import require
 
 Arrays = Mapping[str, NDArray[Any]]
-
-
+LARGEST_MEMORY = 2**31  # bytes, of what all files of a process compute
 TYPES = {"tensor(float)": "float32", "tensor(double)": "float64", "tensor(float16)": "float16"}
 
 
@@ -35,7 +35,9 @@ class Session:
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = threads
-        options.log_severity_level = 3
+        options.log_severity_level = 4
+        _limit_memory()
+        options.add_session_config_entry("session.use_env_allocators", "1")
         try:
             self.session = onnxruntime.InferenceSession(
                 content, options, providers=["CPUExecutionProvider"]
@@ -107,6 +109,16 @@ class Session:
                     f"it wrote {name} {list(value.shape)} for {rows} rows, not {[rows, *shape]}"
                 )
         return results
+
+
+@cache
+def _limit_memory() -> None:
+    """Let the sessions of this process that ask for it have `LARGEST_MEMORY` together."""
+    import onnxruntime as ort
+
+    kind = ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR
+    place = ort.OrtMemoryInfo("Cpu", kind, 0, ort.OrtMemType.DEFAULT)
+    ort.create_and_register_allocator(place, ort.OrtArenaCfg({"max_mem": LARGEST_MEMORY}))
 
 
 def _unfit(problem: str) -> UserError:

@@ -298,7 +298,7 @@ class Actions:
     Args:
         name: of the env, for messages.
         space: of the action.
-        dtype: of actions that are real numbers, unless it is too coarse for their range.
+        dtype: of actions that are real numbers.
 
     Attributes:
         spec: of an action of one env; a matrix of real numbers is a vector.
@@ -376,35 +376,22 @@ class Actions:
         space, shape = self.space, (math.prod(self.space.shape),)
         if not (np.isfinite(space.low).any() or np.isfinite(space.high).any()):
             return Unbounded(shape, dtype=self.dtype)
-        dtype = self._fine_enough()
-        low, high = (
-            torch.as_tensor(bound, dtype=dtype).reshape(shape) for bound in (space.low, space.high)
-        )
-        for index in (low >= high).nonzero().flatten().tolist()[:1]:
-            raise ValueError(
-                f"number {index} of the action of {self.name} has the bounds "
-                f"{space.low.flat[index]} and {space.high.flat[index]}, which are equal in "
-                f"{dtype}: subtract the offset in a wrapper"
-            )
-        return Bounded(low, high, shape, dtype=dtype)
-
-    def _fine_enough(self) -> torch.dtype:
-        """Return the dtype of real numbers: float64 where their range has too few steps.
-
-        A space that is as coarse itself needs no finer dtype.
-        """
-        space = self.space
-        if space.dtype.kind != "f" or space.dtype.itemsize <= self.dtype.itemsize:
-            return self.dtype
-        # From a single bound on, actions count in units of 1.
-        low, high = (
-            np.where(np.isfinite(bound), bound, other + side)
-            for bound, other, side in ((space.low, space.high, -1), (space.high, space.low, 1))
-        )
-        floats = torch.empty(0, dtype=self.dtype).numpy().dtype
+        bounds = [
+            torch.as_tensor(bound, dtype=self.dtype).reshape(shape)
+            for bound in (space.low, space.high)
+        ]
+        low, high = (bound.numpy() for bound in bounds)
         with np.errstate(all="ignore"):  # of coordinates without bounds, and of very large ones
-            count = (high - low) / np.spacing(np.maximum(abs(low), abs(high)).astype(floats))
-        return torch.float64 if (count < COARSE).any() else self.dtype
+            count = (high - low) / np.spacing(np.maximum(abs(low), abs(high)))
+        # A space may itself be as coarse.
+        least = COARSE if space.dtype.itemsize > low.itemsize else 0.0
+        for index in np.flatnonzero(count <= least)[:1]:
+            raise ValueError(
+                f"number {index} of the action of {self.name} goes from {space.low.flat[index]} to "
+                f"{space.high.flat[index]}, where {self.dtype} has too few steps: subtract the "
+                "offset in a wrapper"
+            )
+        return Bounded(*bounds, shape, dtype=self.dtype)
 
     def decode(self, actions: NDArray[Any]) -> NDArray[Any]:
         """Return actions as the env takes them, real numbers within its bounds.

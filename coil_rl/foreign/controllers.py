@@ -24,7 +24,7 @@ from coil_rl.errors import did_you_mean
 from coil_rl.foreign.faults import ForeignError, foreign, shown
 from coil_rl.foreign.guard import NUMBERS, Guard, hold
 from coil_rl.foreign.host import Host, Predictor, asks_for_env, called, check_call, role_of
-from coil_rl.foreign.remembered import copied, maker_of_rows, restore, state_of
+from coil_rl.foreign.remembered import copied, maker_of_rows, state_of
 from coil_rl.foreign.shared import FunctionGuide, NetworkGuide
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key, written_key
 from coil_rl.transforms.hosted import HostedGuide, ToldGuide
@@ -38,9 +38,9 @@ class PerRow(HostedGuide):
     numbering of the env, as a Gymnasium env gives them. It returns an action: numbers, an index or
     a one-hot vector. `reset()`, if there is one, is called at the start of each episode; without it
     each episode gets a new object. Objects with `state_dict()` and `load_state_dict(state)` are
-    part of a checkpoint, networks with their plain attributes; without these, new episodes begin
-    when a run is resumed. They are called one after the other: a batched guide is many times
-    faster.
+    part of a checkpoint; without these, and for networks that remember more than `state_dict()`
+    has, new episodes begin when a run is resumed. They are called one after the other: a batched
+    guide is many times faster.
 
     What an object raises, or returns that is no action, is a `ForeignError` with its row and step.
 
@@ -176,7 +176,7 @@ class PerRow(HostedGuide):
                 host.open()
             host.numbers.load_state_dict(numbers.get(row, {}))
             with foreign(host.place, "load_state_dict"):
-                restore(host.thing, state[row])
+                host.thing.load_state_dict(state[row])
 
 
 class ControllerGuide(HostedGuide):

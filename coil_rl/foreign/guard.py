@@ -81,13 +81,12 @@ def _set_printing(state: tuple[Any, ...]) -> None:
     vars(tensor_str.PRINT_OPTS).update(of_torch)
 
 
-def _device() -> Any:
-    # `torch.get_default_device` takes thirty times as long, because it makes a tensor.
-    return getattr(torch._GLOBAL_DEVICE_CONTEXT, "device_context", None)
+def _device() -> torch.device:
+    return torch.empty(0).device  # in a quarter of the time of `torch.get_default_device`
 
 
-def _set_device(context: Any) -> None:
-    torch.set_default_device(None if context is None else context.device)
+def _set_device(device: torch.device) -> None:
+    torch.set_default_device(None if device.type == "cpu" else device)
 
 
 def _set_path(folders: list[str]) -> None:
@@ -238,8 +237,11 @@ def _set_torch(states: Sequence[Tensor]) -> None:
 
 def _equal(states: Sequence[Tensor], others: Sequence[Tensor]) -> bool:
     """Return whether states have the same bytes."""
-    one = [state.numpy().tobytes() for state in states]
-    return one == [state.numpy().tobytes() for state in others]
+    return [_bytes(state) for state in states] == [_bytes(state) for state in others]
+
+
+def _bytes(state: Tensor) -> bytes:
+    return ctypes.string_at(state.data_ptr(), state.numel())  # sooner than by NumPy
 
 
 class Guard:

@@ -84,8 +84,7 @@ class GymnasiumEnv(SeededRows):
         workers: number of processes over which the rows are spread, 0 for none besides this one;
             "auto" for as many as there are cores if a timed step is long enough. The digits are
             the same.
-        dtype: of all floating-point tensors; an action of float64 with a range of less than 100
-            steps of it stays float64.
+        dtype: of all floating-point tensors.
 
     Attributes:
         observation_bounds: declared bounds of the entries that have any, which they may leave.

@@ -39,7 +39,7 @@ def limit_of(env: Any) -> int | None:
     ):
         return None
     limit = LIMIT
-    for layer in _layers(env):
+    for layer in layers(env):
         registered = getattr(getattr(layer, "spec", None), "max_episode_steps", None)
         if isinstance(layer, TimeLimit) or _is_number(registered):
             return None
@@ -51,7 +51,7 @@ def limit_of(env: Any) -> int | None:
     return limit
 
 
-def _layers(env: Any) -> Iterator[Any]:
+def layers(env: Any) -> Iterator[Any]:
     """Yield an env without its transforms, and what is in its wrappers."""
     layer, of_torchrl = _base(env), isinstance(env, EnvBase)
     for _ in range(100):

@@ -4,16 +4,18 @@ import importlib
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
 
 import gymnasium
 from gymnasium import error as errors
 from gymnasium.envs.registration import load_env_creator
+from gymnasium.wrappers import TimeLimit
 
 from coil_rl.errors import did_you_mean
 from coil_rl.foreign.faults import shortened, shown
+from coil_rl.foreign.limit import layers
 
 # What an error about a missing package mentions, and the extra of coil-rl that installs it.
 EXTRAS = {"box2d": "gym", "pygame": "gym", "mujoco": "mujoco", "minigrid": "babyai"}
@@ -105,13 +107,6 @@ def _check_statistics(env: Env, name: str) -> None:
             )
 
 
-def layers(env: Any) -> Iterator[Any]:
-    """Yield an env and what is in its wrappers."""
-    while env is not None:
-        yield env
-        env = getattr(env, "env", None)
-
-
 def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:
     """Return the env of a maker, which gets the options that it takes."""
     options = dict(settings)
@@ -125,20 +120,10 @@ def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:
 
 def _limited(env: Env, steps: int) -> Env:
     """Return an env whose episodes end after a number of steps, also if it had another limit."""
-    limits = time_limits_of(env)
+    limits = [layer for layer in layers(env) if isinstance(layer, TimeLimit)]
     for limit in limits:  # a further one could only shorten the episodes
         limit._max_episode_steps = steps
-    return env if limits else gymnasium.wrappers.TimeLimit(env, steps)
-
-
-def time_limits_of(env: Env) -> list[gymnasium.wrappers.TimeLimit[Any, Any]]:
-    """Return the wrappers `TimeLimit` around an env."""
-    limits, layer = [], env
-    while isinstance(layer, gymnasium.Wrapper):
-        if isinstance(layer, gymnasium.wrappers.TimeLimit):
-            limits.append(layer)
-        layer = layer.env
-    return limits
+    return env if limits else TimeLimit(env, steps)
 
 
 def _reason(id: str, error: BaseException) -> str:

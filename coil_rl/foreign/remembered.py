@@ -3,17 +3,14 @@
 import copy
 import io
 import pickle
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
 import torch
 from torch import nn
 
-# Key of a saved state with the attributes of a network and its parts that torch does not save.
-PLAIN = "plain attributes"
 OF_TORCH = frozenset(vars(nn.Module()))
-UNSAVED = (pickle.PickleError, TypeError, AttributeError, RuntimeError)
 
 
 def maker_of_rows(thing: Any) -> partial[Any]:
@@ -32,32 +29,19 @@ def _copy_of_network(network: nn.Module) -> nn.Module:
 
 
 def state_of(thing: Any, make: Callable[[], Any]) -> dict[str, Any] | None:
-    """Return all that an object with `state_dict` remembers; None if a checkpoint cannot hold it.
+    """Return what `state_dict` of an object says; None if the object remembers more.
 
     A network whose class leaves `state_dict` to torch may remember something in plain attributes,
-    or in buffers that are not persistent. They are part of its state, but for those that cannot be
-    saved and are as in a new object, such as a configuration.
+    or in buffers that are not persistent: what is another than in a new object.
     """
-    state: dict[str, Any] = thing.state_dict()
-    if not isinstance(thing, nn.Module) or type(thing).state_dict is not nn.Module.state_dict:
-        return state
-    plain = {place: value for place, value in _plain(thing) if _can_be_saved(value)}
-    others = {place: value for place, value in _plain(thing) if place not in plain}
-    if others:
+    if isinstance(thing, nn.Module) and type(thing).state_dict is nn.Module.state_dict:
         with torch.random.fork_rng():
             new = dict(_plain(make()))
-        if not all(place in new and _is_same(value, new[place]) for place, value in others.items()):
+        now = dict(_plain(thing))
+        if now.keys() != new.keys() or not all(_is_same(now[place], new[place]) for place in now):
             return None
-    return {**state, PLAIN: plain}
-
-
-def restore(thing: Any, state: Mapping[str, Any]) -> None:
-    """Give an object with `load_state_dict` what `state_of` returned."""
-    saved = dict(state)
-    plain = saved.pop(PLAIN, {}) if isinstance(thing, nn.Module) else {}
-    thing.load_state_dict(saved)
-    for (part, name), value in plain.items():
-        setattr(thing.get_submodule(part), name, value)
+    state: dict[str, Any] = thing.state_dict()
+    return state
 
 
 def _plain(network: nn.Module) -> Iterator[tuple[tuple[str, str], Any]]:
@@ -81,17 +65,10 @@ def copied(value: Any) -> Any:
     return torch.load(file, weights_only=True)
 
 
-def _can_be_saved(value: Any) -> bool:
-    """Return whether a checkpoint can hold a value."""
-    try:
-        copied(value)
-    except UNSAVED:
-        return False
-    return True
-
-
 def _is_same(value: Any, other: Any) -> bool:
     """Return whether two values are one, or have the same content."""
+    if isinstance(value, torch.Tensor):  # of which a pickle has the place in memory
+        return isinstance(other, torch.Tensor) and torch.equal(value, other)
     return value is other or pickled(value) == pickled(other) != b""
 
 

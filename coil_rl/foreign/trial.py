@@ -29,7 +29,7 @@ from coil_rl.foreign.controllers import PerRow
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.foreign.host import called, is_of_user
-from coil_rl.foreign.makers import layers
+from coil_rl.foreign.limit import layers
 from coil_rl.foreign.remembered import pickled
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import (

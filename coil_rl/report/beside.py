@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 COLUMNS = 4  # of panels
 PANEL_HEIGHT = 1.9  # inches
-MAX_PANELS = 8
+MAX_PANELS, MAX_CASES = 8, 500
 BESIDE = (
     "A line for each case: return of the guide (left) and of the policy (right), means over seeds."
 )
@@ -42,7 +42,8 @@ def draw_beside_guides(
     """Draw a panel for each policy, all on one axis, with a line for each case.
 
     Args:
-        beside: from `beside_guides`, not empty; the first `MAX_PANELS` are drawn.
+        beside: from `beside_guides`, not empty; the first `MAX_PANELS` are drawn, and of each the
+            first `MAX_CASES`.
         path: output file, or a buffer for an SVG.
         strokes: by label, for the colours.
     """
@@ -58,7 +59,7 @@ def draw_beside_guides(
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
         for axes, (label, (guide, policy)) in zip(grid, shown.items(), strict=False):
             style.lighten(axes)
-            for ends in np.stack([guide, policy], 1):
+            for ends in np.stack([guide, policy], 1)[:MAX_CASES]:
                 colour = strokes[label].colour if ends[1] > ends[0] else style.KERB
                 axes.plot([0, 1], ends, "o-", color=colour, lw=1, ms=2.5, alpha=0.7)
             axes.set_title(label, size=8, loc="left")

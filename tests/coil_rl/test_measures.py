@@ -125,11 +125,3 @@ def test_mean_over_cases_counts_a_measure_by_the_episodes_that_have_it():
     ]
     *_, mean = summarise(episodes, {"lap_time": Measure("lap")})
     assert mean["lap_time"] == pytest.approx((5 + 7 + 7 + 7) / 4)
-
-
-def test_mean_of_returns_is_not_a_number_if_one_is_not():
-    episodes = [{"case": "a", "reward": 1.0}, {"case": "b", "reward": math.nan}]
-    rows, counts = summarise(episodes, {}), denominators(episodes, {})
-    assert math.isnan(rows[-1]["reward"])
-    shown = with_shares(rows, counts, {"reward": ("reward", ".1f")})
-    assert shown[-1]["reward"] == "- (1 of 2)"

@@ -39,6 +39,11 @@ def test_what_is_written_is_read_with_every_digit(file, content, tmp_path):
             "driver,reward\ncoil,1\n",
             r"it lacks advice.*again by coil-train",
         ),
+        (
+            record.EVALUATION,
+            "driver,advice,actions,case,reward\ncoil,,sampled,0,-inf\n",
+            "a return that is infinite",
+        ),
     ],
 )
 def test_damaged_file_is_one_sentence_with_its_name_and_what_to_do(file, text, message, tmp_path):

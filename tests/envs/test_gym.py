@@ -145,21 +145,6 @@ def test_returned_arrays_are_copies_and_info_is_optional():
     assert not (again == 7).any()
 
 
-def test_some_cars_are_reset_and_the_others_go_on():
-    straight, mask = np.zeros((4, 1), np.float32), np.array([True, False, False, True])
-    envs, alone = (gymnasium.make_vec(gym.ID, num_envs=4) for _ in range(2))
-    for each in (envs, alone):
-        each.reset(seed=np.int64(3))
-        for _ in range(5):
-            before = each.step(straight)[0]
-    observation, info = envs.reset(options={"reset_mask": mask})
-    assert observation.shape == before.shape
-    np.testing.assert_array_equal(observation[~mask], before[~mask])
-    assert (observation[mask] != before[mask]).any(-1).all()
-    assert info["track"].shape == (4,)
-    np.testing.assert_array_equal(envs.step(straight)[0][~mask], alone.step(straight)[0][~mask])
-
-
 def test_reset_of_some_cars_obeys_its_seed():
     mask, starts = np.array([False, True] * 4), []
     for steps in (1, 7):

@@ -94,7 +94,6 @@ WRAPPERS = "gymnasium.wrappers."
 @pytest.mark.parametrize(
     ("wrapper", "arguments", "shape"),
     [
-        ("RescaleAction", {"min_action": -1, "max_action": 1}, [3]),
         ("RescaleAction", {"min_action": [-1.0], "max_action": [1]}, [3]),
         ("RescaleObservation", {"min_obs": -1, "max_obs": 1}, [3]),
         ("ClipReward", {"min_reward": -1, "max_reward": 0}, [3]),
@@ -104,11 +103,6 @@ WRAPPERS = "gymnasium.wrappers."
         ("DtypeObservation", {"dtype": "float64"}, [3]),
         ("DiscretizeAction", {"bins": [5]}, [3]),
         ("DiscretizeObservation", {"bins": [2, 2, 2]}, [8]),
-        (
-            "StickyAction",
-            {"repeat_action_probability": 0.5, "repeat_action_duration": [1, 3]},
-            [3],
-        ),
         ("TimeAwareObservation", {}, [4]),
         ("RepeatAction", {"num_repeats": 2}, [3]),
     ],

@@ -60,10 +60,3 @@ def test_method_file_without_its_package_line_is_told_the_line(tmp_path):
     refused = called("train", *arguments, cwd=tmp_path, code=2).stderr
     assert "method/mine.yaml: Hydra puts its keys under method" in refused
     assert "begin the file with the line # @package _global_" in refused
-
-
-def test_file_that_is_no_yaml_is_named_with_its_line(tmp_path):
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment" / "mine.yaml").write_text("a: [1,\nb: }\n")
-    done = called("train", "--config-dir", str(tmp_path), "+experiment=mine", code=2)
-    assert "mine.yaml, line 2: it is no YAML: " in done.stderr

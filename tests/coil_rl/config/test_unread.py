@@ -23,11 +23,6 @@ def unread(*words):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (
-            "proxy.seed=3",
-            "proxy.seed=3 has no effect: nothing in this run reads proxy.seed (method=coil)",
-        ),
-        ("preset.perception.scale=2", "nothing in this run reads preset.perception.scale"),
         ("method=dagger budget.minibatches=3", "nothing in this run reads budget.minibatches"),
         (
             "learner=sac training.learning_rate=1",

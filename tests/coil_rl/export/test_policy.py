@@ -201,6 +201,12 @@ def test_file_that_takes_something_else_is_refused(content, message, tmp_path):
         ExportedPolicy(write(tmp_path, content=content))
 
 
+def test_file_that_needs_more_memory_than_any_policy_is_refused(tmp_path):
+    policy = ExportedPolicy(write(tmp_path, content=model(zeros=4_000_000_000)))
+    with pytest.raises(coil_rl.UserError, match=r"it fails with .*ConstantOfShape"):
+        policy.act([0.0, 0.0], 0.0)
+
+
 @pytest.mark.parametrize("name", [ONNX, CONTRACT])
 def test_missing_file_is_named(name, tmp_path):
     write(tmp_path)

@@ -1,37 +1,65 @@
 """What envs and controllers of others do wrong is one sentence with its place, or no harm."""
 
 import asyncio
+import contextlib
+import csv
 import decimal
 import fractions
+import io
 import itertools
+import json
 import logging
 import os
 import random
 import re
+import shlex
 import signal
 import struct
 import sys
 import time
 import warnings
 from functools import partial
+from importlib import metadata
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from gymnasium.wrappers import ClipReward
+from outside_package.install import SOURCE
+from programs import called
+from run_folders import driven, make_run
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Compose, ExplorationType, TransformedEnv, set_exploration_type
 
-from coil_rl import GymnasiumEnv
+import coil_rl
+from coil_rl import GymnasiumEnv, compose_train
+from coil_rl.config.assemble import assemble
+from coil_rl.config.nodes import build
+from coil_rl.envs import gym
 from coil_rl.foreign import guard as guard_file
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.guard import SETTINGS, hold
 from coil_rl.foreign.trial import Trial
-from coil_rl.guides import ControllerGuide, PerRow
-from coil_rl.transforms import GuideActions
+from coil_rl.guides import (
+    ConstantGuide,
+    ControllerGuide,
+    EntryGuide,
+    PerRow,
+    RandomGuide,
+    ZeroGuide,
+)
+from coil_rl.guides.simple import FollowAdvice
+from coil_rl.learners.normaliser import RawObservations, normaliser
+from coil_rl.measures import denominators, summarise, with_shares
+from coil_rl.report.configurations import distinguish
+from coil_rl.report.runs import read_runs
+from coil_rl.run.stopping import resume_command
+from coil_rl.transforms import GuideActions, RandomAdvice
+from coil_rl.transforms.normalised_action import normalising
 
 STEP = 3  # at which a plant or controller does what it is told
 BOX, PLANE = spaces.Box(-np.inf, np.inf, (2,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
@@ -975,3 +1003,382 @@ def test_check_asks_in_the_first_call_only(network):
     asked.clear()
     assert advice(guide, *([float(step)] for step in range(100))) == [[2.0 * n] for n in range(100)]
     assert len(asked) == 100
+
+
+# The examples of the kinds that a whole run shows: what is found, and the right value.
+EXAMPLES = {}
+TINY = ["budget.num_envs=2", "budget.steps=16", "evaluation.cases=2", "logger=none"]
+TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
+PPO = [*TINY, "learner=ppo", "learner.minibatches=2"]
+
+
+def example(right, *cases):
+    """Add examples by what they are asked for; a text must be a part of what is found."""
+
+    def add(find):
+        for case in cases or ["once"]:
+            EXAMPLES[f"{find.__name__} {case}"] = find, case, right
+        return find
+
+    return add
+
+
+class Valve(Plant):
+    """Its best action is 0.3 + 0.2 x of its range, and it shows x in a unit."""
+
+    def __init__(self, low=0.0, high=1.0, unit=1.0, offset=0.0, action=None):
+        self.low, self.span, self.unit, self.offset = low, high - low, unit, offset
+        action = action or spaces.Box(low, high, (1,), np.float32)
+        super().__init__(spaces.Box(-np.inf, np.inf, (1,)), action=action)
+
+    def good(self):
+        self.x = self.np_random.uniform(-1, 1)
+        return np.float32([self.offset + self.unit * self.x])
+
+    def step(self, action):
+        share = (float(np.ravel(action)[0]) - self.low) / self.span
+        pay = -abs(share - 0.3 - 0.2 * self.x)
+        self.time += 1
+        return self.good(), pay, False, self.time == 10, {}
+
+
+class Above:
+    """Gives 0.05 of the range more than the best action."""
+
+    def __init__(self, low, high):
+        self.low, self.span = low, high - low
+
+    def act(self, observation):
+        return [self.low + self.span * (0.35 + 0.2 * observation[0])]
+
+
+BOXES = {"0 to 1": (0, 1), "0 to 2000": (0, 2000), "200 to 1000": (200, 1000)}
+
+
+def run_of(folder, env, method, guide=None, words=(), frames=64):
+    words = [*PPO, *words]
+    return coil_rl.prepare(
+        env, guide=guide, method=method, frames=frames, folder=folder, overrides=words
+    )
+
+
+def first_return(run):
+    """Return what the first policy of a run earns in an episode."""
+    env = run.make_env(2).eval()
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        rewards = env.rollout(100, run.make_learner(env).policy)["next", "reward"]
+    return float(rewards.sum(1).mean())
+
+
+def got(space, guide, *transforms, rows=1, controllers=None):
+    """Return the actions that an env gets while its guide acts."""
+    seen = []
+
+    class Gets(Plant):
+        def step(self, action):
+            seen.append(np.ravel(action).tolist())
+            return super().step(action)
+
+    env = GymnasiumEnv(lambda: Gets(action=space), rows, controllers=controllers)
+    parts = [*normalising(env), GuideActions({"theirs": guide}), *transforms]
+    env = TransformedEnv(env, Compose(*parts)).eval()
+    env.rollout(10, FollowAdvice(env))
+    return seen
+
+
+@example(pytest.approx(-0.5, abs=1e-4), *BOXES)
+def kind_1_residual_begins_as_its_guide_in(box, folder):
+    box = BOXES[box]
+    return first_return(run_of(folder, partial(Valve, *box), "residual", Above(*box)))
+
+
+@example(pytest.approx(81.4, abs=2))  # over other days
+def kind_1_residual_begins_as_its_guide_in_rooms(_, folder):
+    search = f"hydra.searchpath=[file://{SOURCE}/thermostat/conf]"
+    words = [search, "env=rooms", "method=residual", f"run_dir={folder}", "budget.num_envs=2"]
+    return first_return(assemble(compose_train(words)))
+
+
+@example(0.0, "coil", "ppo")
+def kind_1_digits_do_not_depend_on_the_unit_of(method, folder):
+    logs = []
+    for name in ("0 to 1", "0 to 2000"):
+        guide = Above(*BOXES[name]) if method == "coil" else None
+        run_of(folder / name, partial(Valve, *BOXES[name]), method, guide).train()
+        rows = csv.DictReader((folder / name / "metrics.csv").open())
+        logs.append([float(row["train/reward"]) for row in rows])
+    return round(float(np.nanmax(np.abs(np.subtract(*logs)))), 4)
+
+
+@example("uniform", "200 to 1000", "0 to 4", "Discrete", "MultiDiscrete", "degraded MultiDiscrete")
+def kind_1_random_guide_in(name, _):
+    low, high = [float(part) for part in name.split(" to ")] if " to " in name else (0, 0)
+    space = spaces.Discrete(3, start=1) if name == "Discrete" else spaces.MultiDiscrete([3, 2])
+    space, degraded = spaces.Box(low, high, (1,)) if high else space, "degraded" in name
+    guide = [ZeroGuide(), RandomAdvice()] if degraded else [RandomGuide()]
+    found = np.array(got(space, *guide, rows=60))
+    _, counts = np.unique(found, axis=0, return_counts=True)
+    if high:
+        counts, _ = np.histogram(found, 6, (low, high))
+    assert counts.sum() == 600  # none beyond the bounds
+    statistic = np.square(counts - 600 / len(counts)).sum() / (600 / len(counts))
+    return "uniform" if statistic < 20.5 else counts  # chi-square, 5 degrees, 0.1 %
+
+
+@example([1.0, 5.0])
+def kind_1_advice_is_clamped_where_a_bound_is_finite(*_):
+    space = spaces.Box(np.float32([-1, -np.inf]), np.float32([1, np.inf]))
+    return got(space, ConstantGuide([5.0, 5.0]))[0]
+
+
+@example(True)
+def kind_1_actions_without_squash_are_not_all_at_the_bound(_, folder):
+    words = ["learner.squash=false"]
+    run = run_of(folder, partial(Valve, 200, 1000), "ppo", words=words)
+    env = run.make_env(2)
+    env.rollout(9, run.make_learner(env).policy)
+    return len(np.unique(np.stack(env.base_env.actions))) > 9
+
+
+WAYS = {
+    "constant": lambda: ConstantGuide(3),
+    "function": lambda: ControllerGuide(lambda seen: 3),
+    "controller beside its env": lambda: EntryGuide(["controller", "its"]),
+}
+
+
+@example([[3]] * 10, *WAYS)
+def kind_1_choices_have_the_numbers_of_the_env_for_a(way, _):
+    its = {"its": lambda env, seen: 3}
+    return got(spaces.Discrete(3, start=1), WAYS[way](), controllers=its)
+
+
+@example([-2, -1, 0, 1, 2])
+def kind_1_box_of_whole_numbers_is_choices(*_):
+    found = got(spaces.Box(-2, 2, (1,), np.int64), RandomGuide(), rows=20)
+    return sorted({int(each[0]) for each in found})
+
+
+@example("normalise: observation is normalised: [0] mean", "ppo", "sac")
+def kind_2_physical_units_are_normalised_for(learner, folder):
+    said = io.StringIO()
+    words = ["learner.starts=16", "learner.batch_size=8", *TINY] if learner == "sac" else PPO
+    env, options = partial(Valve, unit=40.0, offset=322.0), [f"learner={learner}", *words]
+    run = coil_rl.prepare(env, method="ppo", frames=64, folder=folder, overrides=options)
+    with contextlib.redirect_stderr(said):
+        run.train()
+    acts = run.controller()
+    assert np.ptp([acts.act(np.float32([322 + 40 * x])) for x in (-1, 1)]) > 1e-4  # not saturated
+    return said.getvalue()
+
+
+@example("leave it out", "NormalizeObservation", "NormalizeReward")
+def kind_2_statistics_of_a_wrapper_are_refused(wrapper, _):
+    with pytest.raises(ValueError, match="statistics") as caught:
+        GymnasiumEnv(lambda: ClipReward(getattr(gymnasium.wrappers, wrapper)(Valve()), -1, 1))
+    return str(caught.value)
+
+
+@example([True] * 3)
+def kind_2_rewards_are_scaled_for_every_method(*_):
+    words = [["method=ppo"], ["method=coil_anchored"], ["method=coil", "learner=sac"]]
+    return [compose_train([*each, "env=pendulum"]).learner.scale_rewards for each in words]
+
+
+@example("- (1 of 2)")
+def kind_4_mean_over_some_cases_says_so(*_):
+    episodes = [{"case": "a", "reward": 1.0}, {"case": "b", "reward": NAN}]
+    rows, counts = summarise(episodes, {}), denominators(episodes, {})
+    return with_shares(rows, counts, {"reward": ("reward", ".1f")})[-1]["reward"]
+
+
+DIFFERING = {
+    "env.id": ({"env": {"id": "A"}}, {"env": {"id": "B"}}),
+    "learner.gamma": ({"learner": {"gamma": 0.1}}, {"learner": {"gamma": 0.001}}),
+    "budget.frames": ({"budget": {"frames": 10}}, {"budget": {"frames": 20}}),
+}
+
+
+@example(["coil 1", "coil 2"], *DIFFERING)
+def kind_4_runs_are_pooled_only_if_they_are_equal_in(key, folder):
+    for seed, change in enumerate(DIFFERING[key]):
+        run = make_run(folder / str(seed), "coil", seed, driven("coil", {"a": 1.0}))
+        config = json.loads((run / "config.yaml").read_text()) | change
+        (run / "config.yaml").write_text(json.dumps(config))
+    runs, rows = distinguish(read_runs([folder]))
+    assert all(key in row["differs"] for row in rows)
+    return [run.label for run in runs]
+
+
+@example("2 of 3 runs that were started are finished")
+def kind_4_report_says_how_many_runs_were_started(_, folder):
+    for seed in range(3):
+        rows = driven("coil", {"a": 1.0}) if seed else None
+        make_run(folder / str(seed), "coil", seed, rows)
+    return called("report", f"folder={folder}").stdout
+
+
+FILES = {
+    "env": "defaults: [gym, _self_]\nlearner: {gamma: 0.5, normalise: true}\n",
+    "experiment": "learner: {gamma: 0.5, normalise: true}\n",
+}
+
+
+@example((0.5, True, 3), *FILES)
+def kind_5_file_of_a_user_is_not_overwritten_if_it_is_in(group, folder):
+    (folder / group).mkdir()
+    text = f"# @package _global_\n{FILES[group]}budget: {{num_envs: 3}}\n"
+    (folder / group / "mine.yaml").write_text(text)
+    word = "env=mine" if group == "env" else "+experiment=mine"
+    words = [f"hydra.searchpath=[file://{folder}]", word, "env.id=Pendulum-v1"]
+    words += [] if group == "env" else ["env=gym"]
+    config = compose_train([*words, "learner=sac", "guide=zero"])
+    return config.learner.gamma, config.learner.normalise, config.budget.num_envs
+
+
+@example("nothing in this run reads", "proxy.seed=3", "preset.perception.scale=2")
+def kind_5_word_without_effect_is_refused(word, _):
+    return called("train", "method=coil", word, code=2).stderr
+
+
+@example("mine.yaml, line 2: it is no YAML: ")
+def kind_5_file_that_is_no_yaml_is_named_with_its_line(_, folder):
+    (folder / "experiment").mkdir()
+    (folder / "experiment" / "mine.yaml").write_text("a: [1,\nb: }\n")
+    return called("train", "--config-dir", str(folder), "+experiment=mine", code=2).stderr
+
+
+@example("1 job of this sweep failed: job 0")
+def kind_6_failed_job_leaves_the_others_alone(_, folder):
+    words = ["-m", "env=pendulum", "method=ppo", *PPO, "budget.frames=32", "learner.gamma=7,0.9"]
+    said = called("train", *words, f"hydra.sweep.dir={folder}/sweep", cwd=folder, code=2).stderr
+    assert len(list(folder.rglob("evaluation.csv"))) == 1
+    return said
+
+
+@example("one two", "trust")
+def kind_6_command_that_goes_on_is_quoted_and_keeps_its(_, folder):
+    words = shlex.split(resume_command(folder / "it's a run", ["one", "two"]))
+    assert words[1] == f"resume={folder}/it's a run"
+    return words[2].removeprefix("trust=[").removesuffix("]").replace(",", " ")
+
+
+@example([3], "RescaleAction", "StickyAction")
+def kind_7_wrapper_of_gymnasium_is_used_from_yaml(wrapper, _):
+    given = {"min_action": -1, "max_action": 1}
+    if wrapper == "StickyAction":
+        given = {"repeat_action_probability": 0.5, "repeat_action_duration": [1, 3]}
+    node = {"_target_": f"gymnasium.wrappers.{wrapper}", "_partial_": True, **given}
+    env = {"_target_": "coil_rl.GymnasiumEnv", "id": "Pendulum-v1", "wrappers": [node]}
+    return list(build(env, "env").rollout(3)["observation"].shape[2:])
+
+
+@example(64.0)
+def kind_7_several_choices_are_learned(_, folder):
+    env = partial(Valve, action=spaces.MultiDiscrete([3, 2]))
+    run_of(folder, env, "coil", lambda seen: np.array([1, 0])).train()
+    return float(list(csv.DictReader((folder / "metrics.csv").open()))[-1]["frames"])
+
+
+@example(["1", "2", "3", "a=b ü"])
+def kind_7_run_and_resume_take_one_spelling(_, folder):
+    words = ["env=pendulum", "method=ppo", *PPO, "budget.frames=32", "existing=resume"]
+    for number, quotes in enumerate(("", "'", '"'), 1):
+        name = f"{quotes}a=b ü{quotes}"  # the first trains, the others find its run
+        called("train", *words, f"hydra.run.dir={name}", cwd=folder)
+        called("train", f"resume={name}", cwd=folder)
+        again = [f"hydra.run.dir={number}", "evaluation.gif=false"]
+        called("evaluate", f"run={name}", *again, cwd=folder)
+    return sorted(path.parent.name for path in folder.rglob("evaluation.csv"))
+
+
+@example([False, True, True, False])
+def kind_7_cars_of_the_vector_env_that_go_on_after_a_reset_of_others(*_):
+    straight, mask = np.zeros((4, 1), np.float32), np.array([True, False, False, True])
+    envs, alone = (gymnasium.make_vec(gym.ID, num_envs=4) for _ in range(2))
+    for each in (envs, alone):
+        each.reset(seed=np.int64(3))
+        for _ in range(5):
+            before = each.step(straight)[0]
+    observation, _ = envs.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(observation[~mask], before[~mask])
+    assert (observation[mask] != before[mask]).any(-1).all()
+    return (envs.step(straight)[0] == alone.step(straight)[0]).all(-1).tolist()
+
+
+@example("2.2")
+def kind_7_old_pandas_is_enough(*_):
+    (needed,) = (each for each in metadata.requires("coil-rl") if each.startswith("pandas"))
+    return needed
+
+
+@example("goes on with another file of valve_of_mine", "changed=accept")
+def kind_10_changed_code_is_refused_at_a_resume_without(accept, folder):
+    source, words = folder / "valve_of_mine.py", [f"resume={folder}/run", "trust=[valve_of_mine]"]
+    text = "from tests_of_faults import Valve as Theirs\n\nclass Valve(Theirs):\n    pass\n"
+    sys.modules["tests_of_faults"] = sys.modules[__name__]
+    source.write_text(text)
+    sys.path.insert(0, str(folder))
+    run_of(folder / "run", "valve_of_mine:Valve", "ppo").train()
+    source.write_text(f"{text}\n# another reward\n")
+    refused = called("train", *words, "budget.frames=128", code=2).stderr
+    assert "begun with another file of valve_of_mine" in refused
+    return called("train", *words, "budget.frames=128", accept).stderr
+
+
+SPACES = {
+    "it holds bytes, which": spaces.Box(0, 255, (4,), np.uint8),
+    "it is a picture": spaces.Box(0, 1, (8, 8, 3), np.float32),
+    "it holds choices": spaces.Discrete(3),
+}
+
+
+@example(1, *SPACES)
+def kind_12_normalising_is_said_to_leave_what(holds, _):
+    env = GymnasiumEnv(partial(Plant, SPACES[holds]))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        normaliser(env, ["observation"], normalise=True)
+    return sum(f"leaves observation as it is: {holds}" in str(each.message) for each in caught)
+
+
+@example("needs a space of uint8, or a divis")
+def kind_12_picture_of_real_numbers_up_to_255_is_named(*_):
+    env = GymnasiumEnv(partial(Plant, spaces.Box(0, 255, (8, 8, 3), np.float32)), 2)
+    raw = RawObservations(env, ["observation"], None)
+    with pytest.warns(UserWarning, match="far out of scale") as caught:
+        raw.look(env.rollout(4))
+    return str(caught[0].message)
+
+
+@example("128", "env.workers=2")
+def kind_12_resumed_run_takes(word, folder):
+    words = ["env=pendulum", "method=ppo", *PPO, "env.workers=0", f"hydra.run.dir={folder}/run"]
+    called("train", *words, "budget.frames=64")
+    called("train", f"resume={folder}/run", word, "budget.frames=128")
+    return (folder / "run" / "metrics.csv").read_text().splitlines()[-1].split(",")[0]
+
+
+SLOW = (
+    kind_1_residual_begins_as_its_guide_in,
+    kind_1_residual_begins_as_its_guide_in_rooms,
+    kind_1_digits_do_not_depend_on_the_unit_of,
+    kind_2_physical_units_are_normalised_for,
+    kind_4_report_says_how_many_runs_were_started,
+    kind_5_word_without_effect_is_refused,
+    kind_6_failed_job_leaves_the_others_alone,
+    kind_7_several_choices_are_learned,
+    kind_7_run_and_resume_take_one_spelling,
+    kind_10_changed_code_is_refused_at_a_resume_without,
+    kind_12_resumed_run_takes,
+)
+FAST = [name for name, (find, *_) in EXAMPLES.items() if find not in SLOW]
+
+
+@pytest.mark.fast(*FAST)
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_example_of_a_whole_run_has_its_right_value(name, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(SOURCE)
+    find, case, right = EXAMPLES[name]
+    found = find(case, tmp_path)
+    assert right in found if isinstance(right, str) else found == right

@@ -1,21 +1,17 @@
 """Observations in physical units: decided on the first batch, said, and kept with the policy."""
 
 import copy
-import warnings
 from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
 from gymnasium.spaces import Box
-from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 
 import coil_rl
 from coil_rl.errors import UserError
-from coil_rl.foreign.gymnasium_env import GymnasiumEnv
-from coil_rl.learners.normaliser import Moments, RawObservations, normaliser
+from coil_rl.learners.normaliser import Moments
 from coil_rl.run.training import training_of
 
 TINY = ["budget.num_envs=4", "budget.steps=16", "evaluation.cases=2", "logger=none"]
@@ -72,20 +68,6 @@ def used(run, which="last"):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [ON_POLICY, REPLAY], ids=["ppo", "sac"])
-def test_observations_in_physical_units_are_normalised_and_it_is_said(options, tmp_path, capsys):
-    run = learned(PHYSICAL, tmp_path / "run", *options)
-    said = capsys.readouterr().err
-    assert said.count("normalise: observation is normalised: [0] mean 32") == 1
-    assert "deviation" in said
-    assert "[1] mean" in said
-    assert used(run)
-    controller = run.controller()
-    actions = [controller.act(np.float32([322 + x, 7000 + 1000 * x])) for x in (-1, 0, 1)]
-    assert np.ptp(actions) > 1e-3  # the network is not saturated
-
-
-@pytest.mark.slow
 def test_observations_in_scale_stay_as_they_are(tmp_path, capsys):
     run = learned(Reactor, tmp_path / "auto", *ON_POLICY)
     assert "normalise: observation is in scale and stays as it is" in capsys.readouterr().err
@@ -130,46 +112,6 @@ def test_an_entry_is_never_in_scale_and_far_out_of_scale_in_one_batch():
     moments = Moments(torch.Size([1]), automatic=True)
     moments.add(9.0 + 8.0 * torch.tensor([[-1.0], [1.0]]))  # its size is above 10
     assert moments.out_of_scale.item()
-
-
-@pytest.mark.parametrize(
-    ("space", "message"),
-    [
-        (spaces.Box(0, 255, (4,), np.uint8), "leaves observation as it is: it holds bytes, which"),
-        (spaces.Box(0, 1, (8, 8, 3), np.float32), "leaves observation as it is: it is a picture"),
-        (spaces.Discrete(3), "leaves observation as it is: it holds choices"),
-        (spaces.Box(-1, 1, (4,)), ""),
-    ],
-)
-def test_what_cannot_be_normalised_is_said(space, message):
-    env = GymnasiumEnv(lambda: Pictures(space))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        normaliser(env, ["observation"], normalise=True)
-    assert [message in str(each.message) for each in caught] == [True] * bool(message)
-
-
-def test_floating_point_picture_of_bytes_is_named():
-    env = GymnasiumEnv(lambda: Pictures(spaces.Box(0, 255, (8, 8, 3), np.float32)), 2)
-    raw = RawObservations(env, ["observation"], None)
-    with pytest.warns(UserWarning, match="far out of scale.* needs a space of uint8, or a divis"):
-        raw.look(env.rollout(4))
-
-
-class Pictures(gymnasium.Env):
-    """Shows anything of a space."""
-
-    action_space = spaces.Box(-1, 1, (1,))
-
-    def __init__(self, space):
-        self.observation_space = space
-
-    def reset(self, *, seed=None, options=None):
-        self.observation_space.seed(seed)
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        return self.observation_space.sample(), 0.0, False, False, {}
 
 
 class Drifting(Reactor):
@@ -228,17 +170,3 @@ def test_what_is_out_of_scale(mean, variance, wrong):
 def test_other_word_is_refused(tmp_path):
     with pytest.raises(UserError, match="normalise"):
         learned(Reactor, tmp_path / "run", *ON_POLICY, "learner.normalise=sometimes")
-
-
-@pytest.mark.parametrize(
-    ("wrapper", "message"),
-    [
-        (NormalizeObservation, "statistics an evaluation begins anew; leave it out and give "),
-        (NormalizeReward, "changes the returns that a table shows by statistics of its own"),
-    ],
-)
-def test_wrappers_with_statistics_of_their_own_are_refused(wrapper, message):
-    with pytest.raises(ValueError, match=message):
-        GymnasiumEnv(Reactor, wrappers=[wrapper])
-    with pytest.raises(ValueError, match=message):
-        GymnasiumEnv(lambda: gymnasium.wrappers.ClipReward(wrapper(Reactor()), -1, 1))

@@ -213,22 +213,3 @@ def test_model_of_another_library_is_a_guide_in_one_line(tmp_path):
     opened = coil_rl.open_run(folder, guide=Model(), trust=["odd_plants"]).evaluate()
     assert table["reward"].tolist() == opened["reward"].tolist()
     assert (table["driver"] == "guide").any()
-
-
-@pytest.mark.slow
-def test_run_and_resume_take_one_spelling(tmp_path):
-    words = [word for word in TINY if not word.startswith("hydra")]
-    words += ["method=ppo", "env.id=odd_plants:Plant", "evaluation.gif=false", "existing=resume"]
-    folder, trusting = tmp_path / "a=b ü", "trust=[odd_plants]"
-    for number, quotes in enumerate(["", "'", '"']):
-        name = f"{quotes}{folder.name}{quotes}"
-        # The first trains, the others find its run.
-        called("train", *words, f"hydra.run.dir={name}", cwd=tmp_path)
-        assert (folder / "evaluation.csv").exists()
-        called("train", f"resume={name}", trusting, cwd=tmp_path)
-        out = f"evaluated_{number}"
-        given = [trusting, f"hydra.run.dir={out}", "evaluation.gif=false"]
-        called("evaluate", f"run={name}", *given, cwd=tmp_path)
-        assert (tmp_path / out / "evaluation.csv").exists()
-    made = {path.name for path in tmp_path.iterdir() if path.is_dir()} - {"__pycache__"}
-    assert made == {folder.name, "evaluated_0", "evaluated_1", "evaluated_2"}

@@ -60,11 +60,6 @@ def test_signal_saves_the_present_update_and_says_how_to_go_on(tmp_path, number)
     assert state["updates"] == log.read_bytes().count(b"\n") - 2
 
 
-def test_command_that_goes_on_is_quoted_and_keeps_its_trust(tmp_path):
-    words = shlex.split(stopping.resume_command(tmp_path / "it's a run", ["one", "two"]))
-    assert words == ["coil-train", f"resume={tmp_path}/it's a run", "trust=[one,two]"]
-
-
 def test_training_stops_after_its_update_unless_it_is_asked_twice():
     stop = stopping.Stop()
     assert not stop.ask()

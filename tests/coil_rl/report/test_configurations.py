@@ -40,9 +40,6 @@ def labels(runs):
 @pytest.mark.parametrize(
     ("one", "two", "names"),
     [
-        ({"learner": {"gamma": 0.9}}, {"learner": {"gamma": 0.99}}, "learner.gamma"),
-        ({"env": {"id": "A"}}, {"env": {"id": "B"}}, "env.id"),
-        ({"budget": {"frames": 10}}, {"budget": {"frames": 20}}, "budget.frames"),
         ({"guide": {"a": {"x": 1}}}, {"guide": {}}, "guide.a.x"),
         ({"env": {"first_seed": 5}}, {"env": {"first_seed": 6}}, "env.first_seed"),
         ({"observes": ["a"]}, {"observes": ["a", "b"]}, "observes"),

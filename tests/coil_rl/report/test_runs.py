@@ -75,7 +75,7 @@ ROW = (
             "",
             r"is damaged \(No columns.*\); remove the file and write it again by coil-train",
         ),
-        ("evaluation.csv", ROW.splitlines()[0] + "\n", r"is damaged \(no rows\)"),
+        ("evaluation.csv", ROW.splitlines()[0] + "\n", r"is damaged \(0 rows, not 1 to 50,000\)"),
         ("evaluation.csv", "driver,actions\nguide,sampled\n", r"is damaged \(it lacks advice\)"),
         (
             "evaluation.csv",

@@ -4,7 +4,6 @@ import importlib
 import sys
 
 import pytest
-from programs import called
 
 import coil_rl
 from coil_rl import UserError
@@ -76,14 +75,3 @@ def test_change_of_a_file_is_said_and_refused_where_the_run_would_go_on(place, c
     now = code_of(folder)
     assert now[CODE_BEFORE] == begun
     assert now[CODE]["rewards_of_mine"] != begun["rewards_of_mine"]
-
-
-@pytest.mark.slow
-def test_program_goes_on_where_the_change_is_accepted(place):
-    folder = place / "run"
-    coil_rl.train("tank_of_mine:Tank", frames=32, folder=folder, overrides=TINY)
-    (place / "tank_of_mine.py").write_text(PLANT + "\n# another file\n")
-    words = [f"resume={folder}", "trust=[tank_of_mine]", "budget.frames=48"]
-    refused = called("train", *words, cwd=place, code=2)
-    assert "begun with another file of tank_of_mine" in refused.stderr
-    called("train", *words, "changed=accept", cwd=place)
