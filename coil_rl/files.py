@@ -15,6 +15,7 @@ from typing import BinaryIO
 
 from coil_rl.errors import UserError
 
+SWEEP = "multirun.yaml"  # Hydra's file in the folder of a sweep
 FAILED_JOBS = "failed_jobs.txt"  # in the folder of a sweep, a line for each
 LARGEST_NUMBERS = 1_000_000  # bytes of a small file, such as guide_return.json
 LARGEST_TABLE = 200_000_000  # bytes of a table, such as metrics.csv

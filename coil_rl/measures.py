@@ -41,7 +41,7 @@ class Measure:
         at_least: makes the measure a flag: whether the number is at least this. An episode without
             a number is within no bound; a mean or sum of steps with a NaN is undecided, NaN.
         at_most: makes the measure a flag: whether the number is at most this.
-        title: heading of its column; a measure without one is in the CSV files only.
+        title: heading of its column; None: its name; empty: it is in the CSV files only.
         format: of its numbers in tables; "auto": as they need.
 
     Raises:
@@ -53,7 +53,7 @@ class Measure:
     where: str | tuple[str, ...] | None = None
     at_least: float | None = None
     at_most: float | None = None
-    title: str = ""
+    title: str | None = None
     format: str = "auto"
 
     def __post_init__(self) -> None:
@@ -73,6 +73,10 @@ class Measure:
             key: None if value is None else TYPES[key](value) for key, value in options.items()
         }
         return cls(_key(entry), where=None if where is None else _key(where), **typed)
+
+    def heading(self, name: str) -> str:
+        """Return the heading of the column of a measure of some name; empty where it has none."""
+        return name if self.title is None else self.title
 
     def node(self) -> dict[str, Any]:
         """Return the values for a YAML file."""

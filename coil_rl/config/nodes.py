@@ -76,8 +76,8 @@ def check_node(node: Any, name: str, program: Iterable[str] = ()) -> dict[str, A
         node = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
     if not isinstance(node, Mapping) or "_target_" not in node:
         raise UserError(
-            f"{name}={yaml_text(node)} has no _target_; give it one, the full name of a class or "
-            "function"
+            f"{name}={yaml_text(node)} has no _target_; give single settings, {name}.KEY=VALUE, or "
+            "a _target_, the full name of a class or function"
         )
     _check(node, name, program)
     return dict(node)

@@ -29,6 +29,10 @@ IGNORED_KEYS = (
     "trust",
     "proxy.folder",
     "env.workers",
+    "env.render",
+    "evaluation.env.render",
+    "evaluation.gif",
+    "evaluation.pictures",
 )
 
 

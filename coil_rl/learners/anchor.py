@@ -13,7 +13,7 @@ to the value of the advised action in DQN. The weight w does not change during t
 Before the training a start test decides w, in a few new cases whose steps are counted as frames:
 the guide, or its opposite, is held if it is clearly and materially better than the new policy as it
 acts in training; perhaps with a lower gain, if that is better still. If none is, w is 0, r is 1,
-the advice is hidden from the networks, and the training is plain PPO. The test at the end of the
+the advice is hidden from the networks, and the learner learns alone. The test at the end of the
 training, which may hand over the guide itself, is in `coil_rl.run.delivery`.
 
 The parts are `Anchor`, the numbers that a user chooses; `Hold`, the weights, which are a part of
@@ -339,6 +339,7 @@ class StartTest:
         held = self._first_held(guides, opposites, new)
         # Before gains are compared in other cases: these are returns in the same ones.
         means = self._best(guides), self._best(opposites), self._mean(new)
+        self.cases.guide_ahead = held == new and bool(self._ahead(guides, new))
         if held != new and self.hold.space.continuous and self.anchor.gains:
             held = self._best_gain(held)
         self.hold.set(held)
@@ -431,8 +432,9 @@ class StartTest:
         return max(passing, key=self._mean, default=None)
 
     def _ahead(self, candidates: Sequence[Any], new: tuple[float, ...]) -> list[Any]:
-        """Return the candidates with a higher return than the new policy in every case."""
-        return [each for each in candidates if (self.returns[each] > self.returns[new]).all()]
+        """Return the candidates that were better than the new policy in all of their cases."""
+        known = [(each, self.returns[each]) for each in candidates]
+        return [each for each, own in known if (own > self.returns[new][: len(own)]).all()]
 
     def _clear(
         self, better: tuple[float, ...], worse: tuple[float, ...], errors: float | None = None

@@ -105,11 +105,13 @@ class Cases(Protocol):
         frames: of the whole run.
         steps: that all comparisons have taken so far.
         taken: of these the steps of each policy in the last comparison.
+        guide_ahead: whether a guide that is not held was better in every case of the start test.
     """
 
     frames: int
     steps: int
     taken: list[int]
+    guide_ahead: bool
 
     def teach(self, keys: Sequence[NestedKey], learn: Callable[[TensorDictBase], Any]) -> None:
         """Let something learn from the steps of compared policies.

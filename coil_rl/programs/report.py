@@ -118,7 +118,7 @@ def report(config: DictConfig) -> None:
     from coil_rl.files import write_text
     from coil_rl.report import page, style, write_csv
     from coil_rl.report.html import Section, html_page
-    from coil_rl.report.runs import failed_jobs, read_runs
+    from coil_rl.report.runs import failed_jobs, read_runs, unstarted_jobs
     from coil_rl.run.stopping import resume_command
 
     folders = _folders(config)
@@ -146,7 +146,9 @@ def report(config: DictConfig) -> None:
             "",
             [
                 *page.notes(against, sampled="sampled" in ACTIONS[config.actions]),
-                *page.progress(len(finished), len(runs), failed_jobs(folders)),
+                *page.progress(
+                    len(finished), len(runs), failed_jobs(folders), unstarted_jobs(folders, runs)
+                ),
             ],
         )
     )

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from coil_rl.config.messages import reason_of, refuse
 from coil_rl.errors import RunningError, UserError
-from coil_rl.files import FAILED_JOBS
+from coil_rl.files import FAILED_JOBS, SWEEP
 from coil_rl.output import say
 
 
@@ -54,7 +54,7 @@ class Sweep(Callback):
 
 def remove_unused(folder: Path) -> None:
     """Remove the folder of a sweep none of whose jobs has begun."""
-    of_sweep = ("multirun.yaml", FAILED_JOBS)
+    of_sweep = (SWEEP, FAILED_JOBS)
     if all(path.is_dir() or path.name in of_sweep for path in folder.rglob("*")):
         shutil.rmtree(folder, ignore_errors=True)
         with contextlib.suppress(OSError):  # others are in it

@@ -34,6 +34,8 @@ IRRELEVANT = (
     "proxy.folder",
     "evaluation.gif",
     "evaluation.pictures",
+    "env.render",
+    "evaluation.env.render",
 )
 # Keys, or parents of keys, of the test that a run ends with: others make other cases.
 TEST = (
@@ -47,7 +49,8 @@ TEST = (
 )
 # Those that runs have to share to be compared: episodes of a case, what is observed, and frames.
 CONDITIONS = ("evaluation.repeats", "observes", "budget.frames")
-BATCH = ("num_envs", "workers", "device")  # last parts of keys of an env that change no case
+# Last parts of keys of an env that change no case.
+BATCH = ("num_envs", "workers", "device", "render", "info")
 # Keys, or parents of keys, whose random numbers the drives of a guide depend on.
 ADVICE = ("guide", "degrade")
 OF_GUIDES = ("guide", "degrade", "disturb", "env", "evaluation")
@@ -164,11 +167,13 @@ def _what_differs(groups: Sequence[Sequence[Run]], keys: Sequence[str]) -> list[
     if len(groups) == 1:
         return [""]
     common = [_common([_typed(run) for run in runs]) for runs in groups]
+    values = [_common([relevant(run) for run in runs]) for runs in groups]
     typed = list(dict.fromkeys(itertools.chain.from_iterable(common)))
     typed = [key for key in typed if len({words.get(key) for words in common}) > 1]
+    # Two words may write one value.
+    typed = [key for key in typed if key in keys or not any(key in of for of in values)]
     if all(map(_is_of_test, keys)):
         typed = list(filter(_is_of_test, typed))
-    values = [_common([relevant(run) for run in runs]) for runs in groups]
     telling = _telling_first(keys, values)
     texts = [
         [words.get(key) or f"{key}={_text(of[key])}" for key in typed if key in words or key in of]

@@ -59,8 +59,9 @@ def _columns(
     for group in comparison.groups:
         for name, measure in group.measures.items():
             has_column = name in ("completed", "crashed") or name.startswith(PER_STEP)
-            if measure.title and not has_column:
-                columns[name] = (measure.title, measure.format)
+            heading = measure.heading(name)
+            if heading and not has_column:
+                columns[name] = (heading, measure.format)
     columns["needs_guide"] = ("guide at test time", "")
     return columns
 
@@ -247,13 +248,16 @@ def begun(runs: Sequence[Run]) -> list[str]:
     return REPORT.said("begun", labels=sources)
 
 
-def progress(finished: int, started: int, refused: int = 0) -> list[str]:
-    """Return a sentence on the runs that the tables leave out.
+def progress(finished: int, started: int, refused: int, unstarted: int) -> list[str]:
+    """Return the sentences on the runs that the tables leave out.
 
     Args:
         refused: number of jobs of sweeps that were refused or failed.
+        unstarted: number of jobs of sweeps that have not begun.
     """
-    return REPORT.said("progress", finished=finished, started=started, refused=refused)
+    return REPORT.said(
+        "progress", finished=finished, started=started, refused=refused, unstarted=unstarted
+    )
 
 
 def _trained(runs: Sequence[Run]) -> Iterator[tuple[str, list[Run]]]:

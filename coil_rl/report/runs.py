@@ -5,6 +5,7 @@ pandas takes half a second to import, so only what reads an evaluation does. A t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import yaml
 
 from coil_rl import record
 from coil_rl.errors import UserError, file_of_a_run
-from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, read_text
+from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, SWEEP, read_text
 from coil_rl.measures import MEAN_CASE, Measure, measures_of
 from coil_rl.plain_yaml import read_yaml
 
@@ -125,6 +126,30 @@ def failed_jobs(folders: Iterable[Path]) -> int:
         with file_of_a_run(path, "remove it"):
             # A job that failed in several programs of a sweep has a line of each.
             count += len(set(read_text(path, LARGEST_NUMBERS).splitlines()))
+    return count
+
+
+def unstarted_jobs(folders: Iterable[Path], runs: Sequence[Run]) -> int:
+    """Return the number of jobs that sweeps in some folders have not begun.
+
+    Args:
+        runs: all that were begun.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser  # takes 0.1 s
+
+    begun = [run.folder.resolve() for run in runs]
+    count = 0
+    for path in sorted({file.resolve() for each in folders for file in each.rglob(SWEEP)}):
+        with file_of_a_run(path, "remove it"):
+            node = read_yaml(path)["hydra"]
+            words = node["overrides"]["task"]
+            own = [f"{key}={value}" for key, value in (node["sweeper"]["params"] or {}).items()]
+            parsed = OverridesParser.create().parse_overrides([*own, *words])
+        # A word of the command counts in place of one of the sweep's file.
+        last = {each.key_or_group: each for each in parsed}.values()
+        jobs = math.prod(sum(1 for _ in each.sweep_iterator()) for each in last)
+        known = sum(path.parent in folder.parents for folder in begun)
+        count += max(jobs - known, 0)
     return count
 
 

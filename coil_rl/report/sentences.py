@@ -23,7 +23,7 @@ class Sentences:
 
     Example:
         >>> page = Sentences("coil_rl.report", "report.j2")
-        >>> page.said("progress", finished=3, started=3, refused=0)
+        >>> page.said("progress", finished=3, started=3, refused=0, unstarted=0)
         ['All 3 runs that were started are finished.']
     """
 

@@ -45,6 +45,7 @@ class TrainingCases:
         episodes: number of all episodes so far.
         longest: number of steps of the longest episode so far, of this process.
         calls: number of actions that guides were asked for.
+        guide_ahead: whether a guide that is not held was better in every case of the start test.
         taught: what learns from the steps of compared policies, and the entries that it needs.
     """
 
@@ -55,6 +56,7 @@ class TrainingCases:
     steps: int = field(default=0, init=False)
     episodes: int = field(default=0, init=False)
     calls: int = field(default=0, init=False)
+    guide_ahead: bool = field(default=False, init=False)
     taught: tuple[Sequence[NestedKey], Callable[[TensorDictBase], Any]] | None = field(
         default=None, init=False
     )
@@ -211,13 +213,14 @@ class TrainingCases:
             "steps": self.steps,
             "episodes": self.episodes,
             "calls": self.calls,
+            "guide_ahead": self.guide_ahead,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.generator.set_state(state["generator"])
         self.steps, self.calls = state["steps"], state["calls"]
-        self.episodes = state["episodes"]
+        self.episodes, self.guide_ahead = state["episodes"], state["guide_ahead"]
 
 
 def further_cases(done: int, taken: int, frames: int) -> int:

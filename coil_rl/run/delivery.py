@@ -5,7 +5,7 @@ The last policy of a training need not be its best one, and may be worse than it
 that had the highest return in training, and each guide act in the same new cases, and the one with
 the highest mean return is handed over. A policy that holds a guide is compared with its own first
 policy instead. None of these cases is in the evaluation curve or in the table. Where no guide is
-held and the start test has left no frames for it, the test is left out.
+held, none was ahead in the start test, and this has left no frames, the test is left out.
 """
 
 import copy
@@ -145,8 +145,13 @@ class Delivery:
         return math.ceil(SHARE * self.cases.frames)
 
     def _left(self) -> int:
-        """Return the number of frames that the start test has left for the test at the end."""
-        return max(2 * self._share() - self.cases.steps, 0)
+        """Return the number of frames that the start test has left for the test at the end.
+
+        Where it found a guide ahead but too few cases to hold it, it has taken nothing: what is
+        handed over must not be worse than that guide.
+        """
+        taken = 0 if self.cases.guide_ahead else self.cases.steps
+        return max(2 * self._share() - taken, 0)
 
     def _affordable(self) -> int:
         """Return the frames that the test may take.

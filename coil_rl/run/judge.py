@@ -259,8 +259,8 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, said: Sequenc
     if not trial.advice:
         del columns["advice"]
     for name, measure in trial.evaluation.measures.items():
-        if measure.title:
-            columns[name] = (measure.title, measure.format)
+        if heading := measure.heading(name):
+            columns[name] = (heading, measure.format)
     count = len(trial.evaluation.cases)
     pairs = list(zip(judgement.table, judgement.counts, strict=True))
     if count > MAX_CASES:
@@ -285,7 +285,7 @@ def not_worse(
     """Return the sentence whether a policy is not worse than a guide in the same cases.
 
     The answer is yes if the whole t interval of the difference is above minus 1 % of what the guide
-    earns more or less than random actions, no if it is below. Neither depends on the zero of the
+    earns more or less than random actions, no if it is below. It does not depend on the zero of the
     rewards.
 
     Args:
@@ -294,7 +294,7 @@ def not_worse(
     mine, theirs = policy.rewards, guide.rewards
     found = difference(mine, theirs)
     allowed = ALLOWED_LOSS * abs(guide.mean_reward - chance)
-    answer = "undecided"
+    answer = "undecided, but worse" if found.high < 0 else "undecided"
     if found.low >= -allowed:
         answer = "yes"
     elif found.high < -allowed:

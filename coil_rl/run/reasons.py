@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from coil_rl.files import SWEEP
 from coil_rl.learners.anchor import StartTest
 from coil_rl.record import DELIVERY, UNTESTED
 from coil_rl.report.runs import EVALUATION, RETURN, SELECTION
@@ -118,7 +119,7 @@ def next_step(
         trust: packages that these commands must trust.
     """
     longer = f"{resume_command(folder, trust)} budget.frames={2 * frames}"
-    swept = (folder.parent / "multirun.yaml").exists()
+    swept = (folder.parent / SWEEP).exists()
     report = f"coil-report folder={shlex.quote(str(folder.parent if swept else folder))}"
     if still_rising(rows):
         return f"Still rising at the end: {longer}"

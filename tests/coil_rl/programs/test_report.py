@@ -1,4 +1,5 @@
 import csv
+import shutil
 from pathlib import Path
 
 import pytest
@@ -167,7 +168,7 @@ def test_report_reads_the_runs_of_coil_train(tmp_path):
     sweep = ["method=coil,ppo", "evaluation.gif=false", "hydra.sweep.dir=sweep"]
     program("train", "-m", *TINY, *sweep, cwd=tmp_path)
     done = program("report", "folder=sweep", "actions=both", cwd=tmp_path)
-    assert "All 2 runs that were started are finished." in done.stdout
+    assert "All 2 runs that were started are finished.\nreport:" in done.stdout
     assert done.stderr == ""
     assert {file.name for file in (tmp_path / "sweep").iterdir()} > FILES
     reward = {
@@ -183,3 +184,6 @@ def test_report_reads_the_runs_of_coil_train(tmp_path):
         guide, agent = means[0], means[1]
         assert reward["guide"] == pytest.approx(float(guide["reward"]))
         assert reward[agent["driver"]] == pytest.approx(float(agent["reward"]))
+    shutil.rmtree(run)  # as where the sweep was stopped before it
+    left = program("report", "folder=sweep", cwd=tmp_path).stdout
+    assert "Runs of the sweeps that were not started: 1; repeat their command." in left

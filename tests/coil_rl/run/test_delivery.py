@@ -121,10 +121,13 @@ def test_every_step_is_a_frame_and_the_log_has_the_parts(guide_wins):
     assert float(rows[-1]["guide/calls"]) > last["frames"]
 
 
-@pytest.mark.parametrize(("taken", "kept"), [(0, 50), (50, 50), (70, 30), (120, 0)])
-def test_test_at_the_end_gets_what_the_start_test_leaves_of_a_tenth(taken, kept, tmp_path):
+@pytest.mark.parametrize(
+    ("taken", "ahead", "kept"),
+    [(0, False, 50), (50, False, 50), (70, False, 30), (120, False, 0), (120, True, 50)],
+)
+def test_test_at_the_end_gets_what_the_start_test_leaves_of_a_tenth(taken, ahead, kept, tmp_path):
     cases = TrainingCases(build=GuideActs, frames=1000)
-    cases.steps = taken
+    cases.steps, cases.guide_ahead = taken, ahead
     delivery = Delivery(learner=None, env=None, cases=cases, curve=None, folder=tmp_path)
     assert delivery.reserve() == kept
 
@@ -177,6 +180,21 @@ def test_test_at_the_end_is_left_out_where_the_start_test_took_the_frames_of_bot
     assert "Handed over is the last policy, without a test at the end" in page
     page = called("report", f"folder={run.parent}").stdout
     assert "1 had no frames left for a test and handed over their last policy" in page
+
+
+@pytest.mark.slow
+def test_guide_that_was_ahead_but_not_held_is_tested_at_the_end(tmp_path):
+    small = ["method=coil_anchored", "budget.frames=2400", "budget.num_envs=2"]
+    run = trained(tmp_path / "run", ONCE, *small)
+    first, *_, last = rows_of(run / "metrics.csv")
+    assert float(first["start/weight"]) == 0
+    assert float(first["start/guide"]) > float(first["start/new"])
+    # Two cases of 40 steps with guide and policy, though the start test has taken its share.
+    assert float(last["delivery/cases"]) == 2
+    found = report(run)
+    assert found["returns"]["guide"] > found["returns"]["last"]
+    assert found["policy"] == "guide"
+    assert float(last["frames"]) <= 2400
 
 
 @pytest.mark.slow

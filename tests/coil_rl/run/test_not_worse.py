@@ -20,6 +20,7 @@ def result_of(rewards):
         ([98.5, 98.5, 98.5], "no"),
         ([90, 91, 92], "no"),
         ([80, 120, 100], "undecided"),
+        ([98.9, 99.1, 99.2], "undecided, but worse"),
     ],
 )
 @pytest.mark.parametrize("zero", [0, -100, -1_000_000])  # that of the rewards means nothing
