@@ -1,7 +1,7 @@
 """Odd recordings, made for tests: a drive of the simulated robot with one thing wrong in each.
 
 Each kind comes from a report about a driver, a bag or a robot. `ODD` has by name a function that
-changes the messages of a good drive, and words that `coil-replay` must then say; with `None` it
+changes the messages of a good drive, and words that must then be said of it; with `None` it
 must give the same steering as for the good drive, or say something.
 """
 
@@ -571,15 +571,3 @@ def make_odd_folder(folder, good, change):
     path = _folder(folder / change.__name__ / "bag", messages_of(good))
     change(path)
     return path
-
-
-def make_odd(folder, good):
-    """Write all odd recordings; return their paths with the words that must be said."""
-    made = {}
-    for change, words in ODD.items():
-        drive = messages_of(good)
-        change(drive)
-        made[write(folder / f"{change.__name__}.mcap", drive)] = words
-    for change, words in ODD_FOLDERS.items():
-        made[make_odd_folder(folder, good, change)] = words
-    return made

@@ -22,6 +22,7 @@ REFERRED = (
     "training.imitation_env",
     "budget.minibatches",
 )
+NOISE = "training.noise_correlation"
 NEEDS_GUIDE = "method.needs_guide"  # a fact about the method, not a choice
 OF_A_LEARNER = (
     *("learner", "network", "checkpoint_every", "evaluation.repeats"),
@@ -54,10 +55,10 @@ def unread(config: DictConfig, task: Iterable[str]) -> Iterator[str]:
                 f"{text} has no effect: the file of method={config.method.name} says whether its "
                 "policy needs a guide; leave it out"
             )
-        noise = key == "training.noise_correlation" and not _adds_noise(config)
-        if (noise or is_part(key, (*closed, *REFERRED))) and not any(
-            covers(key, other) for other in references
-        ):
+        is_read = not is_part(key, (*closed, *REFERRED))
+        if key == NOISE:
+            is_read = is_read and _adds_noise(config)
+        if not is_read and not any(covers(key, other) for other in references):
             yield (
                 f"{text} has no effect: nothing in this run reads {key} "
                 f"(method={config.method.name}); leave it out"
@@ -72,7 +73,7 @@ def _unread_nodes(config: DictConfig) -> Iterator[str]:
     if not has_agent:
         yield from OF_A_TRAINING
     if not learns:
-        yield from (*OF_A_LEARNER, "training.noise_correlation")
+        yield from (*OF_A_LEARNER, NOISE)
     if not (anchored or config.delivery == "tested"):
         yield "training.tests"
     if not trains_guides(config):
@@ -82,7 +83,7 @@ def _unread_nodes(config: DictConfig) -> Iterator[str]:
 
 
 def _references(config: DictConfig, closed: Sequence[str]) -> Iterator[str]:
-    """Yield the keys that values refer to, but those in nodes that are not read.
+    """Yield the keys to which values refer, except values in nodes that are not read.
 
     A run without a learner has one row for each case, whatever the number of rows in its env.
     """

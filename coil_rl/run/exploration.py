@@ -20,7 +20,7 @@ class CorrelatedNoise:
     Args:
         env: whose actions are sampled, numbers and not choices.
         correlation: of the numbers of consecutive steps, above 0 and at most 1.
-        parts: number of equal parts of the rows of the env, of which the noise is for one.
+        parts: number of policies that share the rows of the env; the noise is for the rows of one.
 
     Attributes:
         last: the numbers of the last step, [rows, *action]; None before the first.

@@ -108,7 +108,7 @@ def _rows_of_policies(make_env: EnvMaker, cases: str, policies: int) -> EnvBase:
 
 
 def _say_units(env: EnvBase) -> None:
-    """Print in which units an action without some of its bounds is normalised."""
+    """Print the units in which an action that lacks bounds is normalised."""
     if len(env.action_keys) != 1:
         return
     spec = env.full_action_spec[env.action_key]

@@ -119,11 +119,10 @@ class Tuner:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        self.told: list[list[float]] = []  # mean returns of the candidates of each generation
         self.largest = 0  # steps of a generation
-        self.spread = self.search.spread  # of the last candidates
-        self.best: Values = self.own
+        self.spread = self.search.spread
         self._begin()
+        self.best = self.own
 
     @property
     def own(self) -> Values:
@@ -205,7 +204,7 @@ class Tuner:
         """Begin the search at the guide's own numbers."""
         from cmaes import CMA  # imports scipy.stats, which takes a second in every training
 
-        self.told = []
+        self.told: list[list[float]] = []
         first = np.array([number.place(number.own) for number in self.numbers])
         self.cma = CMA(
             first,

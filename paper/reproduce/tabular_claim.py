@@ -111,8 +111,7 @@ class TabularCoil(Result):
             "coil_score": ("COIL", ".2f"),
             "plain_score": ("plain", ".2f"),
         }
-        every_second = self.steps[-1::-2][::-1]  # with the last one, or the table gets too wide
-        for n in every_second:
+        for n in reversed(self.steps[::-2]):  # every second one, or the table gets too wide
             columns[f"share_{n}"] = (f"≥ guide, {n:,} steps", ".0%")
         return columns | {
             "interval": ("95 %", ""),

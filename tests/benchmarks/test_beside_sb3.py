@@ -34,7 +34,6 @@ def test_mean_return_is_that_of_complete_episodes():
     assert 8 <= left <= 10
 
 
-@pytest.mark.slow
 def test_both_are_trained_and_printed(capsys):
     pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
     main(["dqn", "CartPole-v1", "--frames", "40", "--seeds", "2"])
