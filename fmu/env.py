@@ -126,11 +126,10 @@ def _wiring(
         if each in inputs:
             raise ValueError(f"parameters: {each.name} is an action; leave one out")
     model.named("start", start or (), "parameter", "input", "local", "output")
-    moved = [
-        replace(each, low=low, high=high)
-        for each in inputs
-        for low, high in [(bounds or {}).get(each.name, (each.low, each.high))]
-    ]
+    moved = []
+    for each in inputs:
+        low, high = (bounds or {}).get(each.name, (each.low, each.high))
+        moved.append(replace(each, low=low, high=high))
     space = action_space(moved, model.name)
     return Wiring(moved, space, seen, wanted, drawn, dict(start or {}))
 
