@@ -126,7 +126,10 @@ def _wiring(
         if each in inputs:
             raise ValueError(f"parameters: {each.name} is an action; leave one out")
     model.named("start", start or (), "parameter", "input", "local", "output")
-    moved = [_bounded(each, (bounds or {}).get(each.name)) for each in inputs]
+    moved = []
+    for each in inputs:
+        low, high = (bounds or {}).get(each.name, (each.low, each.high))
+        moved.append(replace(each, low=low, high=high))
     space = action_space(moved, model.name)
     return Wiring(moved, space, seen, wanted, drawn, dict(start or {}))
 
@@ -144,14 +147,6 @@ def _numbers(
                 f"{key}: {each.name} of {model.name} is a {each.type}, not a number; leave it out"
             )
     return found
-
-
-def _bounded(variable: Variable, bounds: Sequence[float] | None) -> Variable:
-    """Return an input with other bounds."""
-    if bounds is None:
-        return variable
-    low, high = map(float, bounds)
-    return replace(variable, low=low, high=high)
 
 
 def _courses(key: str, given: Mapping[str, Any] | None) -> dict[str, Course]:

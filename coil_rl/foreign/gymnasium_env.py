@@ -236,8 +236,12 @@ class GymnasiumEnv(SeededRows):
         super().begin(seeds, actions)
 
     def stay_in_process(self) -> None:
-        """Use no processes, if no episode has begun."""
+        """Use no processes from here on; running episodes are lost."""
         self.asked = 0
+        if self.workers is not None:
+            self.workers.close()
+            self.shard, self.workers = self.held, None
+            self.parts.clear()
 
     def _place_rows(self) -> None:
         """Decide in which processes the rows are, and make them there."""

@@ -29,7 +29,7 @@ from coil_rl.files import open_regular, whole_file
 CHUNK = 128 * 1024  # bytes
 
 # A file unpacks to at most this many bytes, and this many for each of its own.
-UNPACKED, UNPACKED_SHARE = 20_000_000, 100
+UNPACKED, UNPACKED_SHARE = 20_000_000, 50
 
 # First bytes of other files with the name of a recording, what they are, and the remedy.
 _OTHER_FORMATS = {
@@ -400,7 +400,9 @@ def _unpacked(chunk: records.Chunk, left: int) -> records.Chunk:
     Args:
         left: number of bytes that it may unpack to; more are a `_TooLargeError`.
     """
-    most = min(left, chunk.uncompressed_size) + 1
+    if chunk.uncompressed_size > left:
+        raise _TooLargeError
+    most = chunk.uncompressed_size + 1
     if chunk.compression == "zstd":
         with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
             data = reader.read(most)

@@ -649,6 +649,14 @@ def test_trial_names_what_rows_share_and_what_lives_by_the_clock(asked, kind, me
     assert re.search(message, text)
 
 
+def test_trial_finds_what_rows_share_also_after_they_were_in_processes():
+    env = GymnasiumEnv(SharesAttribute, 2, first_seed=0, workers=2)
+    env.rollout(3)
+    trial = Trial(env)
+    trial.ask_env()
+    assert [each.kind for each in trial.findings] == ["rows"]
+
+
 @pytest.mark.parametrize("asked", [{}, {"controller": Remembers}, {"controller": Remembers()}])
 def test_trial_blames_nothing_that_is_right(asked):
     assert findings(**asked) == []

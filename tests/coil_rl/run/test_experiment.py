@@ -220,13 +220,6 @@ def test_run_stopped_during_its_evaluation_ends_with_the_same_files(tmp_path, me
     )
 
 
-def test_one_update_is_left_where_tests_need_all_frames(tmp_path):
-    run = experiment(tmp_path / "run")
-    run.reserve = lambda: run.frames
-    rows = run.run()
-    assert len(rows) == 2
-
-
 class WriteNaN(Transform):
     """Write NaN into an entry of one car at one step of the run."""
 
