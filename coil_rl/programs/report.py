@@ -116,9 +116,10 @@ def report(config: DictConfig) -> None:
     figures, all numbers and the figures are written to the first folder.
     """
     from coil_rl.files import write_text
+    from coil_rl.programs.sweeps import unstarted_jobs
     from coil_rl.report import page, style, write_csv
     from coil_rl.report.html import Section, html_page
-    from coil_rl.report.runs import failed_jobs, read_runs, unstarted_jobs
+    from coil_rl.report.runs import failed_jobs, read_runs
     from coil_rl.run.stopping import resume_command
 
     folders = _folders(config)
@@ -147,7 +148,10 @@ def report(config: DictConfig) -> None:
             [
                 *page.notes(against, sampled="sampled" in ACTIONS[config.actions]),
                 *page.progress(
-                    len(finished), len(runs), failed_jobs(folders), unstarted_jobs(folders, runs)
+                    len(finished),
+                    len(runs),
+                    failed_jobs(folders),
+                    unstarted_jobs(folders, [run.folder for run in runs]),
                 ),
             ],
         )

@@ -6,19 +6,25 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from coil_rl.config.messages import reason_of, refuse
-from coil_rl.errors import RunningError, UserError
+from coil_rl.errors import RunningError, UserError, file_of_a_run
 from coil_rl.files import FAILED_JOBS, SWEEP
 from coil_rl.output import say
+from coil_rl.plain_yaml import read_yaml
+
+MOST_JOBS = 10_000  # of a word of a sweep that are counted
 
 
 class Sweep(Callback):
@@ -60,6 +66,38 @@ def remove_unused(folder: Path) -> None:
         with contextlib.suppress(OSError):  # others are in it
             if not folder.is_absolute():
                 os.removedirs(folder.parent)
+
+
+def unstarted_jobs(folders: Iterable[Path], runs: Iterable[Path]) -> int:
+    """Return the number of jobs that sweeps in some folders have not begun.
+
+    Args:
+        runs: folders of all that were begun.
+    """
+    begun = [run.resolve() for run in runs]
+    files = {path.resolve() for folder in folders for path in folder.rglob(SWEEP)}
+    jobs = {path.parent: _jobs_of_sweep(path) for path in sorted(files)}
+    return sum(
+        max(count - sum(folder in run.parents for run in begun), 0)
+        for folder, count in jobs.items()
+    )
+
+
+def _jobs_of_sweep(path: Path) -> int:
+    """Return the number of jobs of the sweep of a file of Hydra, 0 where it is not known."""
+    with file_of_a_run(path, "remove it"):
+        node = read_yaml(path)["hydra"]
+        if not node["sweeper"]["_target_"].endswith(".BasicSweeper"):
+            return 0  # others choose their jobs as they go
+        own = [f"{key}={value}" for key, value in (node["sweeper"].get("params") or {}).items()]
+        try:
+            parsed = OverridesParser.create().parse_overrides([*own, *node["overrides"]["task"]])
+            # A word of the command counts in place of one of the sweep's file.
+            last = {each.key_or_group: each for each in parsed}.values()
+            swept = [each.sweep_iterator() for each in last if each.is_sweep_override()]
+            return math.prod(sum(1 for _ in islice(values, MOST_JOBS)) for values in swept)
+        except HydraException as error:
+            raise ValueError(str(error)) from error
 
 
 def is_sweep() -> bool:

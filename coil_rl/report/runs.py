@@ -5,10 +5,8 @@ pandas takes half a second to import, so only what reads an evaluation does. A t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +14,7 @@ import yaml
 
 from coil_rl import record
 from coil_rl.errors import UserError, file_of_a_run
-from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, SWEEP, read_text
+from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, read_text
 from coil_rl.measures import MEAN_CASE, Measure, measures_of
 from coil_rl.plain_yaml import read_yaml
 
@@ -30,7 +28,6 @@ SELECTION = "selection"  # set of cases for the choice of the best policy
 RETURN, CHOICE = f"{EVALUATION}/return", f"{SELECTION}/return"  # columns of metrics.csv
 PER_STEP = "per_step_"  # prefix of the measures of tasks
 TERM = "reward_"  # prefix of the measures of the terms of the reward
-MOST_JOBS = 10_000  # of a word of a sweep that are counted
 RESTORE = "restore the file, or remove the run from the folder"
 
 
@@ -129,39 +126,6 @@ def failed_jobs(folders: Iterable[Path]) -> int:
             # A job that failed in several programs of a sweep has a line of each.
             count += len(set(read_text(path, LARGEST_NUMBERS).splitlines()))
     return count
-
-
-def unstarted_jobs(folders: Iterable[Path], runs: Sequence[Run]) -> int:
-    """Return the number of jobs that sweeps in some folders have not begun.
-
-    Args:
-        runs: all that were begun.
-    """
-    begun = [run.folder.resolve() for run in runs]
-    files = {path.resolve() for folder in folders for path in folder.rglob(SWEEP)}
-    jobs = {path.parent: _jobs_of_sweep(path) for path in sorted(files)}
-    return sum(
-        max(count - sum(folder in run.parents for run in begun), 0)
-        for folder, count in jobs.items()
-    )
-
-
-def _jobs_of_sweep(path: Path) -> int:
-    """Return the number of jobs of the sweep that a file of Hydra is of."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser  # takes 0.1 s
-    from hydra.errors import HydraException
-
-    with file_of_a_run(path, "remove it"):
-        node = read_yaml(path)["hydra"]
-        own = [f"{key}={value}" for key, value in (node["sweeper"].get("params") or {}).items()]
-        try:
-            parsed = OverridesParser.create().parse_overrides([*own, *node["overrides"]["task"]])
-            # A word of the command counts in place of one of the sweep's file.
-            last = {each.key_or_group: each for each in parsed}.values()
-            swept = [each.sweep_iterator() for each in last if each.is_sweep_override()]
-            return math.prod(sum(1 for _ in islice(values, MOST_JOBS)) for values in swept)
-        except HydraException as error:
-            raise ValueError(str(error)) from error
 
 
 def _is_run(config: Path, folder: Path) -> bool:
