@@ -10,7 +10,15 @@ import worlds
 from gymnasium import spaces
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torchrl.data import Unbounded
-from torchrl.envs import PendulumEnv, TensorDictPrimer, Transform, TransformedEnv
+from torchrl.envs import (
+    GymEnv,
+    PendulumEnv,
+    SerialEnv,
+    StepCounter,
+    TensorDictPrimer,
+    Transform,
+    TransformedEnv,
+)
 
 from coil_rl import GymnasiumEnv, NormalisedAction
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -342,3 +350,13 @@ def test_memory_of_a_transform_survives_a_resume():
     check_transform(cones(), RemembersInTheData())
     with pytest.raises(ValueError, match=r"InAnAttribute gives another last in step 1 of a res"):
         check_transform(cones(), RemembersInAnAttribute())
+
+
+def pendulum():
+    return GymEnv("Pendulum-v1")
+
+
+@pytest.mark.parametrize("make", [pendulum, lambda: SerialEnv(2, pendulum)])
+def test_transform_is_not_blamed_for_an_env_that_cannot_be_restored(make):
+    with pytest.warns(UserWarning, match="cannot go on from the middle of an episode"):
+        check_transform(make(), StepCounter())
