@@ -256,6 +256,12 @@ class Guard:
         self.bits, self.same_bits = np.random.MT19937(0), np.random.MT19937(0)
         self.touched, self.count = False, QUICK
 
+    def __deepcopy__(self, memo: Any) -> "Guard":
+        """Return a guard with what foreign code has set; what the process has is not copied."""
+        other = Guard()
+        other.theirs = dict(self.theirs)
+        return other
+
     def whole(self) -> "Guard":
         """Keep in the next block what takes longer, too: where an env or a controller is made."""
         self.count = len(SETTINGS)

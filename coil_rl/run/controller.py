@@ -65,6 +65,17 @@ class Controller:
         self._check_read()
         self.reset()
 
+    def __deepcopy__(self, memo: Any) -> Controller:
+        """Return a controller in an episode of its own, such as for another row of an env.
+
+        The env that only converts is the same.
+        """
+        if isinstance(self.plant, GymnasiumEnv) and self.plant.held.plants[0].controllers:
+            raise ValueError("a policy that reads a controller beside its env cannot be copied")
+        outer = {id(self.env): None, id(self.plant): None}
+        env = TransformedEnv(self.plant, copy.deepcopy(self.env.transform, outer))
+        return Controller(env, copy.deepcopy(self.policy), self.folder, self.which)
+
     def reset(self) -> None:
         """Begin an episode: forget everything."""
         self.past: Past | None = None

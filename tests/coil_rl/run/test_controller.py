@@ -1,5 +1,7 @@
 """What a machine is sent is what an evaluation executes, for every method."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -49,6 +51,12 @@ def check_same(folder):
         controller.reset()
         sent = [controller.act(observation) for observation in observations]
         np.testing.assert_allclose(sent, actions, rtol=0, atol=1e-6)
+    controller.reset()
+    begun = [controller.act(observation) for observation in observations[:2]]
+    of_another_row = copy.deepcopy(controller)
+    begun_there = [of_another_row.act(observation) for observation in observations[:2]]
+    np.testing.assert_allclose([begun, begun_there], [actions[:2]] * 2, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(controller.act(observations[2]), actions[2], rtol=0, atol=1e-6)
     return observations, actions, controller
 
 
