@@ -166,16 +166,19 @@ def check_transform(env: EnvBase, transform: Transform) -> None:
             stacklevel=2,
         )
         return
-    remedy = "keep what it remembers in the data, see Link.state, or in buffers"
     try:
         found = _difference(transformed, unused)
     except Exception as error:
         reason = shortened(f"{type(error).__name__}: {error}")
         raise ValueError(
-            f"{name} cannot go on from its state_dict() in a resumed run ({reason}): {remedy}"
+            f"{name} cannot go on from its state_dict() in a resumed run ({reason}): keep what it "
+            "remembers in the data, see Link.state, or in buffers"
         ) from error
     if found:
-        raise ValueError(f"{name} gives another {found} of a resumed run: {remedy}")
+        raise ValueError(
+            f"{name} gives another {found} of a resumed run: keep what it remembers in the data, "
+            "see Link.state, or in buffers"
+        )
 
 
 def _continues(env: EnvBase) -> bool:
