@@ -18,6 +18,7 @@ from coil_rl.config.parts import env_maker
 
 FILES = shipped("env")
 REPLAYS = ["mcap_replay"]  # of recordings, see config/test_replay.py
+FMU = "fmu"  # of a file, see tests/fmu
 # Envs of other libraries, without tracks and guides.
 OTHERS = {
     "gym": shlex.split("env.id=Pendulum-v1 env.max_steps=12"),
@@ -76,7 +77,7 @@ def trained(env, learner, folder):
 
 
 @pytest.mark.fast(4)
-@pytest.mark.parametrize("env", [file for file in FILES if file not in REPLAYS])
+@pytest.mark.parametrize("env", sorted({*FILES} - {*REPLAYS, FMU}))
 def test_env_takes_steps_with_the_advice_of_its_guide(env):
     """A new YAML file is driven, too. What it cannot do without belongs into OWN or PACKAGES."""
     if env in PACKAGES:
