@@ -12,7 +12,7 @@ from coil_rl.output import decoration, progress, quietly, say
 from coil_rl.run.folder import is_evaluated
 from coil_rl.run.run import Run
 
-BAR = "compare, {desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"  # in trainings
+BAR = "compare, {desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}"  # in trainings
 
 
 def job_name(arm: str, seed: int) -> str:
