@@ -113,7 +113,7 @@ class Session:
 
 @cache
 def _limit_memory() -> None:
-    """Let the sessions of this process that ask for it have `LARGEST_MEMORY` together."""
+    """Limit the shared allocator of onnxruntime, for sessions that use it, to `LARGEST_MEMORY`."""
     import onnxruntime as ort
 
     kind = ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR

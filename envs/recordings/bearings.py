@@ -72,7 +72,9 @@ def bearings(angles: Sequence[Angles], points: NDArray[np.int64]) -> tuple[Float
 
 
 def _decide(angles: Angles, points: int) -> tuple[Angles, str, str]:
-    """Return the angles to take, what is wrong with the given ones, and an example; perhaps empty.
+    """Return usable angles of a scan, and the fault of the given ones with an example.
+
+    The texts of fault and example are empty where nothing is wrong.
 
     Args:
         points: number of its ranges, at least 2.
