@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from coil_rl.files import whole_file
+from coil_rl.output import say
 from coil_rl.report import style
 from coil_rl.report.pictures import Picture
 from coil_rl.report.table import return_format
@@ -72,7 +73,7 @@ class Film(Picture):
     ) -> None:
         """Take a frame of each policy if it is time; see `Picture.watch`.
 
-        The env's `render(row)` returns a picture [height, width, 3], or None if it cannot.
+        The env's `render(row)` returns a picture [height, width, 3], or None if it has none.
         """
         every = self._steps_of_frame(getattr(env, "rate", math.nan))
         for name, row in rows.items():
@@ -80,7 +81,8 @@ class Film(Picture):
             self.steps[name] = steps + 1
             if not self.active or steps % every or len(images) >= self.frames:
                 continue
-            pixels: NDArray[np.uint8] | None = env.render(row)
+            render: Callable[[int], NDArray[np.uint8] | None] | None = getattr(env, "render", None)
+            pixels = None if render is None else render(row)
             if pixels is None:
                 self.whole = False
             else:
@@ -95,7 +97,7 @@ class Film(Picture):
         return 2 if math.isnan(rate) else max(1, round(rate * self.duration / 1000))
 
     def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
-        """Write the animation; nothing if an env gave no frame, or stopped giving them.
+        """Write the animation; say so if an env gives no frame, or stopped giving them.
 
         Args:
             results: the episodes of each policy, the agent last.
@@ -113,6 +115,12 @@ class Film(Picture):
                 columns.append(images)
                 spec = return_format([first["reward"]])
                 captions.append(f"{name}: return {first['reward']:{spec}}")
+        if not whole:
+            say(
+                f"{folder / 'episode.webp'} is not drawn: the env gives no pictures, as an env of "
+                "Gymnasium does with rgb_array among the render_modes of its metadata",
+                error=True,
+            )
         if not (columns and whole):
             return
         frames = _side_by_side(columns, captions)

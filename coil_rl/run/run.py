@@ -372,7 +372,7 @@ class Run:
         """
         if is_evaluated(self.folder):
             self.check_unchanged()
-            say(f"{self.folder} is finished already, and not trained again", error=True)
+            say(f"{self.folder} is finished already, and not trained or drawn again", error=True)
             reward = report_outcome(self.folder)
             self._say_next()
             return reward

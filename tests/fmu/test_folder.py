@@ -9,7 +9,8 @@ from omegaconf import OmegaConf
 
 from coil_rl import UserError, compose_train
 from coil_rl.config import parts, source, trust
-from coil_rl.config.parts import env_maker
+from coil_rl.config.parts import build_pictures, env_maker
+from coil_rl.report import Film
 
 
 def config(file: Path, *words: str) -> Any:
@@ -49,3 +50,13 @@ def test_an_agent_may_observe_all_that_the_env_writes() -> None:
     env = env_maker(composed).bare(2, "test", None)
     keys = parts.observed_keys(composed, env)
     assert keys == ["current", "speed", "speed_setpoint"]
+
+
+def test_a_film_of_an_fmu_is_made_only_where_it_is_asked_for(tmp_path: Path, capsys: Any) -> None:
+    for words, said in ((), ""), (["evaluation.gif=true"], "not drawn: the env gives no pictures"):
+        composed = config(fmus.motor(), *words)
+        [film] = [each for each in build_pictures(composed) if isinstance(each, Film)]
+        film.watch(env_maker(composed).bare(2, "test", None), {"ppo": 0}, None, None)
+        film.draw({}, tmp_path)
+        assert said in capsys.readouterr().err
+        assert film.watches == bool(said)

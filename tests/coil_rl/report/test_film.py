@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
+from torchrl.envs import PendulumEnv
 
+from coil_rl.foreign.torchrl_env import EnvBatch
 from coil_rl.report import Film
 from coil_rl.report.film import CAPTION, GAP
 from coil_rl.run.evaluation import EvaluationResult
@@ -110,13 +112,20 @@ def test_a_second_evaluation_has_a_film_of_its_own(tmp_path):
 
 @pytest.mark.parametrize(
     ("screen", "steps", "active"),
-    [(Screen(None), 5, True), (Screen(), 0, True), (Screen(), 5, False)],
+    [
+        (Screen(None), 5, True),
+        (EnvBatch(PendulumEnv, max_steps=5), 5, True),
+        (Screen(), 0, True),
+        (Screen(), 5, False),
+    ],
 )
-def test_film_of_an_env_that_is_not_drawn_has_no_file(screen, steps, active, tmp_path):
+def test_film_of_an_env_that_is_not_drawn_has_no_file(screen, steps, active, tmp_path, capsys):
     film = filmed(screen, steps, active=active)
     film.draw({"agent": drive()}, tmp_path)
     assert film.watches is active
     assert not list(tmp_path.iterdir())
+    cannot = not (isinstance(screen, Screen) and screen.size)
+    assert ("not drawn: the env gives no pictures" in capsys.readouterr().err) == cannot
 
 
 def test_film_that_would_be_cut_has_no_file(tmp_path):
