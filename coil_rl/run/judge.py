@@ -174,8 +174,8 @@ def judge(
     once with deterministic actions, `trial.repeats` times with sampled ones if it samples, once
     with each advice of `trial.advice` instead of its own. Each of the `drivers` acts once.
 
-    The files are `episodes.csv`, `evaluation.md` (means) and `evaluation.csv`, with which a run is
-    finished, and then pictures. A picture that fails is a warning.
+    The files are `episodes.csv`, `evaluation.md` (means), pictures, and last `evaluation.csv`, with
+    which a run is finished. A picture that fails is a warning.
 
     Args:
         policy: of the run; None for the guides alone.
@@ -198,11 +198,11 @@ def judge(
     record.EPISODES.write(folder, judgement.episodes)
     page = _page(trial, judgement, has_policy=policy is not None, said=said)
     record.PAGE.write(folder, page)
-    table = with_denominators(judgement.table, judgement.counts)
-    record.EVALUATION.write(folder, table)
     for picture in trial.pictures:
         with decoration(f"the picture {type(picture).__name__} in {folder}"):
             picture.draw(judgement.shown, folder)
+    table = with_denominators(judgement.table, judgement.counts)
+    record.EVALUATION.write(folder, table)
     return judgement
 
 

@@ -16,6 +16,7 @@ from coil_rl.config.parts import (
 )
 from coil_rl.errors import UserError
 from coil_rl.report.pictures import Picture
+from coil_rl.run.folder import is_evaluated
 from coil_rl.run.judge import judge, report_outcome
 from coil_rl.run.reasons import about_returns
 
@@ -107,7 +108,8 @@ class Broken(Picture):
             raise TypeError("render() returns floats")
 
     def draw(self, results, folder):
-        assert (folder / "evaluation.csv").exists()
+        assert (folder / "evaluation.md").exists()
+        assert not is_evaluated(folder), "a run that is killed here draws when it goes on"
         if self.place == "draw":
             raise ValueError("no frames")
         (folder / "drawn").touch()
