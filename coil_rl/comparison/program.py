@@ -28,7 +28,7 @@ from coil_rl.config.compose import compose_train, quoted
 from coil_rl.config.messages import sentence
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
-from coil_rl.programs import app, folders, imported
+from coil_rl.programs import app, folders
 
 CONFIG_DIR = ("--config-dir", "-cd")  # of Hydra: a folder with YAML files of the user
 OWN = ("minutes", "folder", "seed", "tune")  # arguments that coil-train does not have
@@ -60,7 +60,6 @@ def compare(arguments: Sequence[str]) -> None:
     others = [argument for argument in arguments if not argument.startswith("folder=")]
     command = shlex.join(["coil-compare", *others, f"folder={place}"])
     given = Named(words, nodes)
-    imported()
     comparison = Comparison(given, place, minutes=float(minutes), seed=seed, command=command)
     try:
         comparison.run()

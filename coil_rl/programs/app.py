@@ -276,7 +276,6 @@ def _do(
         check(config)
         if has_folder:
             make_folder(Path(config.run_dir))
-        programs.imported()
         if signals.received:
             raise KeyboardInterrupt
         return task(config)

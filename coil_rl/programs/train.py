@@ -14,7 +14,7 @@ from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
 from coil_rl.output import quietly, say
-from coil_rl.programs import app, folders, imported, sweeps
+from coil_rl.programs import app, folders, sweeps
 
 # What may be given beside resume=FOLDER.
 BESIDE_RESUME = ("trust=", "budget.frames=", "env.workers=", "changed=")
@@ -74,7 +74,6 @@ def resume(
     from coil_rl.run.folder import is_evaluated, locked
 
     config = read_config(folder, "resume", goes_on=True)
-    imported()
     folder = folder.absolute()
     _refuse_links(folder)
     config.run_dir = str(folder)

@@ -1,7 +1,6 @@
 """`coil-compare` and `coil_rl.compare`: a pendulum, in the smallest trainings there are."""
 
 import csv
-import gc
 import json
 import shlex
 import sys
@@ -288,25 +287,6 @@ def test_comparison_that_wrote_nothing_removes_what_it_made_only(tmp_path, monke
     for name in ("empty", "new/it"):
         called("compare", *PENDULUM, f"folder={tmp_path / name}", code=130)
     assert list(tmp_path.rglob("*")) == [tmp_path / "empty"]
-
-
-@pytest.mark.slow
-def test_garbage_is_collected_while_it_runs(tmp_path, monkeypatch):
-    """Programs collect none during their imports. The env of a training that ended is garbage."""
-    collects = []
-
-    def stopped(*_):
-        collects.append(gc.isenabled())
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(timing, "measure", stopped)
-    gc.disable()
-    try:
-        called("compare", *PENDULUM, f"folder={tmp_path / 'it'}", code=130)
-    finally:
-        gc.enable()
-        gc.unfreeze()
-    assert collects == [True]
 
 
 def test_folder_that_is_a_file_is_said_to_be_one(tmp_path):

@@ -63,6 +63,21 @@ def test_wrong_override_is_refused_without_heavy_imports(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_programs_collect_garbage_from_the_start_but_seldom():
+    """The env of a training that ended is garbage, and so is nothing of the imports."""
+    script = (
+        "import gc, sys\n"
+        "sys.argv = ['coil-compare']\n"
+        "import coil_rl.programs\n"
+        "print(gc.isenabled(), gc.get_threshold()[0] >= 10_000)\n"
+    )
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(
+        command, env=environment(ROOT), capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["True", "True"]
+
+
 @pytest.mark.slow
 def test_training_imports_no_library_that_it_does_not_use():
     """Each of these takes half a second or more in every training, and is for something else."""
