@@ -132,7 +132,15 @@ class NormalisedAction(Link):
         env = self.parent
         if env is None:
             raise RuntimeError("NormalisedAction needs an env: use it in a TransformedEnv")
-        return units_of(env.full_action_spec[self.action_key], env.batch_dims)
+        units = units_of(env.full_action_spec[self.action_key], env.batch_dims)
+        links = (each for each in env.modules() if isinstance(each, Link))
+        before = [type(each).__name__ for each in links if hasattr(each, "action_key")]
+        if before and units is not None and not units.identity:
+            raise ValueError(
+                f"NormalisedAction is behind {before[0]}, whose actions would be in another unit; "
+                "place it first, next to the env"
+            )
+        return units
 
     def act(self, data: TensorDictBase, state: State) -> State:
         """Write the action in the unit of the env."""

@@ -192,9 +192,14 @@ def test_action_beyond_the_bounds_counts_as_the_bound_in_any_unit(low, high, nor
     assert float(after["guide_distance"]) == 0
 
 
-def test_normalised_action_outside_an_env_says_so():
+def test_normalised_action_outside_an_env_or_behind_advice_says_so():
     with pytest.raises(RuntimeError, match="NormalisedAction needs an env"):
         NormalisedAction().units  # noqa: B018
+    followed(advised(box([-1], [1]), ConstantGuide([0.5]), NormalisedAction(), normalised=False))
+    with pytest.raises(ValueError, match="NormalisedAction is behind GuideActions, whose actions"):
+        followed(
+            advised(box([-2], [2]), ConstantGuide([0.5]), NormalisedAction(), normalised=False)
+        )
 
 
 def test_values_of_choices_are_in_the_unit_of_the_env():
