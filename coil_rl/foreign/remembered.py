@@ -7,10 +7,14 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
 OF_TORCH = frozenset(vars(nn.Module()))
+# What numbers of NumPy are made of. They keep their types, as float32 goes on in another way.
+OF_NUMPY: list[Any] = [np.dtype, np.float64(0).__reduce__()[0]]
+OF_NUMPY += {type(np.dtype(each)) for each in "?bhilqBHILQefdg"}
 
 
 def maker_of_rows(thing: Any) -> partial[Any]:
@@ -55,14 +59,20 @@ def _plain(network: nn.Module) -> Iterator[tuple[tuple[str, str], Any]]:
 
 
 def copied(value: Any) -> Any:
-    """Return a value as a checkpoint gives it back; what it cannot hold is an `UnpicklingError`.
-
-    It is loaded without running code from the file.
-    """
+    """Return a value as a checkpoint gives it back; what it cannot hold is an `UnpicklingError`."""
     file = io.BytesIO()
     torch.save(value, file)
     file.seek(0)
-    return torch.load(file, weights_only=True)
+    return loaded(file)
+
+
+def loaded(file: io.BytesIO, device: str | None = None) -> Any:
+    """Return what `torch.save` wrote, without running code from the file.
+
+    These are the plain values of torch, and numbers of NumPy.
+    """
+    with torch.serialization.safe_globals(OF_NUMPY):
+        return torch.load(file, map_location=device, weights_only=True)
 
 
 def _is_same(value: Any, other: Any) -> bool:

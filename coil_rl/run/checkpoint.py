@@ -13,6 +13,7 @@ from torch import Tensor
 
 from coil_rl.errors import UserError
 from coil_rl.files import folder_to_disk, read_file, whole_file
+from coil_rl.foreign.remembered import loaded
 from coil_rl.output import say
 
 NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint_previous.pt"
@@ -51,7 +52,7 @@ def load(path: Path, device: str = "cpu") -> Any:
         raise UserError(f"{path} is damaged: its checksum is wrong; train again or use another")
     try:
         _check_archive(content)
-        return torch.load(io.BytesIO(content), map_location=device, weights_only=True)
+        return loaded(io.BytesIO(content), device)
     except Exception as error:
         raise UserError(
             f"{path} is damaged ({type(error).__name__}); train again or use another"

@@ -22,6 +22,7 @@ from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.host import Predictor, role_of
 from coil_rl.guides import ControllerGuide, FollowAdvice, PerRow
 from coil_rl.learners import PPO
+from coil_rl.run import checkpoint
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
@@ -212,6 +213,25 @@ def test_state_that_a_checkpoint_cannot_hold_is_refused():
         match=r"state_dict\(\) of the controller Stateful may hold numbers, .*; convert NumPy",
     ):
         env.state_dict()
+
+
+def test_numbers_of_numpy_come_back_as_they_were(tmp_path):
+    values = [np.float64(0.1), np.float32(0.1), np.int64(3), np.bool_(True), 0.1]
+
+    class Stateful(Stateless):
+        def state_dict(self):
+            return {"values": getattr(self, "values", values)}
+
+        def load_state_dict(self, state):
+            self.values = state["values"]
+
+    guide = PerRow(Stateful)
+    env = cones(guide, cars=2)
+    env.rollout(2)
+    checkpoint.save(env.state_dict(), tmp_path / "state.pt")
+    env.load_state_dict(checkpoint.load(tmp_path / "state.pt"))
+    found = guide.hosts[1].thing.values
+    assert [(type(each), each) for each in found] == [(type(each), each) for each in values]
 
 
 def test_new_episodes_begin_if_a_controller_cannot_save_its_state():
