@@ -4,6 +4,7 @@ A terminal may be closed, a disk full, and a picture is drawn by the code of an 
 not depend on any of them.
 """
 
+import math
 import sys
 import textwrap
 import warnings
@@ -16,6 +17,8 @@ from typing import Any
 from tqdm import tqdm
 
 from coil_rl.errors import NO_SPACE
+
+LINE_EVERY = 60.0  # s, of a progress bar in a file
 
 
 class SafeStream:
@@ -83,18 +86,36 @@ def quietly(*, bars: bool = False) -> Iterator[None]:
         _quiet.reset(before)
 
 
+class Lines(tqdm):  # type: ignore[type-arg]
+    """A progress bar in a file: a plain line a minute, and one at the end of a bar that stays."""
+
+    last_print_t = math.inf  # nothing at the beginning
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> bool:
+        """Write a line if it is due; tqdm ends the last one."""
+        if msg is None and (self.disable or self._time() - self.last_print_t >= self.mininterval):
+            self.fp.write(f"{self}{'' if self.disable else chr(10)}")
+        return False
+
+
 def progress(**options: Any) -> "tqdm[Any]":
-    """Return a progress bar on standard error, or in a notebook; `options` are those of tqdm."""
+    """Return a progress bar on standard error, or in a notebook.
+
+    `options` are those of tqdm; a file gets plain lines.
+    """
     if _quiet.get() == "all":
         options["disable"] = True
+    stream = SafeStream(sys.stderr)
     if "ipykernel" not in sys.modules:
-        return tqdm(file=SafeStream(sys.stderr), **options)
+        if stream.isatty():
+            return tqdm(file=stream, **options)
+        return Lines(file=stream, **options | {"mininterval": LINE_EVERY})
     if find_spec("ipywidgets") is not None:
         from tqdm.notebook import tqdm as widget
 
         return widget(**options)
     # One line for all bars: codes that move a cursor are letters in a notebook.
-    return tqdm(file=SafeStream(sys.stderr), **options | {"position": 0, "mininterval": 1.0})
+    return tqdm(file=stream, **options | {"position": 0, "mininterval": 1.0})
 
 
 def say(text: str, *, error: bool = False) -> None:

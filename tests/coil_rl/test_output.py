@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from coil_rl import output
 from coil_rl.output import SafeStream, decoration, progress, quietly, say
 from coil_rl.run.metrics import Metrics
 
@@ -90,6 +91,23 @@ def test_bars_may_be_shown_where_nothing_is_said(capsys):
             say("said")
     out, error = capsys.readouterr()
     assert (out, "0/1" in error) == ("", True)
+
+
+def test_bar_in_a_file_is_a_line_now_and_then(monkeypatch, capsys):
+    monkeypatch.setattr(output, "LINE_EVERY", 0.0)
+    with progress(total=2, desc="train") as bar, progress(desc="test", leave=False) as inner:
+        bar.set_postfix(training="1")
+        inner.update()
+    monkeypatch.setattr(output, "LINE_EVERY", 60.0)
+    with progress(total=3, desc="quiet") as bar, progress(desc="test", leave=False) as inner:
+        for _ in range(3):
+            bar.update()
+            inner.update()
+    error = capsys.readouterr().err
+    lines = error.splitlines()
+    assert not {"\r", "\x1b"} & {*error}
+    assert [line.partition(":")[0] for line in lines] == ["train", "test", "train", "quiet"]
+    assert lines[-1].startswith("quiet: 100%")
 
 
 def test_nothing_is_shown_quietly(capsys):
