@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from coil_rl.report.statistics import holm as holm
     from coil_rl.report.statistics import wins as wins
     from coil_rl.report.table import markdown_table as markdown_table
+    from coil_rl.report.table import p_text as p_text
     from coil_rl.report.table import write_csv as write_csv
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -118,8 +118,8 @@ def guide_training(runs: Sequence[Run]) -> list[Table]:
     return [Table(rows, columns)] if rows else []
 
 
-def training(runs: Sequence[Run]) -> list[Table]:
-    """Return the table of evaluation curves, means over seeds.
+def training(runs: Sequence[Run]) -> list[Block]:
+    """Return the table of evaluation curves, means over seeds, and why frames differ if they do.
 
     The list is empty if nothing was trained.
     """
@@ -140,7 +140,8 @@ def training(runs: Sequence[Run]) -> list[Table]:
         key: (heading, spec if each == AUTO_FORMAT else each)
         for key, (heading, each) in TABLES["learning"]["columns"].items()
     }
-    return [Table(rows, columns)] if rows else []
+    differ = len({row["frames"] for row in rows}) > 1
+    return [Table(rows, columns), *REPORT.said("frames", differ=differ)] if rows else []
 
 
 def _mean_of_some(

@@ -87,6 +87,8 @@ OWN = {
     "jump_start": Stroke(AGENTS[6]),
     "residual_coil": Stroke(AGENTS[7]),
     "tune": Stroke(AGENTS[8]),
+    "sac": Stroke(AGENTS[9]),
+    "coil_anchored_sac": Stroke(AGENTS[1], SECOND_ROUND),
 }
 
 

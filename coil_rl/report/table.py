@@ -19,6 +19,7 @@ from coil_rl.record import csv_text, plain
 TABLES: Any = yaml.safe_load((resources.files("coil_rl.conf") / "tables.yaml").read_text("utf-8"))
 
 AUTO_FORMAT = "auto"  # of a column whose unit is that of the env: as its numbers need
+P_FORMAT = "p"  # of a p-value, see `p_text`
 
 Rows = Sequence[Mapping[str, object]]
 Columns = Mapping[str, Sequence[str]]
@@ -42,6 +43,11 @@ def return_format(returns: Iterable[float]) -> str:
     # From the text, in which 9.999 is 1.00e+01.
     exponent = int(f"{largest:.2e}".partition("e")[2])
     return f".{max(1, 2 - exponent)}f" if exponent >= -4 else ".2e"
+
+
+def p_text(p: float) -> str:
+    """Return a p-value with three decimals, which are never all 0."""
+    return f"{p:.3f}" if p >= 0.001 else "< 0.001"
 
 
 class Cell(NamedTuple):
@@ -193,7 +199,8 @@ def _numeric(values: Sequence[Sequence[object]]) -> list[bool]:
 def _latex(text: str) -> str:
     """Return a text as LaTeX shows it."""
     escaped = re.sub(r"([&%$#_{}])", r"\\\1", text.replace("\\", r"\textbackslash "))
-    return escaped.replace("~", r"\textasciitilde ").replace("^", r"\textasciicircum ")
+    escaped = escaped.replace("~", r"\textasciitilde ").replace("^", r"\textasciicircum ")
+    return escaped.replace("<", r"\textless ")
 
 
 def _escaped(text: str) -> str:
@@ -226,5 +233,5 @@ def _format(value: object, spec: str) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if _is_number(value):
-        return format(value, spec)
+        return p_text(value) if spec == P_FORMAT else format(value, spec)
     return " ".join(str(value).split())

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from coil_paper.reproduce.result import PAGES
-from coil_rl.report import SIGN_FLIP_SEEDS, Estimate, Run, holm, markdown_table
+from coil_rl.report import SIGN_FLIP_SEEDS, Estimate, Run, holm, markdown_table, p_text
 
 CLAIMS_HEADING = "### What held up"
 SIGNIFICANT = 0.05
@@ -48,7 +48,7 @@ class Claim(NamedTuple):
             word = "did not hold up"
         seeds = "1 seed" if self.estimate.seeds == 1 else f"{self.estimate.seeds} seeds"
         verdict = f"**{word}**: {number}, {seeds}"
-        return verdict if math.isnan(p) else f"{verdict}, p {p:.3f}"
+        return verdict if math.isnan(p) else f"{verdict}, p {p_text(p)}"
 
 
 def certain_verdict(holds: bool, details: str) -> str:

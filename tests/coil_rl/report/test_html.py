@@ -132,12 +132,13 @@ def test_file_that_is_no_picture_is_refused(tmp_path):
 
 
 def test_method_has_one_colour_in_all_pictures():
-    alone = {name: style.strong_strokes([name])[name] for name in ("coil", "ppo", "kickstart")}
-    together = style.strong_strokes(["kickstart", "mine", "ppo", "coil"])
+    names = ("coil", "ppo", "kickstart", "sac", "coil_anchored_sac")
+    alone = {name: style.strong_strokes([name])[name] for name in names}
+    together = style.strong_strokes(["mine", *reversed(names)])
     for name, stroke in alone.items():
         assert together[name] == stroke
         assert style.strokes(["guide", name])[name] == stroke
-    assert len({stroke.colour for stroke in together.values()}) == 4
+    assert len({stroke.colour for stroke in together.values()}) == len(together)
 
 
 def test_variants_of_a_method_have_its_colour_and_other_dashes():

@@ -72,6 +72,7 @@ def test_results_md_has_the_claims_the_pages_and_the_missing_results():
         ),
         ((-1.5, -2.0, -1.0, 3), -1, 0.01, "**held up**: -1.5 (-2.0 to -1.0), 3 seeds, p 0.010"),
         ((1.5, 1.0, 2.0, 3), 1, 0.06, "**undecided**: +1.5 (+1.0 to +2.0), 3 seeds, p 0.060"),
+        ((1.5, 1.0, 2.0, 3), 1, 0.0, "**held up**: +1.5 (+1.0 to +2.0), 3 seeds, p < 0.001"),
         ((2.0,), 1, math.nan, "**undecided**: +2.0, 1 seed"),
         ((math.nan,), 1, math.nan, None),
     ],
