@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib.util import find_spec
+from time import time
 from typing import Any
 
 from tqdm import tqdm
@@ -86,16 +87,15 @@ def quietly(*, bars: bool = False) -> Iterator[None]:
         _quiet.reset(before)
 
 
-class Lines(tqdm):  # type: ignore[type-arg]
+class Lines(tqdm):
     """A progress bar in a file: a plain line a minute, and one at the end of a bar that stays."""
 
     last_print_t = math.inf  # nothing at the beginning
 
-    def display(self, msg: str | None = None, pos: int | None = None) -> bool:
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
         """Write a line if it is due; tqdm ends the last one."""
-        if msg is None and (self.disable or self._time() - self.last_print_t >= self.mininterval):
+        if msg is None and (self.disable or time() - self.last_print_t >= self.mininterval):
             self.fp.write(f"{self}{'' if self.disable else chr(10)}")
-        return False
 
 
 def progress(**options: Any) -> "tqdm[Any]":
