@@ -15,13 +15,18 @@ from torchrl.data import Binary, Categorical, MultiCategorical, TensorSpec, Unbo
 from torchrl.envs import EnvBase, InitTracker, TensorDictPrimer, Transform
 from torchrl.modules import MLP, ConvNet
 
-from coil_rl.learners.activations import ACTIVATIONS, ORTHOGONAL
 from coil_rl.ranges import Interval, Len, checked
 from coil_rl.transforms.action_space import written_key
 
 Width = Annotated[int, Interval(ge=1, le=4096)]
 Hidden = Annotated[Sequence[Width], Len(0, 16)]
-Activation = Literal["tanh", "relu", "elu", "silu", "fast_tanh"]
+Activation = Literal["tanh", "relu", "elu", "silu"]
+ACTIVATIONS: Mapping[Activation, type[nn.Module]] = {
+    "tanh": nn.Tanh,
+    "relu": nn.ReLU,
+    "elu": nn.ELU,
+    "silu": nn.SiLU,
+}
 Shapes = Mapping[NestedKey, torch.Size]
 ADDED = ("episode_reward", "task_reward", "limit_count")  # entries that no env has by itself
 STATE = "policy_state"  # what an env carries for a network with a memory
@@ -184,7 +189,7 @@ class Mlp:
 
     Args:
         hidden: widths of the hidden layers.
-        activation: tanh, relu, elu, silu or fast_tanh, see `FastTanh`.
+        activation: tanh, relu, elu or silu.
         layer_norm: whether the numbers of a hidden layer are normalised before its activation.
     """
 
@@ -196,7 +201,6 @@ class Mlp:
         self, inputs: int, outputs: int, gain: float, device: torch.device | None = None
     ) -> MLP:
         """Return the layers after it; `gain` scales the initial weights of the last one."""
-        activation = ACTIVATIONS[self.activation]
         norm: dict[str, Any] = {}
         if self.layer_norm:
             norm = {
@@ -207,11 +211,11 @@ class Mlp:
             inputs,
             outputs,
             num_cells=list(self.hidden),
-            activation_class=activation,
+            activation_class=ACTIVATIONS[self.activation],
             device=device,
             **norm,
         )
-        if activation in ORTHOGONAL:
+        if self.activation == "tanh":
             linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
             for layer in linear:
                 nn.init.orthogonal_(layer.weight, gain if layer is linear[-1] else 2**0.5)
