@@ -25,6 +25,7 @@ T = TypeVar("T")
 Row = dict[str, Any]  # of a table
 
 MOST_MEANS = 50_000  # rows of an evaluation that a report can be made of
+MOST_DRIVERS = 200  # in it, with all kinds of advice and actions
 DRIVER = ("driver", "advice", "actions", "case")  # columns of the tables of episodes: texts
 UNTESTED = "last_untested"  # in `Delivery`: the last policy, as no frames were left for a test
 
@@ -144,7 +145,7 @@ def means(content: bytes) -> list[Row]:
 
     Raises:
         ValueError: for two rows of one driver in the same case, for a return that is infinite, for
-            more than `MOST_MEANS` rows, and for none.
+            more than `MOST_MEANS` rows or `MOST_DRIVERS` drivers, and for none.
     """
     rows: list[Row] = []
     for line in table(content):
@@ -152,6 +153,9 @@ def means(content: bytes) -> list[Row]:
         rows.append(cells | {name: float(line[name]) for name in line if name not in cells})
     if not 0 < len(rows) <= MOST_MEANS:
         raise ValueError(f"{len(rows):,} rows, not 1 to {MOST_MEANS:,}")
+    drivers = len({tuple(row[name] for name in DRIVER[:3]) for row in rows})
+    if drivers > MOST_DRIVERS:
+        raise ValueError(f"{drivers:,} drivers, not 1 to {MOST_DRIVERS}")
     if any(math.isinf(row["reward"]) for row in rows):
         raise ValueError("a return that is infinite")
     if len({tuple(row[name] for name in DRIVER) for row in rows}) < len(rows):

@@ -61,7 +61,7 @@ class Group:
         """Name and modification of the advice."""
         return f"{self.name}, {self.advice}" if self.advice else self.name
 
-    @property
+    @cached_property
     def cases(self) -> tuple[str, ...]:
         """Names of the cases."""
         return tuple(self.table.index.unique("case"))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -66,7 +67,8 @@ class Guide:
 
 def is_guide(frame: pd.DataFrame) -> pd.Series:
     """Return whether the policy of each row of an evaluation is a guide."""
-    return frame["driver"].str.split().str[0] == GUIDE
+    drivers = frame["driver"]
+    return drivers.isin([name for name in drivers.unique() if name.split()[:1] == [GUIDE]])
 
 
 def shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[Guide]:
@@ -164,11 +166,13 @@ def _numbered(
     different: list[pd.DataFrame] = []
     for label, seed, table in tables:
         for name, rows in table[is_guide(table)].groupby("driver", sort=False):
-            equal = (place for place, each in enumerate(different) if _is_same(each, rows))
+            of_name = numbers.setdefault(str(name), {})
+            known = dict.fromkeys(chain.from_iterable(each.values() for each in of_name.values()))
+            equal = (number for number in known if _is_same(different[number], rows))
             number = next(equal, len(different))
             if number == len(different):
                 different.append(rows)
-            numbers.setdefault(str(name), {}).setdefault(label, {})[seed] = number
+            of_name.setdefault(label, {})[seed] = number
     return numbers, different
 
 

@@ -5,6 +5,7 @@ import json
 import pytest
 from run_folders import driven, make_run
 
+from coil_rl.report import guides
 from coil_rl.report.configurations import guide_follows_seed
 from coil_rl.report.guides import of_changed_guides, of_guides_of_labels
 from coil_rl.report.runs import read_runs
@@ -42,6 +43,15 @@ def test_each_guide_and_each_label_with_such_runs_is_named(runs):
     assert "(coil seeds 0 / 1; ppo seeds 0, 3 / 1)" in first
     assert "The guide has" in second
     assert "(sac seeds 4 / 5)" in second
+
+
+def test_evaluations_are_compared_with_those_of_the_same_guide_only(runs, monkeypatch):
+    asked = []
+    monkeypatch.setattr(guides, "_is_same", lambda *both: asked.append(both) or False)
+    for number in range(8):
+        found = runs({0: 1.0, 1: 2.0}, f"label{number}", name=f"guide g{number}")
+    assert len(of_changed_guides(found)) == 8
+    assert len(asked) == 8
 
 
 def test_many_seeds_are_shortened(runs):

@@ -76,6 +76,12 @@ ROW = (
             r"is damaged \(No columns.*\); remove the file and write it again by coil-train",
         ),
         ("evaluation.csv", ROW.splitlines()[0] + "\n", r"is damaged \(0 rows, not 1 to 50,000\)"),
+        (
+            "evaluation.csv",
+            ROW.splitlines()[0]
+            + "".join(f"\nguide {n},,deterministic,a,1,1,1,1,1,1" for n in range(201)),
+            r"is damaged \(201 drivers, not 1 to 200\)",
+        ),
         ("evaluation.csv", "driver,actions\nguide,sampled\n", r"is damaged \(it lacks advice\)"),
         (
             "evaluation.csv",
