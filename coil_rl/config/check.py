@@ -83,7 +83,10 @@ def check(config: DictConfig) -> None:
 
 
 def _check_kind(config: DictConfig) -> None:
-    """Raise a `UserError` if the learner is of another kind than the method needs."""
+    """Raise a `UserError` if the learner is of another kind than the method needs.
+
+    So it is for arguments that it does not take, before an env is made, which may take long.
+    """
     kind, needed = parts.learner_kind(config), config.method.learner
     if kind != needed:
         purpose, example = KINDS[needed]
@@ -92,6 +95,8 @@ def _check_kind(config: DictConfig) -> None:
             f"method={config.method.name} needs a learner that {purpose}, such as "
             f"learner={example}, but {learner} is one that {KINDS[kind][0]}"
         )
+    node: Any = OmegaConf.to_container(config.learner, resolve=True, throw_on_missing=True)
+    check_node({**node, "_partial_": True}, "learner")  # the program adds the others
 
 
 def _check_own_run(config: DictConfig) -> None:

@@ -41,6 +41,8 @@ from coil_rl.plain_yaml import entries
 CORE = "coil_rl.conf"  # the package of our own files, and the group of the entry points
 
 
+WRITTEN: dict[str, str] = {}  # the file of a user by the key that it gives, of the last composition
+
 REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
 
 
@@ -100,6 +102,7 @@ def keep_written(
                 f"{text} chooses several files of a group that takes one; for a run with each "
                 f"write -m {group}={value.strip('[]')}"
             )
+    WRITTEN.clear()
     places = [f"{place.schema}://{place.path}" for place in hydra.runtime.config_sources]
     # To look for files of users takes as long as to compose all files.
     if all(place.startswith(shipped_places()) for place in places):
@@ -109,7 +112,8 @@ def keep_written(
     # A choice of a file, such as method=coil, gives no value.
     typed = [key for key in map(key_of, task) if key not in groups]
     with open_dict(config):
-        for key, value in _written(defaults, places):
+        for key, value, file in _written(defaults, places):
+            WRITTEN[key] = file
             if not any(covers(each, key) for each in typed):
                 OmegaConf.update(config, key, value, merge=False, force_add=True)
 
@@ -138,8 +142,8 @@ def covers(one: str, other: str) -> bool:
     return one == other or other.startswith(f"{one}.") or one.startswith(f"{other}.")
 
 
-def _written(defaults: Iterable[Any], places: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    """Yield the values in the files of users by their full keys, in the order of composition.
+def _written(defaults: Iterable[Any], places: Sequence[str]) -> Iterator[tuple[str, Any, str]]:
+    """Yield full key, value and file of what users' files give, in the order of composition.
 
     Args:
         defaults: Hydra's defaults list.
@@ -155,7 +159,7 @@ def _written(defaults: Iterable[Any], places: Sequence[str]) -> Iterator[tuple[s
         for key, _, value in entries(values, default.package or ""):
             is_node = isinstance(value, Mapping)
             if not is_node and key.partition(".")[0] not in ("hydra", "defaults"):
-                yield key, value
+                yield key, value, name
 
 
 def _file(place: str, name: str) -> Traversable:

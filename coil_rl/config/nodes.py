@@ -18,6 +18,7 @@ from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
 from torchrl.envs import Transform
 
+from coil_rl.config.compose import WRITTEN
 from coil_rl.config.messages import similar
 from coil_rl.errors import UserError
 from coil_rl.ranges import adapter, settings_of, validation_message, yaml_text
@@ -174,8 +175,10 @@ def check_arguments(
     for key in sorted(given.keys() - known):
         if not accepts_any or key.startswith("_"):
             takes = ", ".join(known) or "nothing"
+            file = WRITTEN.get(f"{name}.{key}")
             raise UserError(
-                f"{name}: {title} takes no {key}; it takes {takes}{similar(key, known)}"
+                f"{f'{file}: ' if file else ''}{name}: {title} takes no {key}; it takes {takes}"
+                f"{similar(key, known)}"
             )
     missing = [
         key for key, p in known.items() if p.default is p.empty and key not in {*given, *program}

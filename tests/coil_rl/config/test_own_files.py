@@ -12,6 +12,10 @@ FILES = {
         "needs_guide, learner, run; did you mean transforms?",
     ),
     "method/d": ("# @package _global_\nmethod: {name: d}", "observes into method/d.yaml"),
+    "method/f": (
+        "# @package _global_\ndefaults: [ppo]\nlearner: {anchr: null}",
+        "method/f.yaml: learner: PPO takes no anchr; it takes ",
+    ),
     "experiment/e": (
         "defaults: [override /env: pendulum]",
         "experiment/e.yaml: begin the file with the line # @package _global_",
