@@ -7,6 +7,7 @@ The types of the fields are checked by OmegaConf, their ranges by pydantic
 import hashlib
 import json
 import os
+import re
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Annotated, Any
@@ -316,6 +317,10 @@ OmegaConf.register_new_resolver("minibatches", minibatches, replace=True)
 # Keys of a table in a label: ${names:${degrade},intact}
 OmegaConf.register_new_resolver(
     "names", lambda table, none: "_".join(map(str, table)) or none, replace=True
+)
+# ${file_name:${env.id}}
+OmegaConf.register_new_resolver(
+    "file_name", lambda text: re.sub(r"[^\w.-]+", "_", str(text)), replace=True
 )
 # ${label}_seed${seed}_${fingerprint:}
 OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)
