@@ -226,6 +226,7 @@ METRICS = File("metrics.csv", curve, PUT_BACK, LARGEST_TABLE)
 EPISODES = File("episodes.csv", table, AGAIN, LARGEST_TABLE, csv_text)
 EVALUATION = File("evaluation.csv", means, AGAIN, LARGEST_TABLE, csv_text)
 PAGE = File("evaluation.md", _text, AGAIN)
+TUNED = json_file("tuned.json", dict[str, float], PUT_BACK)  # numbers of the guide
 DELIVERY = json_file("delivery.json", Delivery, "remove it, and the sentence is left out")
 GUIDE_RETURNS = json_file(
     "guide_return.json", dict[str, float], "remove it, and the run measures it again"

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from coil_rl import record
 from coil_rl.comparison.arms import GUIDE, OPPOSITE, TUNE, ZERO
 from coil_rl.comparison.baselines import NAME, action_words, read_baselines
 from coil_rl.comparison.entry import ZERO_ACTIONS, Entry
 from coil_rl.report.curves import points
 from coil_rl.report.runs import RETURN, Run, read_runs
 from coil_rl.run.reasons import POLICIES, still_rising
-from coil_rl.tune.run import TUNED
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def tuned_numbers(runs: Sequence[Run]) -> str:
     Args:
         runs: of one arm; nothing is returned if they tuned nothing.
     """
-    read = [TUNED.read(run.folder) for run in runs]
+    read = [record.TUNED.read(run.folder) for run in runs]
     found = [numbers for numbers in read if numbers is not None]
     texts = []
     for name in found[0] if found else ():

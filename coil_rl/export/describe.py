@@ -68,7 +68,7 @@ def describe(
         "outputs": [_action(plant, step, known)],
         "state": [_state(entry) for entry in step.state],
         "reset": EACH_EPISODE if step.state else "The policy remembers nothing between two steps.",
-        "guide": _guide(step, outside),
+        "guide": _guide(run, step, outside),
         "inside": _inside(step),
         "parity": {
             "observations": parity.observations,
@@ -234,12 +234,15 @@ def _state(entry: Entry) -> dict[str, Any]:
     }
 
 
-def _guide(step: PolicyStep, outside: str | None) -> dict[str, Any]:
+def _guide(run: Run, step: PolicyStep, outside: str | None) -> dict[str, Any]:
     if not step.guides:
         return {"place": "absent"}
+    given, tuned = run.settings.get("guide") or {}, record.TUNED.read(run.folder)
+    settings = {name: given[name] for name in step.guides if name in given}
+    about = {"names": step.guides, "settings": settings} | ({"tuned": tuned} if tuned else {})
     if outside is None:
-        return {"place": "inside", "names": step.guides}
-    return {"place": "outside", "names": step.guides, "key": ADVICE, "reason": outside}
+        return {"place": "inside", **about}
+    return {"place": "outside", **about, "key": ADVICE, "reason": outside}
 
 
 def _inside(step: PolicyStep) -> list[str]:

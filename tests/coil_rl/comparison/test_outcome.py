@@ -2,16 +2,16 @@
 
 import json
 
+from coil_rl import record
 from coil_rl.comparison.outcome import tuned_numbers
 from coil_rl.report.runs import Run
-from coil_rl.tune.run import TUNED
 
 
 def run_with(folder, seed, **numbers):
     place = folder / f"tune_seed{seed}"
     place.mkdir()
     if numbers:
-        (place / TUNED.name).write_text(json.dumps(numbers))
+        (place / record.TUNED.name).write_text(json.dumps(numbers))
     return Run(place, "tune", seed, needs_guide=True, settings={})
 
 

@@ -47,7 +47,9 @@ def test_contract_says_what_the_numbers_mean(exported):
     assert action["meaning"] == "torque, N m"
     assert action["bounds"] == {"low": [-2.0], "high": [2.0]}
     assert contract["env"]["control_rate"]["value"] == 30
-    assert contract["guide"] == {"place": "inside", "names": ["swing_up"]}
+    guide = contract["guide"]
+    assert (guide["place"], guide["names"]) == ("inside", ["swing_up"])
+    assert guide["settings"]["swing_up"]["controller"] == "swing_up"
     assert any("scale of the action" in sentence for sentence in contract["inside"])
     assert [row["driver"] for row in contract["results"]] == ["guide", "coil", "coil"]
     assert contract["parity"]["largest_difference"] < 2e-5

@@ -57,7 +57,9 @@ def rooms(count=12):
 def test_torch_guide_with_memory_is_inside(tmp_path):
     guide = "thermostat.control:BatchedPI"
     run, policy = exported(tmp_path, "coil", "learner.normalise=true", guide=guide)
-    assert policy.contract["guide"] == {"place": "inside", "names": ["controller"]}
+    found = policy.contract["guide"]
+    assert (found["place"], found["names"]) == ("inside", ["controller"])
+    assert found["settings"]["controller"]["of"] == guide
     assert [entry["name"] for entry in policy.contract["inputs"]] == ["observation"]
     states = [entry["input"] for entry in policy.contract["state"]]
     assert states == [
@@ -133,6 +135,7 @@ def test_every_method_is_exported(method, tmp_path):
     # The guides that dynamic COIL learns are networks of the policy itself.
     without = method == "ppo" or method.startswith("dynamic_coil")
     assert policy.contract["guide"]["place"] == ("absent" if without else "inside")
+    assert ("tuned" in policy.contract["guide"]) == (method == "tune")
     same_actions(run, policy, rooms())
 
 
