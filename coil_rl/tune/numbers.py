@@ -240,7 +240,7 @@ class GuideWithNumbers:
         name = f"guide.{self.name}"
         before, after = leaves(self.node), leaves(with_numbers(self.node, name, values))
         return [
-            f"++{name}.{key}={yaml_text(value)}"
+            f"{'' if key in before else '+'}{name}.{key}={yaml_text(value)}"
             for key, value in after.items()
             if key not in before or before[key] != value
         ]

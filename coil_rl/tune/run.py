@@ -36,7 +36,6 @@ from coil_rl.run.stopping import STOP
 from coil_rl.tune.candidates import Candidates
 from coil_rl.tune.search import BEST, MEAN, OWN, MakeGuide, Number, Search, Tuner, Values, chosen
 
-TUNED = record.json_file("tuned.json", dict[str, float], PUT_BACK)  # numbers of the guide
 NAMES = {OWN: "guide", MEAN: "tuned", BEST: "best_candidate"}  # in delivery.json
 
 
@@ -73,7 +72,8 @@ class TunedRun(Run):
         """
         if read_tuned(self.folder, self.numbers) is None:
             raise UserError(
-                f"{self.folder} has no {TUNED.name} yet; finish it with {self.resume_command}"
+                f"{self.folder} has no {record.TUNED.name} yet; finish it with "
+                f"{self.resume_command}"
             )
         return self._loaded(GuideActs(env), env, which)
 
@@ -118,17 +118,23 @@ class TunedRun(Run):
     def _say_next(self) -> None:
         """Print what usually follows: a training with the guide itself, faster than this run."""
         values = read_tuned(self.folder, self.numbers) or {}
-        tuned = self.words(values)
+        tuned = [*self.words(values)]
         if self.in_python:
-            numbers = ", ".join(f"{name}={value:.6g}" for name, value in values.items())
+            each = (f"{name}={str(value).removesuffix('.0')}" for name, value in values.items())
+            numbers = ", ".join(each)
             guide = f"guide=functools.partial(GUIDE, {numbers})"
-            if not all(word.startswith("++guide.controller.") for word in tuned):
+            if not all(word.lstrip("+").startswith("guide.controller.") for word in tuned):
                 guide = f"guide=GUIDE, overrides={tuned}"  # a guide of this package has a name
             say(f"Next: coil_rl.train(ENV, {guide})")
             return
         typed = [*self.command] or record.COMMAND.read(self.folder) or ["coil-train"]
         own = ["method=", "method.run.", "tune=", "tune.", "label=", "run_dir=", "existing="]
-        own += [f"{word.lstrip('+').partition('=')[0]}=" for word in tuned]
+        # A number that was added on the command line is in no file, so that it is added again.
+        given = {word.lstrip("+").partition("=")[0]: word.partition("=")[0] for word in typed}
+        for index, word in enumerate(tuned):
+            key, equals, value = word.lstrip("+").partition("=")
+            own.append(f"{key}=")
+            tuned[index] = f"{given.get(key, word.partition('=')[0])}{equals}{value}"
         kept = [word for word in typed if not word.lstrip("+").startswith(tuple(own))]
         say(f"Next: {shlex.join([*kept, *tuned, 'method=coil_anchored'])}")
 
@@ -222,7 +228,7 @@ class TunedRun(Run):
         values = {OWN: tuner.own, MEAN: tuner.mean, BEST: tuner.best}
         returns = tuner.test()
         name = chosen(returns)
-        TUNED.write(self.folder, dict(values[name]))
+        record.TUNED.write(self.folder, dict(values[name]))
         for which in ("last", HANDED_OVER):
             checkpoint.save({GUIDE: torch.tensor(0)}, weights_file(self.folder, which))
         report = record.Delivery(
@@ -287,7 +293,7 @@ def numbers_sentence(values: Values, own: Values) -> str:
         values: by name.
     """
     listed = (f"{name} {value:.4g} (its own {own[name]:.4g})" for name, value in values.items())
-    return f"The guide's numbers: {', '.join(listed)}; all digits are in {TUNED.name}."
+    return f"The guide's numbers: {', '.join(listed)}; all digits are in {record.TUNED.name}."
 
 
 def read_tuned(folder: Path, numbers: Sequence[Number]) -> Values | None:
@@ -296,10 +302,10 @@ def read_tuned(folder: Path, numbers: Sequence[Number]) -> Values | None:
     Raises:
         UserError: for a file that holds other numbers, or numbers out of their bounds.
     """
-    saved = TUNED.read(folder)
+    saved = record.TUNED.read(folder)
     if saved is None:
         return None
-    with file_of_a_run(folder / TUNED.name, PUT_BACK):
+    with file_of_a_run(folder / record.TUNED.name, PUT_BACK):
         values = {number.name: saved[number.name] for number in numbers}
         for number in numbers:
             low, high = min(number.low, number.own), max(number.high, number.own)

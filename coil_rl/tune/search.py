@@ -54,10 +54,11 @@ class Number:
         return min(max((value - low) / (high - low), 0.0), 1.0)
 
     def value(self, place: float) -> float:
-        """Return the value at a place between the bounds, from 0 to 1."""
+        """Return the value at a place between the bounds, from 0 to 1, with six digits."""
         low, high = self._scaled(self.low), self._scaled(self.high)
         scaled = low + place * (high - low)
-        value = min(max(math.exp(scaled) if self.log else scaled, self.low), self.high)
+        value = float(f"{math.exp(scaled) if self.log else scaled:.6g}")
+        value = min(max(value, self.low), self.high)
         return float(round(value)) if self.whole else value
 
     def _scaled(self, value: float) -> float:

@@ -165,5 +165,6 @@ def test_mistake_is_one_sentence_that_says_what_exists(overrides, sentence):
 def test_words_give_the_controller_itself_its_numbers(env, values):
     make = GuideWithNumbers(composed(f"env={env}"))
     config = composed(f"env={env}", *make.words(values))
+    assert not any(word.startswith("++") for word in make.words(values))
     found = numbers_of(GuideWithNumbers(config).node, make.name)
     assert {name: found[name][0] for name in values} == values

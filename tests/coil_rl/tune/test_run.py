@@ -28,12 +28,13 @@ def test_missing_extra_is_named(monkeypatch):
         Tuning().check(config)
 
 
-def test_next_command_names_each_number_of_the_guide_once(tmp_path, capsys):
-    words = ["env=pendulum", "guide.swing_up.gain=2", "++guide.swing_up.other=1", "seed=3"]
+@pytest.mark.parametrize("mark", ["", "+", "++"])
+def test_next_command_names_each_number_of_the_guide_once(mark, tmp_path, capsys):
+    words = ["env=pendulum", f"{mark}guide.swing_up.gain=2", "++guide.swing_up.other=1", "seed=3"]
     run = TunedRun.__new__(TunedRun)
     run.folder, run.in_python, run.numbers = tmp_path, False, ()
     run.command = ["coil-train", "method=tune", "tune={gain: [1, 4]}", *words]
-    run.words = lambda values: ["++guide.swing_up.gain=3.5"]
+    run.words = lambda values: ["guide.swing_up.gain=3.5", "+guide.swing_up.more=1"]
     run._say_next()
     said = shlex.split(capsys.readouterr().out)
     kept = [word for word in words if "gain" not in word]
@@ -41,7 +42,8 @@ def test_next_command_names_each_number_of_the_guide_once(tmp_path, capsys):
         "Next:",
         "coil-train",
         *kept,
-        "++guide.swing_up.gain=3.5",
+        f"{mark}guide.swing_up.gain=3.5",
+        "+guide.swing_up.more=1",
         "method=coil_anchored",
     ]
 
@@ -49,8 +51,8 @@ def test_next_command_names_each_number_of_the_guide_once(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("++guide.controller.options.gain=3.5", "guide=functools.partial(GUIDE, gain=3.5)"),
-        ("++guide.pid.kp=3.5", "guide=GUIDE, overrides=['++guide.pid.kp=3.5']"),
+        ("+guide.controller.options.gain=3.5", "guide=functools.partial(GUIDE, gain=3.5)"),
+        ("guide.pid.kp=3.5", "guide=GUIDE, overrides=['guide.pid.kp=3.5']"),
     ],
 )
 def test_next_step_in_python_gives_the_numbers_as_the_guide_takes_them(

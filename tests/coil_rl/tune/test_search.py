@@ -241,4 +241,6 @@ def test_places_of_numbers_go_there_and_back():
     whole = Number("horizon", 1, 9, own=5, whole=True)
     assert (whole.value(0.0), whole.value(0.49), whole.value(1.0)) == (1.0, 5.0, 9.0)
     log = Number("kp", 0.01, 100, own=1, log=True)
+    assert log.value(0.6) == 2.51189  # as it is printed
+    assert Number("kd", 0, 1.23456789, own=1).value(1.0) == 1.23456789
     assert (log.place(1.0), log.place(0.001), log.place(1000)) == (pytest.approx(0.5), 0.0, 1.0)
