@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 
+from coil_rl import output
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import Anchor, start_tests
 from coil_rl.learners.extension import Extension
@@ -239,7 +240,8 @@ class OffPolicy(Stateful, Learner):
         self.store(batch)
         self.gradient.begin(progress)
         weights, reports, minibatch = self.loss_weights(progress), [], None
-        for minibatch in self.samples():
+        shown = {"total": int(self.pending_updates), "unit": "minibatch", "desc": "learn"}
+        for minibatch in output.progress(iterable=self.samples(), leave=False, delay=2.0, **shown):
             reports.append(self.gradient(minibatch, weights))
         found = means(reports)
         metrics = {name: found.get(name, math.nan) for name in self.reported}

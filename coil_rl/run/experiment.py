@@ -3,7 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -83,6 +83,7 @@ class Experiment:
         self.updates = 0  # so far
         self.calls_before = 0  # of the guides in the rollouts of earlier processes
         self.frames_before = self.before  # taken before the first update
+        self.first: dict[str, float] = {}  # what was measured before the first update
         self.ends: dict[int, int] = {}  # frames of each length of the run to its number of updates
         self.returns: deque[float] = deque(maxlen=self.EPISODES)
         self.measuring = [callback for callback in self.callbacks if callback.names]
@@ -141,7 +142,7 @@ class Experiment:
         if self.curve is not None:
             self.metrics.check_columns(self.curve.columns)
         where = f"after update {self.updates}"
-        if not self.updates:
+        if state is None:
             where = "from the beginning: there is no checkpoint yet"
         say(f"{self.folder} continues {where}", error=True)
 
@@ -156,14 +157,13 @@ class Experiment:
         Raises:
             UserError: for a NaN from the env, in the losses or in the weights.
         """
-        first = {}
         self.metrics.describe(self.identity)
-        if self.updates == 0:
+        if not self.first:
             first = self._measure({})
             for sentence in start_test(first):
                 say(sentence, error=True)
             self.frames_before = self.before + self.tested
-            first |= self._taken()
+            self.first = first | self._taken()
         self._plan()
         updates, frames = self.all_updates, self.rollout.frames
         with progress(
@@ -174,12 +174,17 @@ class Experiment:
             desc="train",
         ) as bar:
             self._act({})
+            if self.tested and not self.updates:
+                self.save()
             with STOP.after_update():
                 while self.updates < updates:
-                    row = self.update(self.updates / updates)
+                    # The first update may learn from all steps of the tests, which takes long.
+                    kept = self.tested and not self.updates
+                    with STOP.at_once() if kept else nullcontext():
+                        row = self.update(self.updates / updates)
                     row |= self._measure(row)
                     row = self._taken() | row
-                    self._log(row, first)
+                    self._log(row)
                     bar.update(frames)
                     with decoration("the progress bar"):
                         self._show(bar, row, guide_return)
@@ -209,14 +214,10 @@ class Experiment:
                     raise UserError(f"{name} is {value} in update {self.updates}")
         return {**row, **learned}
 
-    def _log(self, row: dict[str, float], first: Mapping[str, float]) -> None:
-        """Log an update.
-
-        Args:
-            first: numbers of the state before the first update.
-        """
+    def _log(self, row: dict[str, float]) -> None:
+        """Log an update."""
         if not self.metrics.rows:
-            self.metrics.append({**dict.fromkeys(row, math.nan), **first})
+            self.metrics.append({**dict.fromkeys(row, math.nan), **self.first})
         self.metrics.append(row)
 
     def _measure(self, row: Mapping[str, float]) -> dict[str, float]:
@@ -339,6 +340,7 @@ class Experiment:
             "rollout": self.rollout.state_dict(),
             "identity": self.identity,
             "updates": self.updates,
+            "first": self.first,
             "ends": self.ends,
             "frames_before": self.frames_before,
             "calls": self.calls_before + guide_calls(self.rollout.env),
@@ -353,6 +355,7 @@ class Experiment:
         self.learner.load_state_dict(state["learner"])
         self.rollout.load_state_dict(state["rollout"])
         self.updates, self.ends = state["updates"], dict(state["ends"])
+        self.first = dict(state["first"])
         self.frames_before = state["frames_before"]
         # What building this process's env has asked its guides for is no part of the run.
         self.calls_before = state["calls"] - guide_calls(self.rollout.env)

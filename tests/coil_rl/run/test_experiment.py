@@ -12,24 +12,27 @@ from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
 from coil_rl.guides import RandomGuide, SplineGuide, SplineMemoryGuide
 from coil_rl.learners import PPO
+from coil_rl.learners.anchor import Anchor
 from coil_rl.run import checkpoint
+from coil_rl.run.cases import TrainingCases
 from coil_rl.run.curve import EvaluationCurve
 from coil_rl.run.experiment import Experiment, watched_keys
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.rollout import Rollout
-from coil_rl.run.stopping import resume_command
+from coil_rl.run.stopping import STOP, resume_command
 from coil_rl.transforms import GuideActions
 
 WATCH = {"episode": {"crashed": ["info", "crashed"]}, "step": {"cone": ["info", "reward", "cone"]}}
 
 
-def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=()):
+def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=(), anchor=None):
     torch.manual_seed(seed)
     env = ConeTrackEnv(shipped_tracks("train"), 16, seed=seed)
     env = TransformedEnv(
         env, Compose(GuideActions({"guide": guide or SplineGuide()}), *extra, RewardSum())
     )
-    learner = PPO(env, ["observation", "guide_action"], epochs=2, minibatches=2, seed=seed)
+    options = {"epochs": 2, "minibatches": 2, "anchor": anchor, "seed": seed}
+    learner = PPO(env, ["observation", "guide_action"], **options)
     rollout = Rollout(env, learner.policy, 8, [*learner.keys, *watched_keys(env, WATCH)])
     folder.mkdir(exist_ok=True)
     curve = EvaluationCurve(
@@ -47,8 +50,15 @@ def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=()):
         watch=WATCH,
         checkpoint_every=2,
         curve=curve,
+        callbacks=learner.callbacks(tests := TrainingCases(of_tests, frames, seed)),
+        cases=tests,
         resume_command=resume_command(folder),
     )
+
+
+def of_tests(rows):
+    env = ConeTrackEnv(shipped_tracks("train"), rows, rate=6, time_limit=1)
+    return TransformedEnv(env, Compose(GuideActions({"guide": SplineGuide()}), RewardSum()))
 
 
 def cases(drivers):
@@ -110,21 +120,29 @@ class Killed(BaseException):
     pass
 
 
-@pytest.mark.fast("SplineMemoryGuide-4")
+@pytest.mark.fast("SplineMemoryGuide-4-None")
 @pytest.mark.parametrize(
-    ("guide", "last"),
-    [(RandomGuide, 1), (RandomGuide, 5), (SplineMemoryGuide, 4), (SplineGuide, 4)],
+    ("guide", "last", "anchor"),
+    [
+        (RandomGuide, 1, None),
+        (RandomGuide, 5, None),
+        (SplineMemoryGuide, 4, None),
+        (SplineGuide, 4, None),
+        (SplineGuide, 1, Anchor()),
+    ],
 )
-def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last, capsys):
+def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last, anchor, capsys):
     frames = 16 * 8 * 5
-    rows = experiment(tmp_path / "whole", frames=frames, guide=guide()).run()
+    rows = experiment(tmp_path / "whole", frames=frames, guide=guide(), anchor=anchor).run()
 
-    stopped = experiment(tmp_path / "stopped", frames=frames, guide=guide())
+    stopped = experiment(tmp_path / "stopped", frames=frames, guide=guide(), anchor=anchor)
     update, calls = stopped.learner.update, []
 
     def dying(batch, progress):
         calls.append(progress)
         if len(calls) == last:
+            # The first update is interrupted at once if its tests are kept.
+            assert STOP.ask() == (anchor is None)
             raise Killed
         return update(batch, progress)
 
@@ -133,14 +151,14 @@ def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last,
         stopped.run()
 
     # Once there is a checkpoint, nothing may depend on the seed of the second process.
-    again = experiment(
-        tmp_path / "stopped", seed=9 if last > 2 else 0, frames=frames, guide=guide()
-    )
+    kept, options = last > 2 or anchor is not None, {"guide": guide(), "anchor": anchor}
+    seed = 9 if kept else 0
+    again = experiment(tmp_path / "stopped", seed=seed, frames=frames, **options)
     again.resume()
     assert as_written(again.run()) == as_written(rows)
     place = (
         f"after update {(last - 1) // 2 * 2}"
-        if last > 2
+        if kept
         else "from the beginning: there is no checkpoint yet"
     )
     assert f"{tmp_path / 'stopped'} continues {place}\n" in capsys.readouterr().err
@@ -148,7 +166,7 @@ def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last,
     assert whole.keys() == resumed.keys()
     for name in whole.keys() - {"checkpoint.pt", "checkpoint_previous.pt"}:
         assert whole[name] == resumed[name], name
-    finished = experiment(tmp_path / "stopped", seed=9, frames=frames, guide=guide())
+    finished = experiment(tmp_path / "stopped", seed=9, frames=frames, **options)
     finished.resume()
     assert as_written(finished.run()) == as_written(rows)
     assert contents(tmp_path / "stopped") == resumed
