@@ -108,6 +108,11 @@ def mirrored(drive):
     drive.of_scans(ranges=lambda scan: np.roll(scan["ranges"][::-1], -1))
 
 
+def mirrored_by_turns(drive):
+    for _, scan in drive.scans[::2]:
+        scan["ranges"] = np.roll(scan["ranges"][::-1], -1)
+
+
 def backwards(drive):
     drive.of_scans(ranges=lambda scan: np.roll(scan["ranges"], 180))
 
@@ -300,6 +305,10 @@ def commands_to_the_other_side(drive):
     _change(drive, "angular", "z", -1)
 
 
+def commands_to_drive_backwards(drive):
+    _change(drive, "linear", "x", -1)
+
+
 def commands_of_half_a_turn(drive):
     _change(drive, "angular", "z", 0.5)
 
@@ -420,6 +429,7 @@ def short_odometry(drive):
 
 ODD = {
     mirrored: "the scans are mirrored",
+    mirrored_by_turns: "the scans are mirrored",
     backwards: "180 for a laser that points backwards",
     turned_left: "both boundaries",
     step_of_one_more: "does not lead to angle_max",
@@ -460,6 +470,7 @@ ODD = {
     commands_in_cm: "drives 0.01 times as fast as it is told (0.15 for 15 m/s)",
     commands_in_throttle: "drives 0.25 times as fast as it is told",
     commands_to_the_other_side: "against its commands",
+    commands_to_drive_backwards: "drives -1 times as fast as it is told (-0.15 for 0.15 m/s)",
     commands_of_half_a_turn: "times as fast as it is told",
     commands_a_second_late: "before its commands",
     commands_two_seconds_early: "after its commands",
@@ -486,6 +497,7 @@ ODD = {
 # Those of which a replay tells: the perception, the size of the robot, or the odometry.
 OF_A_REPLAY = (
     mirrored,
+    mirrored_by_turns,
     backwards,
     turned_left,
     clockwise_with_a_positive_step,
@@ -495,6 +507,7 @@ OF_A_REPLAY = (
     commands_in_cm,
     commands_in_throttle,
     commands_to_the_other_side,
+    commands_to_drive_backwards,
     commands_of_half_a_turn,
     commands_a_second_late,
     commands_two_seconds_early,

@@ -81,6 +81,16 @@ def _set_printing(state: tuple[Any, ...]) -> None:
     vars(tensor_str.PRINT_OPTS).update(of_torch)
 
 
+def _computing() -> tuple[bool, bool]:
+    return torch.is_grad_enabled(), torch.is_autocast_enabled("cpu")
+
+
+def _set_computing(state: tuple[bool, bool]) -> None:
+    grad, autocast = state
+    torch._C._set_grad_enabled(grad)
+    torch.set_autocast_enabled("cpu", autocast)
+
+
 def _device() -> torch.device:
     return torch.empty(0).device  # in a quarter of the time of `torch.get_default_device`
 
@@ -119,7 +129,7 @@ def _set_handlers(handlers: list[Any]) -> None:
 SETTINGS: list[tuple[Callable[[], Any], Callable[[Any], Any]]] = [
     (_folder, _go_to),
     (torch.get_default_dtype, torch.set_default_dtype),
-    (torch.is_grad_enabled, torch._C._set_grad_enabled),
+    (_computing, _set_computing),
     (torch.get_num_threads, torch.set_num_threads),
     (_logging, _set_logging),
     (_warnings, _set_warnings),

@@ -452,7 +452,7 @@ class _Shared:
     def _things(self) -> Iterator[tuple[str, Any, Any]]:
         """Yield name, value, and what sets it."""
         for kind in self.kinds:
-            for name, value in vars(kind).items():
+            for name, value in list(vars(kind).items()):  # to pickle an object adds to its class
                 title = f"{kind.__name__}.{name}"
                 if isinstance(value, FunctionType):
                     given = [each for each in value.__defaults__ or () if _is_data(each)]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 CHECKED_SCANS = 512  # of a recording at most, evenly spread
 MOST = 0.5  # share of the clusters, and of the scans
 # Of the scans with both boundaries 0.97 and more with 30 % of the cones missing, see docs/robot.md.
-IN_ORDER = 0.5
+IN_ORDER = 0.75  # of two views by turns, one of them mirrored, half
 BEYOND = 0.1  # share of the commands
 ROUNDING = 1.001  # of commands at the limit
 
@@ -129,11 +129,12 @@ def _against_odometry(recording: Recording, speed: Floats, turn_rate: Floats) ->
         turn_rate: radians/s, [N], commanded.
     """
     moved, turned = recording.motion()
-    known = (speed > STANDS) & ~np.isnan(turn_rate) & recording.located
+    known = (np.abs(speed) > STANDS) & ~np.isnan(turn_rate) & recording.located
     if known.sum() < FEWEST:
         return []
     problems = []
-    driven, told = np.median(moved[known]), np.median(speed[known])
+    driven = np.median((moved * np.sign(speed))[known])
+    told = np.median(np.abs(speed[known]))
     if not 1 / ALIKE < driven / told < ALIKE:
         problems.append(
             f"the robot drives {driven / told:.3g} times as fast as it is told ({driven:.3g} for "

@@ -542,6 +542,20 @@ class SharesAttribute(SharesDefault):
         super().__init__(self.shared, **options)
 
 
+class SharesObjects(Drift):
+    """Is paid for what all objects of its class do."""
+
+    all = []  # noqa: RUF012
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.all.append(self)
+
+    def step(self, action):
+        seen, reward, *ends = super().step(action)
+        return seen, reward + sum(each.time for each in self.all), *ends
+
+
 class Remembers:
     """A controller of each row alone; its variants share their memory."""
 
@@ -630,6 +644,7 @@ def findings(env=Drift, controller=None):
     [
         ({"env": SharesDefault}, "rows", "all rows share a default of SharesDefault.__init__; mak"),
         ({"env": SharesAttribute}, "rows", "all rows share SharesAttribute.shared; make it in __i"),
+        ({"env": SharesObjects}, "rows", "all rows share SharesObjects.all; make it in __init__"),
         ({"controller": OfClass}, "rows", "all rows share OfClass.memory; make it in __init__"),
         ({"controller": OfClassCleared}, "rows", "all rows share OfClass.memory; make it in __"),
         ({"controller": OfModule}, "rows", r"all rows share .*test_faults\.MEMORY; make it in"),
@@ -718,6 +733,7 @@ CHANGES = {
     "folder": chdir,
     "dtype": lambda: torch.set_default_dtype(torch.float64),
     "grad": lambda: torch.set_grad_enabled(False),
+    "autocast": lambda: torch.autocast("cpu").__enter__(),
     "threads": lambda: torch.set_num_threads(3),
     "printing": lambda: np.set_printoptions(precision=1),
     "torch printing": lambda: torch.set_printoptions(precision=1),
