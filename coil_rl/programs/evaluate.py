@@ -19,7 +19,7 @@ OF_NO_TRAINING = ("env.info", "env.workers")  # no number of a training depends 
 OF_A_RUN = (*OF_BOTH, "beside", *OF_NO_TRAINING)
 OF_GUIDES = ("preset", "env", "guide", *OF_BOTH)
 # Keys of `evaluation` of the command, not of the run.
-OWN = ("repeats", "policy", "gif", "advice", "beside")
+OWN = ("repeats", "policy", "advice", "beside")
 OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
 # Keys of `evaluation` that only a training reads, and those that only a policy with actions to
 # sample or advice to listen to has.
@@ -104,9 +104,13 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
     # The advice of the training is evaluated too.
     resolved["evaluation"]["advice"] = own | resolved["evaluation"]["advice"] | resolved["degrade"]
     values = OmegaConf.create(resolved["evaluation"])
-    for key in _changed(config, resolved, folder):
+    changed = _changed(config, resolved, folder)
+    for key in changed:
         value = OmegaConf.select(values, key)
         OmegaConf.update(config.evaluation, key, value, merge=False, force_add=True)
+    if "gif" in changed:  # what refers to it in the files has its value in a folder
+        for node in filter(None, (config.evaluation.env, *config.evaluation.pictures.values())):
+            node.update({name: values.gif for name in node.keys() & {"render", "active", "gif"}})
     if "cases" in config.evaluation.env:  # an env whose cases are numbered seeds
         config.evaluation.env["cases"] = config.evaluation.cases
     check_values(config)

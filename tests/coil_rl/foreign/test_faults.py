@@ -1383,6 +1383,16 @@ def kind_12_resumed_run_takes(word, folder):
     return (folder / "run" / "metrics.csv").read_text().splitlines()[-1].split(",")[0]
 
 
+@example([True, False], "evaluation.gif")
+def kind_12_finished_run_is_drawn_by(word, folder):
+    words = ["env=pendulum", "method=ppo", *PPO, f"hydra.run.dir={folder}/run"]
+    called("train", *words, "budget.frames=32")  # without a film
+    for value in ("true", "false"):
+        again = [f"{word}={value}", "evaluation.repeats=1", f"hydra.run.dir={folder}/{value}"]
+        called("evaluate", f"run={folder}/run", *again)
+    return [(folder / value / "episode.webp").exists() for value in ("true", "false")]
+
+
 SLOW = (
     kind_1_residual_begins_as_its_guide_in,
     kind_1_residual_begins_as_its_guide_in_rooms,
@@ -1395,6 +1405,7 @@ SLOW = (
     kind_7_run_and_resume_take_one_spelling,
     kind_10_changed_code_is_refused_at_a_resume_without,
     kind_12_resumed_run_takes,
+    kind_12_finished_run_is_drawn_by,
 )
 FAST = [name for name, (find, *_) in EXAMPLES.items() if find not in SLOW]
 
