@@ -345,6 +345,7 @@ class GuideActions(ActionTransform):
             self.passed = (self.out_keys[0],)
         self._checked: set[str] = set()
         self.calls = 0  # number of actions that guides were asked for
+        self.rests = False
 
     @cached_property
     def given_space(self) -> ActionSpace:
@@ -370,6 +371,12 @@ class GuideActions(ActionTransform):
     def names(self) -> list[str]:
         """Names of the guides, one per row of the advice."""
         return self.guides.names
+
+    def rest(self) -> None:
+        """Ask no guide from now on: the advice, which nothing reads, is 0."""
+        self.rests, self.supplied = True, []
+        self.in_keys: list[NestedKey] = []
+        self.needs_past = bool(self.guides.memories)
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Set the env, which may have other rows than an earlier one."""
@@ -467,7 +474,7 @@ class GuideActions(ActionTransform):
         rows: tuple[Tensor, ...] = mask.reshape(tensordict.batch_size).nonzero(as_tuple=True)
         data = tensordict_reset.select(*self.in_keys, strict=False)[rows]
         written: State = {}
-        if self._cache is not None:
+        if self._cache is not None and not self.rests:
             before = self.calls
             data.set(self.out_keys[0], self._cache(data, self._advice))
             # What is kept counts too: a process that resumes the run has kept nothing yet.
@@ -489,6 +496,10 @@ class GuideActions(ActionTransform):
         ended: Ended | None = None,
     ) -> Tensor:
         """Return the advice within the bounds of the action; the memory is replaced by the next."""
+        if self.rests:
+            space = self.action_space
+            shape = (*tensordict.batch_size, *space.agents, len(self.names), space.size)
+            return torch.zeros(shape, dtype=space.dtype, device=tensordict.device)
         if not self._checked:
             self.guides.match_dtypes(tensordict)
             self.guides.tell(self.guide_space, observed_choices(self.parent.base_env))

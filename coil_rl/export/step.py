@@ -125,7 +125,8 @@ class PolicyStep(nn.Module):
         super().__init__()
         plant, policy = controller.plant, WrittenPolicy(controller.policy)
         links = exportable(controller)
-        guides = next((each for each in links if isinstance(each, GuideActions)), None)
+        asked = (each for each in links if isinstance(each, GuideActions) and not each.rests)
+        guides = next(asked, None)
         given = None if inside or guides is None else GivenAdvice(guides)
         if inside and guides is not None and "row" in guides.supplied:
             raise NotExportableError("a guide asks for the number of its row")

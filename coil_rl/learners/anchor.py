@@ -31,12 +31,14 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.envs import EnvBase, Transform
 
 from coil_rl.learners.learner import Callback, Cases
 from coil_rl.learners.normaliser import Normaliser
 from coil_rl.learners.policy import UNCLIPPED, Sample
 from coil_rl.ranges import Interval, Positive, Share, checked
 from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.transforms.guide_actions import GuideActions
 
 TIE = 1e-6  # decides between equal values
 ADVISED = 0.9  # probability of the advised one of several options at a choice weight of 1
@@ -268,6 +270,24 @@ def hold_of(policy: nn.Module) -> Hold | None:
         if isinstance(module, Hold):
             return module
     return None
+
+
+def rest_guides(policy: nn.Module, env: EnvBase, others: Sequence[NestedKey]) -> None:
+    """Ask the guides of an env no more if nothing would read their advice.
+
+    That is so where a policy holds none of them for good, as its networks see 0 then.
+
+    Args:
+        others: entries that something else reads.
+    """
+    hold = hold_of(policy)
+    if hold is None or hold.held:
+        return
+    transforms = [each for each in env.modules() if isinstance(each, Transform)]
+    read = {*others, *(key for each in transforms for key in each.in_keys or ())}
+    for each in transforms:
+        if isinstance(each, GuideActions) and each.out_keys[0] not in read:
+            each.rest()
 
 
 def start_tests(

@@ -22,6 +22,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type
 
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
+from coil_rl.learners.anchor import rest_guides
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.chain import Chain, Past
 
@@ -57,9 +58,11 @@ class Controller:
             raise ValueError(f"a controller needs an env of one row, not {list(env.batch_size)}")
         self.env, self.policy = env.eval(), policy
         self.plant, self.folder, self.which = env.base_env, folder, which
+        rest_guides(policy, self.env, ())
         self.chain = Chain(self.env, policy)
         # Those that demonstrated are left out.
-        parts = [part for part in self.chain.links if isinstance(part, GuideActions)]
+        links = [part for part in self.chain.links if isinstance(part, GuideActions)]
+        parts = [part for part in links if not part.rests]
         self.guides = parts[0] if parts else None
         self.read = {unravel_key(key) for part in (policy, *parts) for key in part.in_keys}
         self._check_read()

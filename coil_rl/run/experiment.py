@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.envs import EnvBase
 
 from coil_rl.errors import UserError, file_of_a_run, is_outside
+from coil_rl.learners.anchor import rest_guides
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.output import decoration, progress, say
 from coil_rl.report.table import return_format
@@ -165,6 +166,9 @@ class Experiment:
             self.frames_before = self.before + self.tested
             self.first = first | self._taken()
         self._plan()
+        read = [unravel_key(tuple(key)) for group in self.watch.values() for key in group.values()]
+        read += getattr(getattr(self.learner, "extensions", None), "keys", [])
+        rest_guides(self.learner.policy, self.rollout.env, read)
         updates, frames = self.all_updates, self.rollout.frames
         with progress(
             total=updates * frames,

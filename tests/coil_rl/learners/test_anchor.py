@@ -9,7 +9,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Anchor, Gru, Reinforce
-from coil_rl.learners.anchor import BARS, PROMISING, Hold, hold_of, start_tests
+from coil_rl.learners.anchor import BARS, PROMISING, Hold, hold_of, rest_guides, start_tests
 from coil_rl.learners.policy import UNCLIPPED
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions, Takeover
@@ -130,6 +130,24 @@ def test_advice_is_hidden_while_no_guide_is_held(kind):
         assert not torch.equal(acted(policy, data), acted(policy, other))
     hold_of(policy).set([0.0])
     torch.testing.assert_close(acted(policy, data), acted(policy, other), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", ACTIONS)
+@pytest.mark.parametrize("held", [0.0, 0.5])
+def test_guides_that_are_not_held_rest_unless_something_else_reads_their_advice(name, held):
+    batches, calls = [], []
+    for others in (["guide_action"], []):
+        env = advised(*ACTIONS[name])
+        torch.manual_seed(0)
+        policy = learner(env).policy
+        hold_of(policy).set([held])
+        rest_guides(policy, env, others)
+        batches.append(Rollout(env, policy, 12).collect())
+        calls.append(env.transform[0].calls)
+    assert (calls[1] == 0) == (held == 0)
+    assert calls[0] > 0
+    for key in ("action", "observation", ("next", "reward")):
+        assert torch.equal(batches[0][key], batches[1][key])
 
 
 def test_without_a_held_guide_actions_are_those_of_ppo():
