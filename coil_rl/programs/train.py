@@ -87,13 +87,13 @@ def resume(
         run = assemble(config, folder)
         if is_evaluated(folder):
             run.check_unchanged()
-        if frames is not None:
-            run.lengthen(frames)
         try:
-            if not is_evaluated(folder):
+            if frames is not None or not is_evaluated(folder):
                 check(config)
         except UserError as error:
             raise UserError(f"{folder / 'config.yaml'}: {error}") from error
+        if frames is not None:
+            run.lengthen(frames, changed)
         return run.finish_begun(changed)
 
 

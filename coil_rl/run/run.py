@@ -238,7 +238,7 @@ class Run:
         """
         with locked(self.folder):
             if frames is not None:
-                self.lengthen(whole("frames", frames))
+                self.lengthen(whole("frames", frames), changed)
             if is_begun(self.folder):
                 self.finish_begun(changed)
             else:
@@ -330,11 +330,14 @@ class Run:
         settings = {**self.settings, **({CODE: code} if code else {})}
         begin(self.folder, settings, self.command, self.trust)
 
-    def lengthen(self, frames: int) -> None:
+    def lengthen(self, frames: int, changed: str = "") -> None:
         """Set a new length, before the run goes on.
 
+        Args:
+            changed: as of `train`.
+
         Raises:
-            UserError: if the run has been trained for longer.
+            UserError: if the run has been trained for longer, or its code was changed.
         """
         budget = self.budget
         if frames == budget.frames:
@@ -345,6 +348,8 @@ class Run:
                 "larger number, or train another run"
             )
         begun = is_begun(self.folder)
+        if begun:
+            self._take_code(changed)
         stages = [*budget.stages, budget.frames] if begun else []
         self.budget = replace(budget, frames=frames, stages=stages)
         saved = dict(self.settings.get("budget", {})) | {"frames": frames, "stages": stages}

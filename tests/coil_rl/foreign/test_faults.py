@@ -1347,6 +1347,10 @@ def kind_10_changed_code_is_refused_at_a_resume_without(accept, folder):
     source.write_text(f"{text}\n# another reward\n")
     refused = called("train", *words, "budget.frames=128", code=2).stderr
     assert "begun with another file of valve_of_mine" in refused
+    source.rename(folder / "aside.py")
+    called("train", *words, "budget.frames=128", code=2)
+    (folder / "aside.py").rename(source)
+    assert (folder / "run" / "evaluation.csv").exists()  # of what is refused, nothing is removed
     return called("train", *words, "budget.frames=128", accept).stderr
 
 
