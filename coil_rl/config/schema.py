@@ -318,9 +318,9 @@ OmegaConf.register_new_resolver("minibatches", minibatches, replace=True)
 OmegaConf.register_new_resolver(
     "names", lambda table, none: "_".join(map(str, table)) or none, replace=True
 )
-# ${file_name:${env.id}}
+# ${file_name:${env.id}}, without the module of MODULE:NAME
 OmegaConf.register_new_resolver(
-    "file_name", lambda text: re.sub(r"[^\w.-]+", "_", str(text)), replace=True
+    "file_name", lambda text: re.sub(r"[^\w.-]+", "_", str(text).rpartition(":")[2]), replace=True
 )
 # ${label}_seed${seed}_${fingerprint:}
 OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)

@@ -221,10 +221,10 @@ def test_sweep_report_distillation_and_learned_guide(script, tmp_path):
     assert {row["driver"] for row in means} == {"guide", "coil", "ppo"}
     finished(script("coil-distill", *CONF, "env=room", *PROXY, "proxy.folder=proxies"))
     assert len(list((tmp_path / "proxies").glob("pi_*/policy_last.pt"))) == 1
-    learned = ["guide=learned", "guide.learned.run=sweep/2_room_ppo_seed0", "method=coil", *TINY]
+    learned = ["guide=learned", "guide.learned.run=sweep/2_Room-v0_ppo_seed0", "method=coil", *TINY]
     finished(script("coil-train", *CONF, "env=room", *learned, "hydra.run.dir=second"))
     [first] = table(
-        tmp_path / "sweep" / "2_room_ppo_seed0" / "evaluation.csv",
+        tmp_path / "sweep" / "2_Room-v0_ppo_seed0" / "evaluation.csv",
         driver="ppo",
         actions="deterministic",
         case="mean",
