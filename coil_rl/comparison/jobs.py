@@ -35,7 +35,7 @@ def run_jobs(jobs: Mapping[str, Named], folder: Path) -> dict[str, str]:
                 failed[name] = reason
                 with (folder / FAILED_JOBS).open("a", encoding="utf-8") as file:
                     file.write(f"job {name}: {reason}\n")
-            bar.update(max(number - bar.n, 0))
+            show_progress(bar, number)
     return failed
 
 
@@ -65,6 +65,12 @@ def _show(run: Run, bar: Any) -> None:
     run.callbacks = callbacks
 
 
+def show_progress(bar: Any, done: float) -> None:
+    """Show how much is done: not what has come in addition, whose sum is rounded above the total."""
+    bar.n = done
+    bar.update(0)
+
+
 class Tick:
     """Tells a progress bar of the share of a training that is done; a `Callback`.
 
@@ -75,7 +81,7 @@ class Tick:
     names: Sequence[str] = ()
 
     def __init__(self, bar: Any) -> None:
-        self.bar, self.share, self.shown = bar, 0.0, 0.0
+        self.bar, self.begun, self.share = bar, bar.n, 0.0
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
         """Return whether an update is over, and note how much of the training that is."""
@@ -85,6 +91,5 @@ class Tick:
     def after_update(self, update: int) -> dict[str, float]:
         """Show the new share."""
         with decoration("the progress bar"):
-            self.bar.update(self.share - self.shown)
-        self.shown = self.share
+            show_progress(self.bar, self.begun + self.share)
         return {}
