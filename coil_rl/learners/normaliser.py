@@ -44,14 +44,22 @@ class Normaliser(TensorDictModuleBase):
     Args:
         env: the env, for its specs.
         keys: the entries.
-        automatic: whether the first `learn` decides which entries are normalised: those with an
-            element that is out of scale, see `out_of_scale`. The others stay as they are. The
-            decision is a part of the state.
+        automatic: whether `learn` decides which entries are normalised: those with an element that
+            is out of scale, see `out_of_scale`. The others stay as they are. The decision is a part
+            of the state.
+        enough: number of rows after which a decision stays; before, each `learn` decides anew.
     """
 
     by_key = True
 
-    def __init__(self, env: EnvBase, keys: Sequence[NestedKey], *, automatic: bool = False) -> None:
+    def __init__(
+        self,
+        env: EnvBase,
+        keys: Sequence[NestedKey],
+        *,
+        automatic: bool = False,
+        enough: int = 1,
+    ) -> None:
         self.in_keys = list(keys)
         self.out_keys: list[NestedKey] = [unravel_key(("normalised", key)) for key in keys]
         super().__init__()
@@ -65,7 +73,7 @@ class Normaliser(TensorDictModuleBase):
             if not spec.dtype.is_floating_point:
                 raise ValueError(f"normalise: {key} has numbers of type {spec.dtype}; leave it out")
             shape = spec.shape[len(env.batch_size) :]
-            moments = Moments(shape, spec.device, automatic=automatic)
+            moments = Moments(shape, spec.device, enough=enough if automatic else None)
             if not automatic:
                 moments.variance.fill_(math.inf)
             self.moments.append(moments)
@@ -84,12 +92,13 @@ class Normaliser(TensorDictModuleBase):
     def learn(self, batch: TensorDictBase) -> None:
         """Add the entries of a batch of any shape to the statistics."""
         for key, moments in zip(self.in_keys, self.moments, strict=True):
-            first = not moments.count
+            undecided = moments.undecided
             moments.add(batch[key])  # type: ignore[operator]
-            if first and moments.used is not None:
+            if undecided:
                 wrong = moments.out_of_scale
                 moments.used.fill_(wrong.any())  # type: ignore[operator]
-                _say(key, moments.described(wrong))  # type: ignore[operator]
+                if not moments.undecided:
+                    _say(key, moments.described(wrong))  # type: ignore[operator]
 
 
 class RunningStatistics(Extension):
@@ -117,22 +126,23 @@ class Moments(nn.Module):
     Args:
         shape: of an array.
         device: of the statistics; None: PyTorch's default.
-        automatic: whether values are normalised only once `used` is true.
+        enough: number of arrays that decide whether values are normalised; None: they always are.
 
     Attributes:
         used: whether values are normalised, a scalar; None: always.
     """
 
     def __init__(
-        self, shape: torch.Size, device: torch.device | None = None, *, automatic: bool = False
+        self, shape: torch.Size, device: torch.device | None = None, *, enough: int | None = None
     ) -> None:
         super().__init__()
+        self.enough = enough
         options: dict[str, Any] = {"dtype": torch.float64, "device": device}
         self.count: Tensor = nn.Buffer(torch.zeros((), **options))
         self.mean: Tensor = nn.Buffer(torch.zeros(shape, **options))
         self.variance: Tensor = nn.Buffer(torch.ones(shape, **options))
         self.used: Tensor | None
-        self.register_buffer("used", torch.tensor(False, device=device) if automatic else None)
+        self.register_buffer("used", None if enough is None else torch.tensor(False, device=device))
 
     def forward(self, values: Tensor) -> Tensor:
         """Normalise values [*batch, *shape]."""
@@ -141,6 +151,11 @@ class Moments(nn.Module):
         scaled = (values - self.mean) / deviation
         scaled = scaled.clamp(-LIMIT, LIMIT).to(values.dtype)
         return scaled if self.used is None else torch.where(self.used, scaled, values)
+
+    @property
+    def undecided(self) -> bool:
+        """Whether a decision may still change."""
+        return self.enough is not None and float(self.count) < self.enough
 
     @property
     def size(self) -> Tensor:
@@ -199,11 +214,13 @@ def normaliser(
     env: EnvBase,
     in_keys: Sequence[NestedKey],
     normalise: bool | Literal["auto"] | Sequence[NestedKey],
+    enough: int = 1,
 ) -> Normaliser | None:
     """Return the normaliser of a learner, None without entries.
 
     `normalise` names them; True: all of `in_keys` that hold vectors of measurements, that is not
-    advice, choices or images; "auto": those of them that are out of scale in the first batch.
+    advice, choices or images; "auto": those of them that are out of scale in the batches with the
+    first `enough` rows.
     """
     if isinstance(normalise, str):
         if normalise != "auto":
@@ -222,7 +239,9 @@ def normaliser(
                 f"normalise: {', '.join(unread)} is not observed; "
                 f"observed are {', '.join(map(str, in_keys))}"
             )
-    return Normaliser(env, chosen, automatic=normalise == "auto") if chosen else None
+    if not chosen:
+        return None
+    return Normaliser(env, chosen, automatic=normalise == "auto", enough=enough)
 
 
 def _warn_of_others(env: EnvBase, in_keys: Sequence[NestedKey]) -> None:
@@ -251,8 +270,7 @@ class RawObservations:
     def __init__(
         self, env: EnvBase, in_keys: Sequence[NestedKey], normaliser: Normaliser | None
     ) -> None:
-        # Whether each is normalised: perhaps by a decision of the first batch.
-        self.used: dict[NestedKey, Tensor | None] = {}
+        self.each: dict[NestedKey, Moments | None] = {}  # which decide; None: it stays as it is
         specs = zip(in_keys, entry_specs(env, in_keys), strict=True)
         self.images = [
             key for key, spec in specs if _is_image(env, spec) and spec.dtype.is_floating_point
@@ -263,9 +281,9 @@ class RawObservations:
             moments = dict(zip(normaliser.in_keys, normaliser.moments, strict=True))
         for key in vectors:
             if key not in moments:
-                self.used[key] = None
+                self.each[key] = None
             elif moments[key].used is not None:
-                self.used[key] = moments[key].used
+                self.each[key] = moments[key]
         self.batch_dims, self.count = len(env.batch_size), 0
 
     def look(self, batch: TensorDictBase) -> None:
@@ -276,15 +294,15 @@ class RawObservations:
         self.count += 1
         if self.count & (self.count - 1):
             return
-        for key, used in list(self.used.items()):
-            if used is not None and used:
+        for key, decides in list(self.each.items()):
+            if decides is not None and (decides.undecided or decides.used):
                 continue
             moments = Moments(batch[key].shape[self.batch_dims + 1 :], batch[key].device)
             moments.add(batch[key])
             if found := moments.described(moments.size > LARGE):
-                del self.used[key]
-                remedy = f"use learner.normalise={'auto or true' if used is None else 'true'}"
-                now = "is" if used is None else "is by now"
+                del self.each[key]
+                remedy = f"use learner.normalise={'auto or true' if decides is None else 'true'}"
+                now = "is" if decides is None else "is by now"
                 if key in self.images:
                     remedy = "a picture of 0 to 255 needs a space of uint8, or a division by 255"
                 warnings.warn(
@@ -295,7 +313,7 @@ class RawObservations:
 
 
 def _say(key: NestedKey, found: Sequence[str]) -> None:
-    """Print what the first batch decided about an entry."""
+    """Print what was decided about an entry."""
     if found:
         say(f"normalise: {_name(key)} is normalised: {', '.join(found)}", error=True)
     else:

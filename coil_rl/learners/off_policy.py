@@ -76,7 +76,8 @@ class OffPolicy(Stateful, Learner):
         env: the env, for its device and transforms.
         in_keys: entries that are observed.
         normalise: whether to normalise what is observed, or the entries to normalise, see
-            `Normaliser`. Steps are stored as they are.
+            `Normaliser`; with "auto" the steps before learning starts decide. Steps are stored as
+            they are.
         scale_rewards: whether rewards are divided by the running deviation of returns, see
             `RewardScale`.
         tau: step of the target networks towards the networks after each minibatch, as a fraction.
@@ -143,7 +144,7 @@ class OffPolicy(Stateful, Learner):
         if not max(starts, 1) <= capacity:
             raise ValueError(f"capacity={capacity} must be at least 1 and at least starts={starts}")
         check_replay(env, type(self).__name__)
-        self.normaliser = normaliser(env, in_keys, normalise)
+        self.normaliser = normaliser(env, in_keys, normalise, enough=max(starts, 1))
         self.reward_scale = RewardScale(gamma) if scale_rewards else None
         self.inputs = networks.inputs_of(env, self.normaliser, anchor)
         self.raw = RawObservations(env, in_keys, self.normaliser)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from tensordict import TensorDict
 
 import coil_rl
 from coil_rl.errors import UserError
@@ -109,9 +110,28 @@ def test_raw_observations_far_out_of_scale_are_named(tmp_path):
 
 
 def test_an_entry_is_never_in_scale_and_far_out_of_scale_in_one_batch():
-    moments = Moments(torch.Size([1]), automatic=True)
+    moments = Moments(torch.Size([1]), enough=1)
     moments.add(9.0 + 8.0 * torch.tensor([[-1.0], [1.0]]))  # its size is above 10
     assert moments.out_of_scale.item()
+
+
+def test_steps_before_learning_decide_together_with_replay(capsys):
+    env = coil_rl.GymnasiumEnv("Pendulum-v1", num_envs=2)
+    sac = coil_rl.SAC(env, normalise="auto", starts=96)
+    (moments,) = sac.normaliser.moments
+
+    def learn(mean, deviation):
+        batch = mean + deviation * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]).repeat(16, 1)
+        sac.normaliser.learn(TensorDict({"observation": batch}, 32))
+        return bool(moments.used)
+
+    assert learn(1.4, 0.02)  # where all episodes begin
+    assert not learn(-1.4, 0.5)
+    assert not capsys.readouterr().err
+    assert not learn(0.0, 1.0)
+    assert "normalise: observation is in scale and stays as it is" in capsys.readouterr().err
+    assert not learn(500.0, 1.0)  # decided
+    assert not capsys.readouterr().err
 
 
 class Drifting(Reactor):
