@@ -394,16 +394,19 @@ class Clock:
     """
 
     names = ("time", "monotonic", "perf_counter", "time_ns", "monotonic_ns", "perf_counter_ns")
+    dates = ("gmtime", "localtime")
 
     def __init__(self) -> None:
-        self.read = {name: getattr(time, name) for name in self.names}
-        self.start = {name: read() for name, read in self.read.items()}
+        self.read = {name: getattr(time, name) for name in (*self.names, *self.dates)}
+        self.start = {name: self.read[name]() for name in self.names}
         self.tick = QUICK
 
     def __enter__(self) -> "Clock":
         self.passed = 0.0
         for name in self.names:
             setattr(time, name, partial(self._now, name))
+        for name in self.dates:
+            setattr(time, name, partial(self._date, name))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -415,6 +418,9 @@ class Clock:
         self.passed += self.tick
         since = round(self.passed * 1e9) if name.endswith("_ns") else self.passed
         return self.start[name] + since
+
+    def _date(self, name: str, *given: float) -> time.struct_time:
+        return self.read[name](*(given or [self._now("time")]))
 
     def pause(self, seconds: float) -> None:
         """Let time pass: much of it by this clock, and some by every other one."""

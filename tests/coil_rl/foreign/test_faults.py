@@ -607,6 +607,16 @@ class OfClock:
         return self.output
 
 
+class OfDate(OfClock):
+    """Gives a new output each second."""
+
+    def act(self, observation):
+        now = time.mktime(time.localtime())
+        if now > self.last:
+            self.last, self.output = now, [float(observation[0])]
+        return self.output
+
+
 class OfBudget(Remembers):
     """Stops after two seconds."""
 
@@ -653,6 +663,7 @@ def findings(env=Drift, controller=None):
             "clock",
             "when time passes between two steps: it reads the clock",
         ),
+        ({"controller": OfDate}, "clock", "the controller OfDate gives other actions when time"),
         ({"controller": OfBudget}, "clock", "the controller OfBudget gives other actions when"),
         ({"controller": OfClock()}, "clock", "the controller OfClock gives other actions when"),
         ({"env": Slow}, "clock", "observation of the env differs when time passes between two"),
