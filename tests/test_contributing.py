@@ -55,8 +55,11 @@ def test_walks_name_every_file_between_the_command_and_the_optimiser_step_and_th
 
     monkeypatch.setattr(torch.optim.Adam, "step", traced_step)
     monkeypatch.setattr(SplineGuide, "forward", traced_advice)
-    short = ["training.tests.time_limit=0.5", "learner.epochs=2", "learner.minibatches=2"]
-    called("train", "method=coil_anchored", *TINY, *short, f"hydra.run.dir={tmp_path / 'run'}")
+    short = [*TINY, "learner.epochs=2", "learner.minibatches=2"]
+    # A guide that is not held is asked no more, so the advice is that of COIL.
+    for method, *words in (["coil_anchored", "training.tests.time_limit=0.5"], ["coil"]):
+        run = f"hydra.run.dir={tmp_path / method}"
+        called("train", f"method={method}", *words, *short, run)
     assert (
         {"coil_rl/programs/train.py", "coil_rl/learners/ppo.py"}
         <= set(stacks["optimiser"])
