@@ -232,7 +232,7 @@ def test_a_method_has_the_means_of_its_drives_next_to_the_paper(page):
 
 
 def test_claims_have_a_verdict_by_seed(page):
-    expected = "**held up**: -0.194 (-0.194 to -0.194), 3 seeds, p 0.000"
+    expected = "**held up**: -0.194 (-0.194 to -0.194), 3 seeds, p < 0.001"
     assert row(page, "PPO steers more smoothly than the guide")[1:] == [
         "-0.163",
         "3 of 3",
@@ -253,7 +253,7 @@ def test_drives_without_a_complete_lap_are_compared_by_clearance_only(page):
     assert row(page, "COIL's laps")[1:] == [
         "-0.61",
         "2 of 3",
-        "**held up**: -1.00 (-1.00 to -1.00), 2 seeds, p 0.000",
+        "**held up**: -1.00 (-1.00 to -1.00), 2 seeds, p < 0.001",
     ]
     expected = "**held up**: -0.195 (-0.259 to -0.131), 2 seeds, p 0.049"
     assert row(page, "COIL steers more smoothly than its guide")[1:] == [

@@ -57,11 +57,11 @@ def test_the_claim_has_a_verdict_in_each_world(made):
     claim = "COIL's best return is above PPO's"
     assert row(page, f"{claim} ")[1:] == [
         "+63.4",
-        "**held up**: +70.0 (+70.0 to +70.0), 3 seeds, p 0.000",
+        "**held up**: +70.0 (+70.0 to +70.0), 3 seeds, p < 0.001",
     ]
     assert (
         row(page, f"{claim}, another world")[2]
-        == "**did not hold up**: -30.0 (-30.0 to -30.0), 3 seeds, p 0.000"
+        == "**did not hold up**: -30.0 (-30.0 to -30.0), 3 seeds, p < 0.001"
     )
 
 
