@@ -124,9 +124,7 @@ class PolicyStep(nn.Module):
     def __init__(self, controller: Controller, *, inside: bool = True) -> None:
         super().__init__()
         plant, policy = controller.plant, WrittenPolicy(controller.policy)
-        links = exportable(controller)
-        asked = (each for each in links if isinstance(each, GuideActions) and not each.rests)
-        guides = next(asked, None)
+        links, guides = exportable(controller), controller.guides
         given = None if inside or guides is None else GivenAdvice(guides)
         if inside and guides is not None and "row" in guides.supplied:
             raise NotExportableError("a guide asks for the number of its row")

@@ -37,17 +37,17 @@ class Normaliser(TensorDictModuleBase):
     """Entries of an env, normalised by mean and standard deviation of all that `learn` has seen.
 
     The results are written as `("normalised", KEY)`. Before the first `learn` they are 0, so that
-    no result depends on the unit or the centre of an entry; with `automatic` they equal the
-    entries. Advice, which shares the unit of the action, and entries of other than floating point
-    numbers are a `ValueError`.
+    no result depends on the unit or the centre of an entry; with `enough` they equal the entries.
+    Advice, which shares the unit of the action, and entries of other than floating point numbers
+    are a `ValueError`.
 
     Args:
         env: the env, for its specs.
         keys: the entries.
-        automatic: whether `learn` decides which entries are normalised: those with an element that
-            is out of scale, see `out_of_scale`. The others stay as they are. The decision is a part
-            of the state.
-        enough: number of rows after which a decision stays; before, each `learn` decides anew.
+        enough: None: all of them are normalised. Else `learn` decides which: those with an element
+            that is out of scale, see `out_of_scale`, while the others stay as they are. Each
+            `learn` decides anew until that many rows were seen; then the decision stays. It is a
+            part of the state.
     """
 
     by_key = True
@@ -57,8 +57,7 @@ class Normaliser(TensorDictModuleBase):
         env: EnvBase,
         keys: Sequence[NestedKey],
         *,
-        automatic: bool = False,
-        enough: int = 1,
+        enough: int | None = None,
     ) -> None:
         self.in_keys = list(keys)
         self.out_keys: list[NestedKey] = [unravel_key(("normalised", key)) for key in keys]
@@ -73,8 +72,8 @@ class Normaliser(TensorDictModuleBase):
             if not spec.dtype.is_floating_point:
                 raise ValueError(f"normalise: {key} has numbers of type {spec.dtype}; leave it out")
             shape = spec.shape[len(env.batch_size) :]
-            moments = Moments(shape, spec.device, enough=enough if automatic else None)
-            if not automatic:
+            moments = Moments(shape, spec.device, enough=enough)
+            if enough is None:
                 moments.variance.fill_(math.inf)
             self.moments.append(moments)
 
@@ -241,7 +240,7 @@ def normaliser(
             )
     if not chosen:
         return None
-    return Normaliser(env, chosen, automatic=normalise == "auto", enough=enough)
+    return Normaliser(env, chosen, enough=enough if normalise == "auto" else None)
 
 
 def _warn_of_others(env: EnvBase, in_keys: Sequence[NestedKey]) -> None:

@@ -1,7 +1,7 @@
 """Off-policy learning with a replay buffer, the base class of `DQN` and `SAC`."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, ClassVar, Literal, TypedDict
 
 import torch
@@ -241,8 +241,12 @@ class OffPolicy(Stateful, Learner):
         self.store(batch)
         self.gradient.begin(progress)
         weights, reports, minibatch = self.loss_weights(progress), [], None
-        shown = {"total": int(self.pending_updates), "unit": "minibatch", "desc": "learn"}
-        for minibatch in output.progress(iterable=self.samples(), leave=False, delay=2.0, **shown):
+        minibatches: Iterable[Entries] = self.samples()
+        due = int(self.pending_updates)
+        if due > AT_ONCE:  # to make a bar takes as long as a small minibatch
+            shown = {"iterable": minibatches, "total": due, "unit": "minibatch", "desc": "learn"}
+            minibatches = output.progress(**shown, leave=False, delay=2.0)
+        for minibatch in minibatches:
             reports.append(self.gradient(minibatch, weights))
         found = means(reports)
         metrics = {name: found.get(name, math.nan) for name in self.reported}

@@ -63,6 +63,14 @@ def test_wrong_override_is_refused_without_heavy_imports(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def printed(script):
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(
+        command, env=environment(ROOT), capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()
+
+
 def test_programs_collect_garbage_from_the_start_but_seldom():
     """The env of a training that ended is garbage, and so is nothing of the imports."""
     script = (
@@ -71,11 +79,7 @@ def test_programs_collect_garbage_from_the_start_but_seldom():
         "import coil_rl.programs\n"
         "print(gc.isenabled(), gc.get_threshold()[0] >= 10_000)\n"
     )
-    command = [sys.executable, "-c", script]
-    done = subprocess.run(
-        command, env=environment(ROOT), capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == ["True", "True"]
+    assert printed(script) == "True True"
 
 
 @pytest.mark.slow
@@ -86,11 +90,7 @@ def test_training_imports_no_library_that_it_does_not_use():
         "others = {'pandas', 'scipy.stats', 'scipy.interpolate', 'sklearn'}\n"
         "print(sorted(others & set(sys.modules)))\n"
     )
-    command = [sys.executable, "-c", script]
-    done = subprocess.run(
-        command, env=environment(ROOT), capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "[]"
+    assert printed(script) == "[]"
 
 
 def test_info_imports_nothing_heavy(tmp_path):
