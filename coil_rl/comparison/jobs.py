@@ -66,7 +66,7 @@ def _show(run: Run, bar: Any) -> None:
 
 
 def show_progress(bar: Any, done: float) -> None:
-    """Show how much is done, which is no sum of parts: that may be rounded above the total."""
+    """Set a bar to what is done; a sum of increments could be rounded above its total."""
     bar.n = done
     bar.update(0)
 

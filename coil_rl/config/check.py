@@ -85,7 +85,7 @@ def check(config: DictConfig) -> None:
 def _check_kind(config: DictConfig) -> None:
     """Raise a `UserError` if the learner is of another kind than the method needs.
 
-    So it is for arguments that it does not take, before an env is made, which may take long.
+    The same if it is given arguments that it does not take: to make an env first may take long.
     """
     kind, needed = parts.learner_kind(config), config.method.learner
     if kind != needed:

@@ -39,9 +39,8 @@ from coil_rl.errors import UserError
 from coil_rl.plain_yaml import entries
 
 CORE = "coil_rl.conf"  # the package of our own files, and the group of the entry points
-
-
-WRITTEN: dict[str, str] = {}  # the file of a user by the key that it gives, of the last composition
+# Of the last composition: the file of a user by each key that it gives.
+WRITTEN: dict[str, str] = {}
 
 REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
 

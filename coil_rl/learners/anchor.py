@@ -273,9 +273,9 @@ def hold_of(policy: nn.Module) -> Hold | None:
 
 
 def rest_guides(policy: nn.Module, env: EnvBase, others: Sequence[NestedKey]) -> None:
-    """Ask the guides of an env no more if nothing would read their advice.
+    """Stop asking the guides of an env whose advice nothing reads.
 
-    That is so where a policy holds none of them for good, as its networks see 0 then.
+    The networks of a policy that holds no guide see 0 in place of advice.
 
     Args:
         others: entries that something else reads.

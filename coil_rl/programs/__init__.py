@@ -21,6 +21,6 @@ def interrupted(signum: int, frame: FrameType | None) -> NoReturn:
 # Only in a process of a program: coil-NAME, or python -m, which has set no name yet.
 _name = Path(sys.argv[0]).name if sys.argv else ""
 if _name == "-m" or _name.startswith("coil-"):
-    gc.set_threshold(10_000)  # with Python's own a quarter of the time of the imports is its
+    gc.set_threshold(10_000)  # Python's own costs a quarter of the time of the imports
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, interrupted)  # `app.program` ends it

@@ -97,7 +97,7 @@ class Film(Picture):
         return 2 if math.isnan(rate) else max(1, round(rate * self.duration / 1000))
 
     def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
-        """Write the animation; say so if an env gives no frame, or stopped giving them.
+        """Write the animation; print why not if an env gives no pictures, or stopped giving them.
 
         Args:
             results: the episodes of each policy, the agent last.

@@ -46,7 +46,7 @@ def return_format(returns: Iterable[float]) -> str:
 
 
 def p_text(p: float) -> str:
-    """Return a p-value with three decimals, which are never all 0."""
+    """Return a p-value as a text: three decimals, or `< 0.001`."""
     return f"{p:.3f}" if p >= 0.001 else "< 0.001"
 
 

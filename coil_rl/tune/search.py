@@ -54,7 +54,7 @@ class Number:
         return min(max((value - low) / (high - low), 0.0), 1.0)
 
     def value(self, place: float) -> float:
-        """Return the value at a place between the bounds, from 0 to 1, with six digits."""
+        """Return the value at a place from 0 to 1 between the bounds, rounded to six digits."""
         low, high = self._scaled(self.low), self._scaled(self.high)
         scaled = low + place * (high - low)
         value = float(f"{math.exp(scaled) if self.log else scaled:.6g}")
