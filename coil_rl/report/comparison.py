@@ -1,7 +1,4 @@
-"""Comparison of policies over seeds: agents grouped by label, and their guides.
-
-pandas is imported where it is used, because a training does without it.
-"""
+"""Comparison of policies over seeds: agents grouped by label, and their guides."""
 
 from __future__ import annotations
 
@@ -9,22 +6,21 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from coil_rl.errors import UserError
 from coil_rl.measures import Measure
 from coil_rl.record import DRIVER
 from coil_rl.report.guides import is_guide, shared_guides
 from coil_rl.report.runs import FALLBACK, GUIDE, Run
+from coil_rl.report.sentences import listed
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
 from coil_rl.report.table import return_format
 
-if TYPE_CHECKING:
-    import pandas as pd
-
+LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 EPISODES = "_episodes"  # suffix of the columns of `with_denominators`
 
 
@@ -42,7 +38,7 @@ class Group:
         needs_guide: whether the policy needs its guide during evaluation; None if that does not
             apply.
         measures: definitions of the measures in the table by name.
-        label: of the runs of an agent; empty for a guide.
+        labels: of the runs of an agent one; of those of a guide all that share it.
         of_runs: for a guide the number of its evaluation in the table, by label and seed of a run.
     """
 
@@ -53,7 +49,7 @@ class Group:
     guide: Group | None = None
     needs_guide: bool | None = None
     measures: Mapping[str, Measure] = field(default_factory=dict, repr=False)
-    label: str = ""
+    labels: tuple[str, ...] = ()
     of_runs: Mapping[tuple[str, int], int] = field(default_factory=dict, repr=False)
 
     @property
@@ -83,8 +79,6 @@ class Group:
         Args:
             measure: name of the measure, or "reward".
         """
-        import pandas as pd
-
         index = self.table.index.unique("seed")
         values = self.table[measure].to_numpy().reshape(len(index), -1)
         return pd.DataFrame(values, index, self.cases)
@@ -92,7 +86,8 @@ class Group:
     def beside(self, other: Group) -> tuple[list[int], list[int]]:
         """Return the seeds that this policy has in common with another one.
 
-        Of a guide with several evaluations it is the one of the same run.
+        Of a guide with several evaluations it is the one of the same run; the only one of a guide
+        without random actions is beside every seed.
 
         Args:
             other: the other policy.
@@ -101,10 +96,15 @@ class Group:
             The seeds here, and for each of them the seed in the table of the other policy.
         """
         seeds = self.table.index.unique("seed").tolist()
+        if other.is_guide and other.seeds is None:
+            return seeds, other.table.index.unique("seed").tolist() * len(seeds)
         theirs = {seed: seed for seed in other.table.index.unique("seed")}
         if other.is_guide:
-            numbers = {seed: other.of_runs.get((self.label, seed)) for seed in seeds}
-            theirs = {seed: number for seed, number in numbers.items() if number is not None}
+            theirs = {
+                seed: number
+                for (label, seed), number in other.of_runs.items()
+                if label in self.labels
+            }
         common = [seed for seed in seeds if seed in theirs]
         return common, [theirs[seed] for seed in common]
 
@@ -119,27 +119,28 @@ class Group:
         return estimate(self.returns.mean(axis=0))
 
     @cached_property
-    def of_measures(self) -> dict[str, tuple[Array, Array, Array]]:
-        """The reward and each measure: values, episodes that have one, episodes, [seeds, cases]."""
-        count, found = len(self.table.index.unique("seed")), {}
-        for name in ("reward", *self.measures):
-            if name in self.table:
-                columns = (self.table[name], *_episodes(self.table, name))
-                values, known, episodes = (each.to_numpy().reshape(count, -1) for each in columns)
-                found[name] = values, known, episodes
-        return found
+    def episodes(self) -> pd.DataFrame:
+        """How many `episodes` each result is the mean of, and how many of them have each measure.
 
-    def counts(self, case: int | None = None) -> dict[str, int]:
+        The columns are those of `with_denominators`. A run leaves them out if all of its episodes
+        have all measures; it has as many episodes as the others, or, if none has the columns, one.
+        """
+        table = self.table
+        ran = table.get("episodes", pd.Series(1, table.index))
+        counts = {"episodes": ran.fillna(ran.max()).fillna(1)}
+        for name in self.measures:
+            if name in table:
+                known = table.get(f"{name}{EPISODES}", ran).fillna(counts["episodes"])
+                counts[name] = known.clip(lower=1).where(table[name].notna(), 0)
+        return pd.DataFrame(counts)
+
+    def counts(self, case: str | None = None) -> dict[str, int]:
         """Return the number of `episodes`, and by measure in how many of them it is known.
 
         Args:
-            case: index of the only case to count; None for all of them.
+            case: the only case to count; None for all of them.
         """
-        at = slice(None) if case is None else slice(case, case + 1)
-        counts = {"episodes": int(self.of_measures["reward"][2][:, at].sum())}
-        for name in self.measures:
-            if name in self.of_measures:
-                counts[name] = int(self.of_measures[name][1][:, at].sum())
+        counts: dict[str, int] = _of_case(self.episodes, case).sum().astype(int).to_dict()
         return counts
 
     @property
@@ -161,12 +162,10 @@ class Group:
         """
         if not self.has("crashed"):
             return None
-        crashed = self.by_seed("crashed")
+        crashed, unit = (self.by_seed("crashed") > 0).to_numpy(), ""
         if self.seeds is None:
-            count = int((crashed > 0).to_numpy().sum())
-            share, _, interval = count_of_seeds(count, len(self.cases)).partition(" (")
-            return f"{share} cases ({interval}"
-        return count_of_seeds(int((crashed > 0).any(axis=1).sum()), self.seeds)
+            crashed, unit = crashed.T, " cases"
+        return count_of_seeds(int(crashed.any(axis=1).sum()), len(crashed), unit)
 
     def has(self, measure: str) -> bool:
         """Return whether a measure is known in all cases."""
@@ -178,14 +177,12 @@ class Group:
         A measure counts as often as there are episodes that have it.
 
         Args:
-            case: index of the only case to count; None for all of them.
+            case: the only case to count; None for all of them.
         """
-        at = slice(None) if case is None else slice(case, case + 1)
-        means = {"reward": float(self.of_measures["reward"][0][:, at].mean())}
-        for name, each in self.measures.items():
-            if name in self.of_measures:
-                values, known, _ = (part[:, at].ravel() for part in self.of_measures[name])
-                means[name] = each.pool(values.tolist(), known.tolist())
+        rows, counts = _of_case(self.table, case), _of_case(self.episodes, case)
+        means = {"reward": float(rows["reward"].to_numpy().mean())}
+        for name in self.episodes.columns[1:]:
+            means[name] = self.measures[name].pool(rows[name].tolist(), counts[name].tolist())
         return means
 
     def parts(self, prefix: str) -> dict[str, float]:
@@ -202,18 +199,9 @@ class Group:
         return {column: float(self.table[column].mean()) for column in columns}
 
 
-def _episodes(rows: pd.DataFrame, measure: str) -> tuple[pd.Series, pd.Series]:
-    """Return how many episodes of each result have a measure, and how many episodes there are.
-
-    The columns are those of `with_denominators`. A run leaves them out if all of its episodes have
-    all measures; it has as many episodes as the others, or, if none has the columns, one.
-    """
-    known = rows[measure].notna()
-    if "episodes" not in rows:
-        return known.astype(int), known * 0 + 1
-    episodes = rows["episodes"].fillna(rows["episodes"].max()).fillna(1)
-    counts = rows.get(f"{measure}{EPISODES}", episodes).fillna(episodes)
-    return counts.clip(lower=1).where(known, 0), episodes
+def _of_case(rows: pd.DataFrame, case: str | None) -> pd.DataFrame:
+    """Return the rows of a case of a table that is indexed by seed and case; all for None."""
+    return rows if case is None else rows.xs(case, level="case")
 
 
 @dataclass(frozen=True)
@@ -287,13 +275,13 @@ class Comparison:
         found = [each.counts() for each in self.groups]
         return [name for each in found for name in each if 0 < each[name] < each["episodes"]]
 
-    def _partial(self, group: Group, case: int | None = None) -> dict[str, int]:
+    def _partial(self, group: Group, case: str | None = None) -> dict[str, int]:
         """Return in how many episodes each measure is known, unless it is in all episodes.
 
         With such a measure the number of all episodes is among them.
 
         Args:
-            case: index of the only case to count; None for all of them.
+            case: the only case to count; None for all of them.
         """
         if not self._unknown:
             return {}
@@ -306,9 +294,8 @@ class Comparison:
         rows = []
         for group in self.groups:
             about = {"driver": group.name, "advice": group.advice, "seeds": group.seeds}
-            for index, case in enumerate(group.cases):
-                means, counts = group.means(index), self._partial(group, index)
-                rows.append(about | {"case": case} | means | counts)
+            for case in group.cases:
+                rows.append(about | {"case": case} | group.means(case) | self._partial(group, case))
         return rows
 
     def unpaired(self, against: str | None) -> list[str]:
@@ -320,9 +307,7 @@ class Comparison:
         names = []
         for group in self.agents:
             other = self._other(group, against)
-            if other is None or group.advice or _is_shared(other):
-                continue
-            if not group.beside(other)[0]:
+            if other is not None and not group.advice and not group.beside(other)[0]:
                 names.append(group.name)
         return names
 
@@ -333,11 +318,8 @@ class Comparison:
 
     def _other(self, group: Group, against: str | None) -> Group | None:
         """Return the policy that a group is compared with; None if there is none."""
-        if against == GUIDE:
-            other = group.guide
-        else:
-            agents = {agent.name: agent for agent in self.agents if not agent.advice}
-            other = agents.get(against or "")
+        agents = {agent.name: agent for agent in self.agents if not agent.advice}
+        other = group.guide if against == GUIDE else agents.get(against or "")
         return None if other is group or group.is_guide else other
 
 
@@ -352,67 +334,40 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
         UserError: if two runs have the same label and seed, or the same label and other cases.
     """
     finished = [run for run in runs if run.finished]
-    labels = {
-        label: _join_runs([run for run in finished if run.label == label])
-        for label in dict.fromkeys(run.label for run in finished)
-    }
-    measures = _definitions(finished)
-    guides = _group_guides(labels, measures)
-    unique = dict.fromkeys(chain.from_iterable(guides.values()))
-    needs_guide = {run.label: run.needs_guide for run in reversed(finished)}
+    labels: dict[str, pd.DataFrame] = {}
+    needs_guide: dict[str, bool | None] = {}
+    measures: dict[str, Measure] = {}
+    for run in reversed(finished):  # the first run of a name defines it
+        measures |= run.measures
+        needs_guide[run.label] = run.needs_guide
+    for label in dict.fromkeys(run.label for run in finished):
+        labels[label] = _join_runs([run for run in finished if run.label == label])
+    guides = _guides(labels, measures)
     agents: list[Group] = []
     for label, frame in labels.items():
         rows = frame[~is_guide(frame) & (frame["actions"] == actions)]
-        best_guide = guides[label][0] if label in guides else None
-        variants = _variants(label, rows, measures, best_guide, needs_guide[label])
-        agents += sorted(variants, key=lambda group: (group.advice != "", group.rank))
+        for (driver, advice), own in rows.groupby(["driver", "advice"], sort=False):
+            needs = None if advice else needs_guide[label] or driver.endswith(FALLBACK)
+            agents.append(
+                Group(
+                    driver,
+                    advice,
+                    _index(driver, own),
+                    guide=next((each for each in guides if label in each.labels), None),
+                    needs_guide=needs,
+                    measures=measures,
+                    labels=(label,),
+                )
+            )
+    agents.sort(key=lambda group: (group.advice != "", group.rank))
     # The first group of a name is the one with unaltered advice.
     best = {group.name: group.rank for group in reversed(agents)}
     agents.sort(key=lambda group: (best[group.name], group.name))
-    ranked = tuple(sorted(unique, key=lambda group: group.rank))
-    return Comparison(ranked, tuple(agents))
-
-
-def _definitions(runs: Sequence[Run]) -> dict[str, Measure]:
-    """Return the measures of all runs by name, as the first run defines each of them."""
-    measures: dict[str, Measure] = {}
-    for run in reversed(runs):
-        measures |= run.measures
-    return measures
-
-
-def _variants(
-    label: str,
-    rows: pd.DataFrame,
-    measures: Mapping[str, Measure],
-    guide: Group | None,
-    needs_guide: bool | None,
-) -> list[Group]:
-    """Return the agent of a label, with each alteration of its advice, and with a fallback.
-
-    Args:
-        measures: definitions by name.
-        needs_guide: whether it needs the guide during evaluation.
-    """
-    variants = []
-    for (driver, advice), own in rows.groupby(["driver", "advice"], sort=False):
-        variant = Group(
-            driver,
-            advice,
-            _index(driver, own),
-            guide=guide,
-            needs_guide=None if advice else needs_guide or driver.endswith(FALLBACK),
-            measures=measures,
-            label=label,
-        )
-        variants.append(variant)
-    return variants
+    return Comparison(tuple(guides), tuple(agents))
 
 
 def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:
     """Join the evaluations of the runs of one label."""
-    import pandas as pd
-
     first: dict[int, Run] = {}
     for run in runs:
         if run.seed in first:
@@ -437,28 +392,32 @@ def _index(name: str, rows: pd.DataFrame) -> pd.DataFrame:
     return rows.set_index(["seed", "case"]).drop(columns=list(DRIVER), errors="ignore")
 
 
-def _group_guides(
-    labels: Mapping[str, pd.DataFrame], measures: Mapping[str, Measure]
-) -> dict[str, list[Group]]:
-    """Return the guides of each label, best first.
+def _guides(labels: Mapping[str, pd.DataFrame], measures: Mapping[str, Measure]) -> list[Group]:
+    """Return the different guides of all labels, best first.
 
     Args:
         labels: the evaluations by label.
         measures: definitions by name.
     """
-    guides = shared_guides(labels)
-    names = [guide.name for guide in guides]
-    groups: dict[str, list[Group]] = {}
-    for guide in guides:
-        is_unique = names.count(guide.name) == 1
-        name = guide.name if is_unique else f"{guide.name} ({guide.listed()})"
-        table = _index(f"the guide of {guide.labels[0]}", guide.rows())
-        group = Group(name, "", table, is_guide=True, measures=measures, of_runs=guide.numbers())
-        for label in guide.labels:
-            groups.setdefault(label, []).append(group)
-    return {
-        label: sorted(of_label, key=lambda group: group.rank) for label, of_label in groups.items()
-    }
+    guides, different = shared_guides(labels)
+    names = [name for name, _ in guides]
+    groups = []
+    for name, of_runs in guides:
+        own = tuple(dict.fromkeys(label for label, _ in of_runs))
+        places = {number: place for place, number in enumerate(dict.fromkeys(of_runs.values()))}
+        rows = pd.concat([different[number].assign(seed=place) for number, place in places.items()])
+        groups.append(
+            Group(
+                name if names.count(name) == 1 else f"{name} ({listed(own, LABELS_IN_NAME)})",
+                "",
+                _index(f"the guide of {own[0]}", rows),
+                is_guide=True,
+                measures=measures,
+                labels=own,
+                of_runs={run: places[number] for run, number in of_runs.items()},
+            )
+        )
+    return sorted(groups, key=lambda group: group.rank)
 
 
 @dataclass(frozen=True)
@@ -492,10 +451,8 @@ def paired(group: Group, other: Group, measure: str = "reward") -> Paired | None
     """
     if group.cases != other.cases:
         return None
-    ours, theirs = group.by_seed(measure), other.by_seed(measure)
-    if not _is_shared(other):
-        seeds, of_other = group.beside(other)
-        ours, theirs = ours.loc[seeds], theirs.loc[of_other]
+    seeds, of_other = group.beside(other)
+    ours, theirs = group.by_seed(measure).loc[seeds], other.by_seed(measure).loc[of_other]
     x, y = ours.to_numpy(), theirs.to_numpy()
     counts = np.isfinite(x) & np.isfinite(y)
     if not x.size or not counts.any(axis=1).all():
@@ -504,8 +461,3 @@ def paired(group: Group, other: Group, measure: str = "reward") -> Paired | None
         return None
     differences = np.where(counts, x - y, 0).sum(axis=1) / counts.sum(axis=1)
     return Paired(estimate(differences), float(wins(x, y)[counts].mean()))
-
-
-def _is_shared(other: Group) -> bool:
-    """Return whether all seeds are compared with one value: of a guide without random actions."""
-    return other.is_guide and other.seeds is None

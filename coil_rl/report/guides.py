@@ -7,62 +7,21 @@ have one number, so that guides are compared by sets of numbers.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from coil_rl.report.configurations import guide_follows_seed, of_guide
 from coil_rl.report.runs import GUIDE, Run
 from coil_rl.report.sentences import REPORT, listed
-from coil_rl.report.statistics import Array
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 SAME_RETURN = 1e-5  # of the range of the compared returns; the rest is rounding
-LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 MOST_SEEDS = 4  # in a part of the seeds of a label
 
 Numbers = dict[str, dict[str, dict[int, int]]]  # of evaluations, by guide, label and seed
-
-
-@dataclass(frozen=True, eq=False)
-class Guide:
-    """A guide that some labels share.
-
-    Attributes:
-        name: "guide", or "guide NAME".
-        different: the different evaluations of all guides.
-        labels: which share the guide.
-        of_runs: the number of the evaluation of each run in `different`, by label and seed.
-    """
-
-    name: str
-    different: Sequence[pd.DataFrame]
-    labels: list[str] = field(default_factory=list)
-    of_runs: dict[tuple[str, int], int] = field(default_factory=dict)
-
-    def listed(self) -> str:
-        """Return the labels as a text, the first ones of many."""
-        return listed(self.labels, LABELS_IN_NAME)
-
-    @property
-    def own(self) -> list[int]:
-        """The numbers of its different evaluations."""
-        return list(dict.fromkeys(self.of_runs.values()))
-
-    def numbers(self) -> dict[tuple[str, int], int]:
-        """Return the place of the evaluation of each run in `rows`, by label and seed."""
-        return {run: self.own.index(number) for run, number in self.of_runs.items()}
-
-    def rows(self) -> pd.DataFrame:
-        """Return all different evaluations, numbered by the column `seed`."""
-        import pandas as pd
-
-        tables = [self.different[number] for number in self.own]
-        return pd.concat([rows.assign(seed=place) for place, rows in enumerate(tables)])
+OfRuns = dict[tuple[str, int], int]  # numbers of the evaluations of one guide, by label and seed
 
 
 def is_guide(frame: pd.DataFrame) -> pd.Series:
@@ -71,8 +30,10 @@ def is_guide(frame: pd.DataFrame) -> pd.Series:
     return drivers.isin([name for name in drivers.unique() if name.split()[:1] == [GUIDE]])
 
 
-def shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[Guide]:
-    """Return the different guides of all labels.
+def shared_guides(
+    labels: Mapping[str, pd.DataFrame],
+) -> tuple[list[tuple[str, OfRuns]], list[pd.DataFrame]]:
+    """Return the different guides of all labels by their names, and the different evaluations.
 
     Every run evaluates its guides: equal results of one guide count once, and labels share a guide
     if the results of one contain those of the other. A guide with random actions has one result per
@@ -85,18 +46,17 @@ def shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[Guide]:
     for label, frame in labels.items():
         tables += [(label, seed, rows) for seed, rows in frame.groupby("seed", sort=False)]
     numbers, different = _numbered(tables)
-    guides: list[Guide] = []
+    guides: list[tuple[str, OfRuns]] = []
     for name, of_labels in numbers.items():
-        of_name: list[Guide] = []
+        of_name: list[OfRuns] = []
         for label, of_seeds in of_labels.items():
-            same = next((each for each in of_name if _share(of_seeds.values(), each.own)), None)
-            if same is None:
-                same = Guide(name, different)
-                of_name.append(same)
-            same.labels.append(label)
-            same.of_runs.update({(label, seed): number for seed, number in of_seeds.items()})
-        guides += of_name
-    return guides
+            shared = (each for each in of_name if _share(of_seeds.values(), each.values()))
+            guide = next(shared, {})
+            if not guide:
+                of_name.append(guide)
+            guide.update({(label, seed): number for seed, number in of_seeds.items()})
+        guides += [(name, guide) for guide in of_name]
+    return guides, different
 
 
 def of_changed_guides(runs: Sequence[Run]) -> list[str]:
@@ -145,13 +105,10 @@ def of_guides_of_labels(runs: Sequence[Run]) -> list[str]:
 
 def _without_seed(runs: Sequence[Run]) -> tuple[Numbers, list[pd.DataFrame]]:
     """Return the evaluations of the guides that do not depend on the seed, see `_numbered`."""
-    follow = set()
-    for label in dict.fromkeys(run.label for run in runs):
-        if guide_follows_seed([run for run in runs if run.label == label]):
-            follow.add(label)
-    return _numbered(
-        (run.label, run.seed, run.evaluation) for run in runs if run.label not in follow
-    )
+    labels = dict.fromkeys(run.label for run in runs)
+    of_labels = ([run for run in runs if run.label == label] for label in labels)
+    kept = chain.from_iterable(each for each in of_labels if not guide_follows_seed(each))
+    return _numbered((run.label, run.seed, run.evaluation) for run in kept)
 
 
 def _numbered(
@@ -183,20 +140,16 @@ def _share(ours: Iterable[int], theirs: Iterable[int]) -> bool:
 
 
 def _is_same(one: pd.DataFrame, other: pd.DataFrame) -> bool:
-    """Return whether two evaluations have the same cases and returns."""
-    if one["case"].tolist() != other["case"].tolist():
-        return False
-    return _same_returns(one["reward"].to_numpy(float), other["reward"].to_numpy(float))
-
-
-def _same_returns(one: Array, other: Array) -> bool:
-    """Return whether two evaluations of guides in the same cases have the same returns.
+    """Return whether two evaluations of guides have the same cases and returns.
 
     The allowed difference is small beside the range of these returns, so that it fits any unit and
     any centre, and large beside what the rounding of a batch of another size makes of one guide:
     2e-6 of the range in the cone world. A single case has no range but its own return.
     """
-    both = np.concatenate([one, other, [0.0]]) if len(one) == 1 else np.concatenate([one, other])
-    both = both[np.isfinite(both)]
-    tolerance = SAME_RETURN * float(np.ptp(both)) if both.size else 0.0
-    return np.allclose(one, other, rtol=1e-7, atol=tolerance, equal_nan=True)
+    if one["case"].tolist() != other["case"].tolist():
+        return False
+    returns = np.array([one["reward"], other["reward"]], float)
+    ends = np.append(returns, 0.0) if len(one) == 1 else returns
+    ends = ends[np.isfinite(ends)]
+    tolerance = SAME_RETURN * float(np.ptp(ends)) if ends.size else 0.0
+    return np.allclose(*returns, rtol=1e-7, atol=tolerance, equal_nan=True)

@@ -50,33 +50,21 @@ def section(
 def _columns(
     comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None
 ) -> dict[str, tuple[str, str]]:
-    """Return heading and format of the columns of the table of policies."""
-    hidden = _hidden(rows, against)
+    """Return heading and format of the columns of the table of policies, without empty ones."""
+    hidden = set() if against else {"difference cell", "p", "better"}
+    for key in ("advice", "completed", "crashes"):
+        if all(row[key] in (None, "") for row in rows):
+            hidden.add(key)
     columns: dict[str, tuple[str, str]] = {}
     for key, (text, spec) in TABLES["drivers"]["columns"].items():
         if key not in hidden:
             columns[key] = (text.format(other=_other(against)), spec)
-    for group in comparison.groups:
-        for name, measure in group.measures.items():
-            has_column = name in ("completed", "crashed") or name.startswith(PER_STEP)
-            heading = measure.heading(name)
-            if heading and not has_column:
-                columns[name] = (heading, measure.format)
+    for name, measure in chain.from_iterable(each.measures.items() for each in comparison.groups):
+        has_column = name in ("completed", "crashed") or name.startswith(PER_STEP)
+        if measure.heading(name) and not has_column:
+            columns[name] = (measure.heading(name), measure.format)
     columns["needs_guide"] = ("guide at test time", "")
     return columns
-
-
-def _hidden(rows: Sequence[Mapping[str, Any]], against: str | None) -> set[str]:
-    """Return the keys of columns that would say nothing."""
-    hidden = set()
-    if not any(row["advice"] for row in rows):
-        hidden.add("advice")
-    if against is None:
-        hidden |= {"difference cell", "p", "better"}
-    for key in ("completed", "crashes"):
-        if all(row[key] is None for row in rows):
-            hidden.add(key)
-    return hidden
 
 
 def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, Any]]:
@@ -197,16 +185,15 @@ def summary(tables: Mapping[str, Sequence[Mapping[str, Any]]], against: str | No
         tables: `Comparison.table(against)`, by env.
         against: what the policies are compared with, see `Comparison.table`.
     """
-    found: dict[str, list[Mapping[str, Any]]] = {}
+    found: dict[str, Counter[str]] = {}
     for row in chain.from_iterable(tables.values()):
         if row["difference_seeds"] is not None and not row["advice"]:
-            found.setdefault(row["driver"], []).append(row)
-    rows: list[dict[str, Any]] = []
-    for driver, differences in found.items():
-        better = sum(row["difference_low"] > 0 for row in differences)
-        worse = sum(row["difference_high"] < 0 for row in differences)
-        even = len(differences) - better - worse
-        rows.append({"driver": driver, "better": better, "even": even, "worse": worse})
+            signs = {"better": row["difference_low"] > 0, "worse": row["difference_high"] < 0}
+            sign = next((name for name, is_so in signs.items() if is_so), "even")
+            found.setdefault(row["driver"], Counter()).update([sign])
+    rows = [
+        {"driver": driver, "better": 0, "even": 0, "worse": 0, **of} for driver, of in found.items()
+    ]
     columns = {
         "driver": (f"in how many envs beside {_other(against)}", ""),
         "better": ("better", "d"),
@@ -302,8 +289,8 @@ def cases_table(groups: Sequence[Group], file: str) -> Block:
     rows = []
     for group in groups:
         row: dict[str, Any] = {"driver": group.title}
-        for index, case in enumerate(group.cases):
-            means = group.means(index)
+        for case in group.cases:
+            means = group.means(case)
             reward, completed = means["reward"], means.get("completed", 1.0)
             row[f"{IN_CASE}{case}"] = (
                 f"{reward:{spec}} ({completed:.0%} completed)" if completed < 1 else reward

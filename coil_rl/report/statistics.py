@@ -136,16 +136,17 @@ def holm(p_values: ArrayLike) -> Array:
     return adjusted
 
 
-def count_of_seeds(count: int, seeds: int) -> str:
+def count_of_seeds(count: int, seeds: int, unit: str = "") -> str:
     """Return a number of seeds and the 95 % interval of its share as a table cell.
 
     Args:
         seeds: number of all seeds. The interval is that of Clopper and Pearson.
+        unit: after the numbers, where other things than seeds are counted.
     """
     from scipy import stats
 
     interval = stats.binomtest(count, seeds).proportion_ci(method="exact")
-    return f"{count} of {seeds} ({interval.low:.0%} to {interval.high:.0%})"
+    return f"{count} of {seeds}{unit} ({interval.low:.0%} to {interval.high:.0%})"
 
 
 def wins(x: ArrayLike, y: ArrayLike) -> Array:

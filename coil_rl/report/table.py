@@ -4,7 +4,6 @@ import math
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from itertools import chain
 from numbers import Real
@@ -62,60 +61,86 @@ class Cell(NamedTuple):
     number: float | None = None
 
 
-@dataclass(frozen=True, eq=False)
 class Table:
-    """A table for people, in Markdown or cell by cell.
+    """A table for people, in Markdown, in LaTeX or cell by cell.
 
     Args:
         rows: as `markdown_table` takes them.
         columns: as `markdown_table` takes them.
+
+    Attributes:
+        headings: of the columns.
+        specs: number formats of the columns, none of them `AUTO_FORMAT`.
+        numeric: whether each column has only numbers; none has without rows.
+        cells: of each row.
+
+    Raises:
+        ValueError: if no row has a column, or a number does not fit its format.
     """
 
-    rows: Rows
-    columns: Columns
+    def __init__(self, rows: Rows, columns: Columns) -> None:
+        keys = dict.fromkeys(chain.from_iterable(rows))
+        for key, (heading, _) in columns.items():
+            if rows and key not in keys:
+                raise ValueError(
+                    f"No row has {key!r} for the column {heading!r}; "
+                    f"the rows have: {', '.join(keys)}."
+                )
+        values = [[plain(row.get(key)) for row in rows] for key in columns]  # by column
+        self.headings = [heading for heading, _ in columns.values()]
+        self.specs = [
+            return_format(filter(_is_number, column)) if spec == AUTO_FORMAT else spec
+            for (_, spec), column in zip(columns.values(), values, strict=True)
+        ]
+        self.numeric = [
+            bool(column) and all(_is_missing(value) or _is_number(value) for value in column)
+            for column in values
+        ]
+        of_columns = [
+            [_cell(value, spec) for value in column]
+            for column, spec in zip(values, self.specs, strict=True)
+        ]
+        self.cells = list(map(list, zip(*of_columns, strict=True)))
 
     def __str__(self) -> str:
-        """Return the table in Markdown."""
-        return markdown_table(self.rows, self.columns)
+        """Return the table in Markdown; columns of numbers are right-aligned."""
+        lines = [[" ".join(heading.split()) for heading in self.headings]]
+        lines += [[cell.text for cell in row] for row in self.cells]
+        columns, rule = [], []
+        for number, is_numeric in enumerate(self.numeric):
+            column = [line[number].replace("|", "\\|") for line in lines]
+            width = max(map(len, column))
+            columns.append([f" {text:{'>' if is_numeric else '<'}{width}} " for text in column])
+            left = "-" if is_numeric or not self.cells else ":"
+            rule.append(f"{left}{'-' * width}{':' if is_numeric else '-'}")
+        heading, *others = zip(*columns, strict=True)
+        return "\n".join(f"|{'|'.join(line)}|" for line in (heading, rule, *others))
 
     def latex(self) -> str:
         """Return the table as LaTeX, for the package booktabs."""
-        columns = "".join("r" if each else "l" for each in self.numeric)
-        rows = [self.headings, *([cell.text for cell in row] for row in self.cells)]
-        first, *others = (rf"{' & '.join(map(_latex, row))} \\" for row in rows)
-        lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", first, r"\midrule"]
-        return "\n".join([*lines, *others, r"\bottomrule", r"\end{tabular}"])
+        import pandas as pd  # a training writes no LaTeX
 
-    @property
-    def headings(self) -> list[str]:
-        """Headings of the columns."""
-        return [heading for heading, _ in self.columns.values()]
-
-    @property
-    def numeric(self) -> list[bool]:
-        """Whether each column has only numbers; none has without rows."""
-        return _numeric(_values(self.rows, self.columns)) or [False] * len(self.columns)
-
-    @property
-    def cells(self) -> list[list[Cell]]:
-        """The cells of each row."""
-        values = _values(self.rows, self.columns)
-        specs = _specs(values, self.columns)
-        return [
-            [_cell(value, spec) for value, spec in zip(row, specs, strict=True)] for row in values
-        ]
+        texts = [[cell.text for cell in row] for row in self.cells]
+        alignment = "".join("r" if each else "l" for each in self.numeric)
+        frame = pd.DataFrame(texts, columns=self.headings)
+        text: str = frame.to_latex(index=False, escape=True, column_format=alignment)
+        return text.replace("<", r"\textless ").strip()
 
 
 def _cell(value: object, spec: str) -> Cell:
-    text = _format(value, spec)
-    if not _is_missing(value) and _is_number(value):
-        return Cell(text, float(value))
+    if _is_missing(value):
+        return Cell("-")
+    if isinstance(value, bool):
+        return Cell("yes" if value else "no")
+    if _is_number(value):
+        return Cell(p_text(value) if spec == P_FORMAT else format(value, spec), float(value))
+    text = " ".join(str(value).split())
     number = re.match(r"[-+]?\d[\d,]*(\.\d+)?", text)
     return Cell(text, float(number[0].replace(",", "")) if number else None)
 
 
 def markdown_table(rows: Rows, columns: Columns) -> str:
-    """Return a Markdown table; columns of numbers are right-aligned.
+    """Return a Markdown table.
 
     Args:
         rows: one mapping per line. Missing keys, None and NaN become "-", booleans yes and no; text
@@ -138,22 +163,7 @@ def markdown_table(rows: Rows, columns: Columns) -> str:
         | guide  |    31.2 | no    |
         | agent  |       - | yes   |
     """
-    values = _values(rows, columns)
-    specs = _specs(values, columns)
-    lines = [[_escaped(_format(heading, "")).strip() for heading, _ in columns.values()]]
-    for row in values:
-        cells = zip(row, specs, strict=True)
-        lines.append([_escaped(_format(value, spec)).strip() for value, spec in cells])
-    right = _numeric(values) or [False] * len(columns)
-    rule = []
-    for column, numbers in enumerate(right):
-        width = max(len(line[column]) for line in lines)
-        for line in lines:
-            line[column] = f" {line[column]:{'>' if numbers else '<'}{width}} "
-        rule.append(f"{'-' * (width + 1)}:" if numbers else f":{'-' * (width + 1)}")
-    if not values:
-        rule = ["-" * len(cell) for cell in lines[0]]
-    return "\n".join(f"|{'|'.join(line)}|" for line in (lines[0], rule, *lines[1:]))
+    return str(Table(rows, columns))
 
 
 def fitted(rows: Rows, columns: Columns) -> dict[str, tuple[str, str]]:
@@ -162,49 +172,8 @@ def fitted(rows: Rows, columns: Columns) -> dict[str, tuple[str, str]]:
     Args:
         columns: as `markdown_table` takes them.
     """
-    specs = _specs(_values(rows, columns), columns)
-    headings = ((name, heading) for name, (heading, _) in columns.items())
-    return {name: (heading, spec) for (name, heading), spec in zip(headings, specs, strict=True)}
-
-
-def _values(rows: Rows, columns: Columns) -> list[list[object]]:
-    """Return the values of each row in the order of the columns."""
-    keys = dict.fromkeys(chain.from_iterable(rows))
-    for key, (heading, _) in columns.items():
-        if rows and key not in keys:
-            raise ValueError(
-                f"No row has {key!r} for the column {heading!r}; the rows have: {', '.join(keys)}."
-            )
-    return [[plain(row.get(key)) for key in columns] for row in rows]
-
-
-def _specs(values: Sequence[Sequence[object]], columns: Columns) -> list[str]:
-    """Return the number format of each column, given the values of each row."""
-    specs = [spec for _, spec in columns.values()]
-    for index, spec in enumerate(specs):
-        if spec == AUTO_FORMAT:
-            column = [row[index] for row in values]
-            specs[index] = return_format(float(each) for each in column if _is_number(each))
-    return specs
-
-
-def _numeric(values: Sequence[Sequence[object]]) -> list[bool]:
-    """Return whether each column has only numbers, given the values of each row."""
-    return [
-        all(_is_missing(value) or _is_number(value) for value in column)
-        for column in zip(*values, strict=True)
-    ]
-
-
-def _latex(text: str) -> str:
-    """Return a text as LaTeX shows it."""
-    escaped = re.sub(r"([&%$#_{}])", r"\\\1", text.replace("\\", r"\textbackslash "))
-    escaped = escaped.replace("~", r"\textasciitilde ").replace("^", r"\textasciicircum ")
-    return escaped.replace("<", r"\textless ")
-
-
-def _escaped(text: str) -> str:
-    return text.replace("|", "\\|")
+    table = Table(rows, columns)
+    return dict(zip(columns, zip(table.headings, table.specs, strict=True), strict=True))
 
 
 def write_csv(rows: Sequence[Mapping[str, object]], path: str | os.PathLike[str]) -> None:
@@ -225,13 +194,3 @@ def _is_missing(value: object) -> bool:
 
 def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, Real) and not isinstance(value, bool)
-
-
-def _format(value: object, spec: str) -> str:
-    if _is_missing(value):
-        return "-"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if _is_number(value):
-        return p_text(value) if spec == P_FORMAT else format(value, spec)
-    return " ".join(str(value).split())
