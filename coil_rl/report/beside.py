@@ -48,22 +48,18 @@ def draw_beside_guides(
         strokes: by label, for the colours.
     """
     shown = dict(list(beside.items())[:MAX_PANELS])
-    columns = min(COLUMNS, len(shown))
-    rows = -(-len(shown) // columns)
+    rows = -(-len(shown) // COLUMNS)
     handles = [
         Line2D([], [], color=style.INK, label="better than the guide"),
         Line2D([], [], color=style.KERB, label="not better (grey)"),
     ]
     height = 0.3 + PANEL_HEIGHT * rows
     with style.picture(path, None, handles, height, add_header=True, h_pad=0.08) as figure:
-        grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
-        for axes, (label, (guide, policy)) in zip(grid, shown.items(), strict=False):
+        grid = style.panels(figure, list(shown), COLUMNS, size=8)
+        for axes, (label, (guide, policy)) in zip(grid, shown.items(), strict=True):
             style.lighten(axes)
             for ends in np.stack([guide, policy], 1)[:MAX_CASES]:
                 colour = strokes[label].colour if ends[1] > ends[0] else style.KERB
                 axes.plot([0, 1], ends, "o-", color=colour, lw=1, ms=2.5, alpha=0.7)
-            axes.set_title(label, size=8, loc="left")
             axes.set(xlim=(-0.15, 1.15), xticks=[0, 1], xticklabels=["guide", "policy"])
-        for axes in figure.axes[len(shown) :]:
-            axes.remove()
         figure.supylabel("return", size=9)

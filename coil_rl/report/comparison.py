@@ -171,7 +171,7 @@ class Group:
         """Return whether a measure is known in all cases."""
         return measure in self.table and not self.table[measure].isna().to_numpy().any()
 
-    def means(self, case: int | None = None) -> dict[str, float]:
+    def means(self, case: str | None = None) -> dict[str, float]:
         """Return reward and measures over seeds and cases: means, of minima the smallest.
 
         A measure counts as often as there are episodes that have it.

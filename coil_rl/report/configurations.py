@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -62,8 +62,6 @@ MOST_KEYS = 3  # that nobody typed
 
 
 Differing = list[dict[str, str]]  # rows of a table: the new name, and what differs
-# By name: the keys that differ in its runs, and the indices of the runs of each configuration.
-Configurations = dict[str, tuple[list[str], list[list[int]]]]
 
 
 def distinguish(runs: Sequence[Run]) -> tuple[list[Run], Differing]:
@@ -72,17 +70,9 @@ def distinguish(runs: Sequence[Run]) -> tuple[list[Run], Differing]:
     Returns:
         The runs in their order, and a row for each label that is new.
     """
-    configurations: Configurations = {}
-    for label in dict.fromkeys(run.label for run in runs):
-        of_label = [index for index, run in enumerate(runs) if run.label == label]
-        keys = differing([runs[index] for index in of_label])
-        configurations[label] = keys, _alike(runs, of_label, keys)
-    named, rows = _named(runs, configurations)
-    distinguished = list(runs)
-    for label, indices in named.items():
-        for index in indices:
-            distinguished[index] = _relabelled(runs[index], label)
-    return distinguished, rows
+    named, rows = _named(runs, lambda run: run.label, lambda _: True)
+    labels = {run: label for label, of_label in named.items() for run in of_label}
+    return [_relabelled(run, labels[run]) for run in runs], rows
 
 
 def by_test(runs: Sequence[Run]) -> tuple[dict[str, list[Run]], Differing]:
@@ -92,15 +82,7 @@ def by_test(runs: Sequence[Run]) -> tuple[dict[str, list[Run]], Differing]:
         The runs by a name, with a number where one env has several tests, and a row for each of
         these names.
     """
-    envs: dict[str, list[int]] = {}
-    for index, run in enumerate(runs):
-        envs.setdefault(env_name(run), []).append(index)
-    tests: Configurations = {}
-    for env, of_env in envs.items():
-        keys = [key for key in differing([runs[index] for index in of_env]) if _is_of_test(key)]
-        tests[env] = keys, _alike(runs, of_env, keys)
-    named, rows = _named(runs, tests)
-    return {name: [runs[index] for index in indices] for name, indices in named.items()}, rows
+    return _named(runs, env_name, _is_of_test)
 
 
 def env_name(run: Run) -> str:
@@ -116,29 +98,38 @@ def _is_of_test(key: str) -> bool:
     return is_part(key, TEST) and key.rpartition(".")[2] not in BATCH
 
 
-def _alike(runs: Sequence[Run], indices: Sequence[int], keys: Sequence[str]) -> list[list[int]]:
-    """Return the indices of runs in groups that have the same values of some keys."""
-    groups: dict[str, list[int]] = {}
-    for index in indices:
-        values = relevant(runs[index])
-        groups.setdefault(repr([values.get(key) for key in keys]), []).append(index)
-    return list(groups.values())
+def _named(
+    runs: Sequence[Run], name_of: Callable[[Run], str], divides: Callable[[str], bool]
+) -> tuple[dict[str, list[Run]], Differing]:
+    """Return runs by short names, and a row for each name that is new.
 
-
-def _named(runs: Sequence[Run], found: Configurations) -> tuple[dict[str, list[int]], Differing]:
-    """Return indices of runs by short names, and a row for each name that is new."""
-    named: dict[str, list[int]] = {}
-    rows: Differing = []
+    Args:
+        name_of: gives a run the name that it has at first.
+        divides: whether runs of one name get different ones where a key of theirs differs.
+    """
+    of_names: dict[str, list[Run]] = {}
+    for run in runs:
+        of_names.setdefault(name_of(run), []).append(run)
+    found: dict[str, tuple[list[list[Run]], list[str]]] = {}
+    for name, of_name in of_names.items():
+        keys = list(filter(divides, differing(of_name)))
+        alike: dict[str, list[Run]] = {}
+        for run in of_name:
+            values = relevant(run)
+            alike.setdefault(repr([values.get(key) for key in keys]), []).append(run)
+        groups = list(alike.values())
+        found[name] = groups, _what_differs(groups, keys, divides)
     unchanged = {
-        name for name, (_, of) in found.items() if len(of) == 1 and len(name) <= LONGEST_NAME
+        name for name, (of, _) in found.items() if len(of) == 1 and len(name) <= LONGEST_NAME
     }
-    for name, (keys, of_name) in found.items():
-        told = _what_differs([[runs[index] for index in each] for each in of_name], keys)
-        for indices, differs in zip(of_name, told, strict=True):
-            new = (
-                name if name in unchanged else _free_name(name, {*unchanged, *named}, len(of_name))
-            )
-            named[new] = indices
+    named: dict[str, list[Run]] = {}
+    rows: Differing = []
+    for name, (groups, told) in found.items():
+        for group, differs in zip(groups, told, strict=True):
+            new = name
+            if name not in unchanged:
+                new = _free_name(name, {*unchanged, *named}, len(groups))
+            named[new] = group
             if new != name:
                 cut = "" if len(name) <= LONGEST_NAME else f"of {name}"
                 rows.append({"name": new, "differs": ", ".join(filter(None, (cut, differs)))})
@@ -156,24 +147,25 @@ def _free_name(name: str, taken: Collection[str], several: int) -> str:
     return next(each for each in numbers if each not in taken)
 
 
-def _what_differs(groups: Sequence[Sequence[Run]], keys: Sequence[str]) -> list[str]:
+def _what_differs(
+    groups: Sequence[Sequence[Run]], keys: Sequence[str], divides: Callable[[str], bool]
+) -> list[str]:
     """Return what was typed for all runs of each of some groups, and not for all groups, as a text.
 
     Where that does not tell them apart, it is values of their configurations.
 
     Args:
         keys: that tell the groups apart.
+        divides: see `_named`; words of other keys are left out.
     """
     if len(groups) == 1:
         return [""]
     common = [_common([_typed(run) for run in runs]) for runs in groups]
     values = [_common([relevant(run) for run in runs]) for runs in groups]
-    typed = list(dict.fromkeys(itertools.chain.from_iterable(common)))
+    typed = list(filter(divides, dict.fromkeys(itertools.chain.from_iterable(common))))
     typed = [key for key in typed if len({words.get(key) for words in common}) > 1]
     # Two words may write one value.
     typed = [key for key in typed if key in keys or not any(key in of for of in values)]
-    if all(map(_is_of_test, keys)):
-        typed = list(filter(_is_of_test, typed))
     telling = _telling_first(keys, values)
     texts = [
         [words.get(key) or f"{key}={_text(of[key])}" for key in typed if key in words or key in of]
@@ -201,11 +193,7 @@ def _common(nodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def _typed(run: Run) -> dict[str, str]:
     """Return the words of the command of a run on which its numbers depend, by their key."""
     words = {word.partition("=")[0].lstrip("+~"): word for word in run.command[1:]}
-    return {
-        key: word
-        for key, word in words.items()
-        if not is_part(key, IRRELEVANT) and not key.startswith("hydra.")
-    }
+    return {key: word for key, word in words.items() if not is_part(key, (*IRRELEVANT, "hydra"))}
 
 
 def of_several_conditions(runs: Sequence[Run]) -> list[str]:
@@ -313,12 +301,12 @@ def relevant(run: Run) -> dict[str, Any]:
 
     The seed in the path of another run, as in `seed3`, is left out.
     """
-    values: dict[str, Any] = {}
-    for name, value in leaves(run.settings).items():
-        if is_part(name, IRRELEVANT):
-            continue
-        is_text = isinstance(value, str)
-        values[name] = re.sub(rf"seed{run.seed}(?!\d)", "seed", value) if is_text else value
+    values = {
+        name: value for name, value in leaves(run.settings).items() if not is_part(name, IRRELEVANT)
+    }
+    for name, value in values.items():
+        if isinstance(value, str):
+            values[name] = re.sub(rf"seed{run.seed}(?!\d)", "seed", value)
     return values
 
 

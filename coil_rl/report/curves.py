@@ -59,10 +59,8 @@ def draw_learning_curves(
     returns = RETURNS if cases is None else f"{RETURNS}, mean of {cases} cases"
     curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
     strokes = strokes or style.strong_strokes(runs)
-    handles: list[Artist] = []
-    for label, seeds in runs.items():
-        line = {"color": strokes[label].colour, "ls": strokes[label].linestyle}
-        handles.append(Line2D([], [], lw=2, label=_with_count(label, seeds), **line))
+    named = {_with_count(label, seeds): strokes[label] for label, seeds in runs.items()}
+    handles = style.handles(named, lw=2)
     handles += _spread_handles(runs.values(), style.QUIET)
     with style.picture(path, title, handles, 4.2) as figure:
         axes = figure.add_subplot(xlabel="frames", ylabel=returns)
@@ -177,8 +175,7 @@ def draw_curve_grid(
         guides: mean return of the guide of each label, drawn as a dashed line.
     """
     curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
-    columns, strokes = min(GRID_COLUMNS, len(runs)), strokes or style.strong_strokes(runs)
-    rows = -(-len(runs) // columns)
+    strokes, rows = strokes or style.strong_strokes(runs), -(-len(runs) // GRID_COLUMNS)
     guide_line: dict[str, Any] = {"color": style.GUIDES[0], "ls": style.DASHED, "lw": 1.0}
     handles: list[Artist] = [Line2D([], [], color=style.INK, lw=1.5, label="mean of the runs")]
     handles += _spread_handles(runs.values(), style.INK)
@@ -187,8 +184,9 @@ def draw_curve_grid(
         handles.append(Line2D([], [], label="its guide", **guide_line))
     height = 0.35 + GRID_ROW_HEIGHT * rows
     with style.picture(path, None, handles, height, add_header=True, h_pad=0.08) as figure:
-        grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
-        for axes, (label, curve) in zip(grid, curves.items(), strict=False):
+        titles = [_with_count(label, seeds) for label, seeds in runs.items()]
+        grid = style.panels(figure, titles, GRID_COLUMNS)
+        for axes, (label, curve) in zip(grid, curves.items(), strict=True):
             colour = strokes[label].colour
             for other_frames, other_mean, *_ in curves.values():  # its own is drawn over
                 axes.plot(other_frames, other_mean, color=style.KERB, lw=0.6, alpha=0.7)
@@ -196,13 +194,10 @@ def draw_curve_grid(
             axes.plot(*curve[:2], color=colour, lw=1.5, zorder=2.2)
             if guides and label in guides:
                 axes.axhline(guides[label], **guide_line)
-            axes.set_title(_with_count(label, runs[label]), size=9, loc="left")
             axes.spines[["top", "right"]].set_visible(False)
             axes.set_xlim(left=0)
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.tick_params(labelbottom=True)
-        for axes in figure.axes[len(runs) :]:
-            axes.remove()
         figure.supxlabel("frames", size=9)
         figure.supylabel(RETURNS, size=9)
 
@@ -293,7 +288,7 @@ def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Arr
     """
     curves = [curve for curve in (points(run, key) for run in runs) if len(curve)]
     if not curves:
-        return np.empty(0), np.empty(0), np.empty(0), np.empty(0)
+        return (np.empty(0),) * 4
     start, end = max(curve[0, 0] for curve in curves), min(curve[-1, 0] for curve in curves)
     frames = np.unique(np.concatenate([curve[:, 0] for curve in curves]))
     frames = frames[(frames >= start) & (frames <= end)]
@@ -315,26 +310,21 @@ def learning(run: Run) -> dict[str, float]:
         run: with or without a curve.
     """
     curve, choice = points(run.curve, RETURN), points(run.curve, CHOICE)
-    guide = max(run.guide_returns.values(), default=math.nan)
-    frames = run.curve[-1]["frames"] if run.curve else math.nan
+    names = ("frames", "guide", "first", "final", "best", "best_at", "area", "until_guide")
+    found = dict.fromkeys(names, math.nan)
+    found["guide"] = max(run.guide_returns.values(), default=math.nan)
+    if run.curve:
+        found["frames"] = run.curve[-1]["frames"]
     if not len(curve):
-        unknown = ("first", "best", "best_at", "final", "area", "until_guide")
-        return {"frames": frames, "guide": guide} | dict.fromkeys(unknown, math.nan)
+        return found
     at, values = curve.T
-    best, best_at = math.nan, math.nan
+    found |= {"first": values[0], "final": values[-1], "area": values[0]}
+    if len(at) > 1:
+        found["area"] = np.trapezoid(values, at) / (at[-1] - at[0])
     if len(choice) == len(curve):
-        place = int(choice[:, 1].argmax())
-        best, best_at = values[place], at[place]
-    return {
-        "frames": frames,
-        "guide": guide,
-        "first": values[0],
-        "final": values[-1],
-        "best": best,
-        "best_at": best_at,
-        "area": np.trapezoid(values, at) / (at[-1] - at[0]) if len(at) > 1 else values[0],
-        "until_guide": frames_until(at, values, guide),
-    }
+        found["best_at"], found["best"] = curve[choice[:, 1].argmax()]
+    found["until_guide"] = frames_until(at, values, found["guide"])
+    return found
 
 
 def frames_until(

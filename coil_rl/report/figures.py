@@ -47,30 +47,33 @@ def draw_report(
         strokes: by label.
         suffix: of the names of the files, with their format.
     """
-
-    def drawn(name: str, title: str, caption: str, draw: Draw) -> Figure:
-        draw(folder / f"{name}{suffix}")
-        return Figure(title, svg(draw), caption)
-
     panels = {}
     for kind, comparison in compared.items():
         groups = comparison.agents or comparison.guides
         panels[f"{kind} actions"] = driver_intervals(groups, strokes)
-    draw: Draw = partial(draw_intervals, panels, measure="return")
-    figures = [drawn("report", "Evaluation", "Mean return in the cases of the evaluation.", draw)]
     beside = beside_guides(next(iter(compared.values())).agents)
+    curves = [run for run in runs if run.curve and run.label in strokes]
+    use = guide_use(curves)
+    drawings: dict[str, tuple[str, str, Draw]] = {  # by the name of the file: title and caption
+        "report": (
+            "Evaluation",
+            "Mean return in the cases of the evaluation.",
+            partial(draw_intervals, panels, measure="return"),
+        )
+    }
     if beside:
         draw = partial(draw_beside_guides, beside, strokes=strokes)
-        figures.append(drawn("report_cases", "Case by case", BESIDE, draw))
-    curves = [run for run in runs if run.curve and run.label in strokes]
+        drawings["report_cases"] = ("Case by case", BESIDE, draw)
     if curves:
-        draw = _learning_curves(curves, strokes)
         caption = "Deterministic policies kept on the way."
-        figures.append(drawn("report_curves", "Training", caption, draw))
-    use = guide_use(curves)
+        drawings["report_curves"] = ("Training", caption, _learning_curves(curves, strokes))
     if use:
         draw = partial(draw_guide_use, use, strokes=strokes)
-        figures.append(drawn("report_guides", "Use of the guide", "A line for each run.", draw))
+        drawings["report_guides"] = ("Use of the guide", "A line for each run.", draw)
+    figures = []
+    for name, (title, caption, drawn) in drawings.items():
+        drawn(folder / f"{name}{suffix}")
+        figures.append(Figure(title, svg(drawn), caption))
     return [*figures, *films(runs)]
 
 

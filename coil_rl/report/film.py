@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import matplotlib as mpl
-import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from coil_rl.files import whole_file
@@ -81,8 +80,7 @@ class Film(Picture):
             self.steps[name] = steps + 1
             if not self.active or steps % every or len(images) >= self.frames:
                 continue
-            render: Callable[[int], NDArray[np.uint8] | None] | None = getattr(env, "render", None)
-            pixels = None if render is None else render(row)
+            pixels = getattr(env, "render", lambda row: None)(row)
             if pixels is None:
                 self.whole = False
             else:
@@ -104,8 +102,8 @@ class Film(Picture):
             folder: where the animation is written.
         """
         columns, captions = [], []
-        taken, self.images, self.steps = self.images, {}, {}
-        whole, self.whole = self.whole, True
+        taken, whole = self.images, self.whole
+        self.__post_init__()  # for the next evaluation
         for name, result in results.items():
             first = result.episodes[0]
             # After its end an episode may be drawn as the next one.
@@ -145,10 +143,7 @@ def _side_by_side(
         columns: the frames of each film, at least one each, of one size.
         captions: above each.
     """
-    lefts, width = [], 0
-    for images in columns:
-        lefts.append(width)
-        width += images[0].width + GAP
+    *lefts, width = itertools.accumulate((each[0].width + GAP for each in columns), initial=0)
     height = CAPTION + max(images[0].height for images in columns)
     empty = Image.new("RGB", (width - GAP, height), style.BACKGROUND)
     for images, left, caption in zip(columns, lefts, captions, strict=True):

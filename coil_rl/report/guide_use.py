@@ -3,15 +3,14 @@
 Which columns of `metrics.csv` say so is in `conf/tables.yaml`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
 from coil_rl.report import style
-from coil_rl.report.curves import Rows, points
+from coil_rl.report.curves import points
 from coil_rl.report.runs import Run
 from coil_rl.report.statistics import Array
 from coil_rl.report.table import TABLES
@@ -30,22 +29,14 @@ def guide_use(runs: Sequence[Run]) -> Use:
         the training, has it at the first and the last frames.
     """
     found: dict[str, dict[str, list[Array]]] = {}
-    for column in TABLES["guide_use"]:
-        for label, curve in _curves(runs):
-            known = points(curve, column) if any(column in row for row in curve) else np.empty(0)
-            if len(known) == 1:
-                frames = [row["frames"] for row in curve]
-                known = np.array([[frames[0], known[0, 1]], [frames[-1], known[0, 1]]])
-            if len(known):
-                found.setdefault(column, {}).setdefault(label, []).append(known)
+    for column, run in itertools.product(TABLES["guide_use"], runs):
+        known = points(run.curve, column)
+        if len(known) == 1:
+            ends = run.curve[0]["frames"], run.curve[-1]["frames"]
+            known = np.array([[frames, known[0, 1]] for frames in ends])
+        if len(known):
+            found.setdefault(column, {}).setdefault(run.label, []).append(known)
     return found
-
-
-def _curves(runs: Sequence[Run]) -> Iterator[tuple[str, Rows]]:
-    """Yield the label and the rows of each run that was trained."""
-    for run in runs:
-        if run.curve:
-            yield run.label, run.curve
 
 
 def draw_guide_use(use: Use, path: style.Target, strokes: Mapping[str, style.Stroke]) -> None:
@@ -57,10 +48,7 @@ def draw_guide_use(use: Use, path: style.Target, strokes: Mapping[str, style.Str
         strokes: by label.
     """
     labels = dict.fromkeys(label for of_label in use.values() for label in of_label)
-    handles: list[Artist] = []
-    for label in labels:
-        colour, linestyle = strokes[label]
-        handles.append(Line2D([], [], color=colour, ls=linestyle, lw=2, label=label))
+    handles = style.handles({label: strokes[label] for label in labels}, lw=2)
     height = 0.3 + PANEL_HEIGHT * len(use)
     with style.picture(path, None, handles, height, add_header=True, h_pad=0.08) as figure:
         panels = figure.subplots(len(use), 1, sharex=True, squeeze=False)[:, 0]

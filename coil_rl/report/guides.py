@@ -148,8 +148,8 @@ def _is_same(one: pd.DataFrame, other: pd.DataFrame) -> bool:
     """
     if one["case"].tolist() != other["case"].tolist():
         return False
-    returns = np.array([one["reward"], other["reward"]], float)
-    ends = np.append(returns, 0.0) if len(one) == 1 else returns
+    ours, theirs = one["reward"].to_numpy(float), other["reward"].to_numpy(float)
+    ends = np.concatenate([ours, theirs, [0.0] if len(one) == 1 else []])
     ends = ends[np.isfinite(ends)]
     tolerance = SAME_RETURN * float(np.ptp(ends)) if ends.size else 0.0
-    return np.allclose(*returns, rtol=1e-7, atol=tolerance, equal_nan=True)
+    return np.allclose(ours, theirs, rtol=1e-7, atol=tolerance, equal_nan=True)

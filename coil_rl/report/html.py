@@ -17,6 +17,8 @@ from markupsafe import Markup
 
 from coil_rl.report.table import Table
 
+# Of the files of pictures that a page may hold, by their kind.
+BEGINNINGS = {"png": rb"\x89PNG\r\n\x1a\n", "webp": rb"RIFF....WEBP", "gif": rb"GIF89a"}
 SCRIPT = """
 for (const button of document.querySelectorAll("th button")) {
   button.addEventListener("click", () => {
@@ -110,12 +112,7 @@ def embedded(content: bytes) -> str:
     Raises:
         ValueError: for anything but a PNG, WebP or GIF picture.
     """
-    if content[:8] == b"\x89PNG\r\n\x1a\n":
-        kind = "png"
-    elif content[:4] == b"RIFF" and content[8:12] == b"WEBP":
-        kind = "webp"
-    elif content[:6] == b"GIF89a":
-        kind = "gif"
-    else:
-        raise ValueError("no PNG, WebP or GIF picture")
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    for kind, beginning in BEGINNINGS.items():
+        if re.match(beginning, content, re.DOTALL):
+            return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    raise ValueError("no PNG, WebP or GIF picture")

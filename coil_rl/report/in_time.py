@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,23 +24,14 @@ if TYPE_CHECKING:
     from coil_rl.run.evaluation import EvaluationResult
 
 OBSERVED, ADVICE, EXECUTED = "observation", "guide_action", "executed_action"
-MOST = {"observation": 6, "action": 3}  # numbers that are drawn
+MOST = {"observation": 6, "action": 3, "advice": 3}  # numbers that are drawn
 PANEL_HEIGHT = 0.85  # inches
 
 
-@dataclass
-class Trace:
-    """The steps of one policy in the first case, in the units of the env.
-
-    Attributes:
-        observed: what it saw before each step.
-        advice: what its first guide advised; empty without advice.
-        sent: the action that was executed.
-    """
-
-    observed: list[list[float]] = field(default_factory=list)
-    advice: list[list[float]] = field(default_factory=list)
-    sent: list[list[float]] = field(default_factory=list)
+# Of one policy in the first case, in the units of the env: what it observed before each step, the
+# action that was executed, and what its first guide advised; without what it does not have.
+Trace = dict[str, list[list[float]]]
+OBSERVATION, ACTION, ADVISED = "observation", "action", "advice"
 
 
 class InTime(Picture):
@@ -67,23 +57,20 @@ class InTime(Picture):
         after: TensorDictBase,
     ) -> None:
         """Note a step of each policy; see `Picture.watch`."""
-        key = env.action_key
-        space = ActionSpace(env.full_action_spec[key], env.batch_dims)
-        units = given_units(env)
-
-        def numbers(action: Tensor) -> list[list[float]]:
-            given = action if units is None else units.denormalise(action)
-            return _numbers(given, len(env.batch_size), MOST["action"])
-
-        sent = numbers(after[EXECUTED] if EXECUTED in after else before[key])
-        advice = numbers(space.actions(before[ADVICE][..., 0, :])) if ADVICE in before else []
-        seen = before.get(OBSERVED, None)
-        observed = [] if seen is None else _numbers(seen, len(env.batch_size), MOST["observation"])
-        for name, row in rows.items():
-            trace = self.traces.setdefault(name, Trace())
-            trace.sent.append(sent[row])
-            trace.advice += [advice[row]] if advice else []
-            trace.observed += [observed[row]] if observed else []
+        key, units = env.action_key, given_units(env)
+        shown: dict[str, Tensor] = {}
+        if OBSERVED in before:
+            shown[OBSERVATION] = before[OBSERVED]
+        shown[ACTION] = after[EXECUTED] if EXECUTED in after else before[key]
+        if ADVICE in before:
+            space = ActionSpace(env.full_action_spec[key], env.batch_dims)
+            shown[ADVISED] = space.actions(before[ADVICE][..., 0, :])
+        for kind, values in shown.items():
+            is_action = kind != OBSERVATION
+            given = units.denormalise(values) if is_action and units is not None else values
+            flat = given.reshape(env.batch_size.numel(), -1)[:, : MOST[kind]].double().tolist()
+            for name, row in rows.items():
+                self.traces.setdefault(name, {}).setdefault(kind, []).append(flat[row])
 
     def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
         """Draw the picture.
@@ -99,13 +86,6 @@ class InTime(Picture):
             draw_in_time(shown, folder / "in_time.png", rate=rate)
 
 
-def _numbers(values: Tensor, batch_dims: int, most: int) -> list[list[float]]:
-    """Return the first numbers of each row."""
-    flat = values.reshape(values.shape[:batch_dims].numel(), -1)[:, :most]
-    found: list[list[float]] = flat.double().tolist()
-    return found
-
-
 def draw_in_time(traces: Mapping[str, Trace], path: style.Target, *, rate: float) -> None:
     """Draw the steps of several policies over each other.
 
@@ -116,10 +96,7 @@ def draw_in_time(traces: Mapping[str, Trace], path: style.Target, *, rate: float
     """
     strokes = style.strokes(traces)
     panels = _panels(traces)
-    handles = [
-        Line2D([], [], color=strokes[name].colour, ls=strokes[name].linestyle, label=name)
-        for name in traces
-    ]
+    handles = style.handles(strokes)
     if any(name for lines in panels.values() for name, _, dotted in lines if dotted):
         handles.append(Line2D([], [], color=style.QUIET, ls=":", label="advice to a policy"))
     height = 0.45 + PANEL_HEIGHT * len(panels)
@@ -141,13 +118,13 @@ def _panels(traces: Mapping[str, Trace]) -> dict[str, list[tuple[str, Array, boo
     """Return the lines of each panel: name of the policy, numbers, and whether they are advice."""
     panels: dict[str, list[tuple[str, Array, bool]]] = {}
     for name, trace in traces.items():
-        tables = {"observation": trace.observed, "action": trace.sent, "": trace.advice}
-        for kind, steps in tables.items():
-            title, dotted = kind or "action", not kind
-            if dotted and trace.advice == trace.sent:  # a guide that acts alone
+        for kind, steps in trace.items():
+            is_advice = kind == ADVISED
+            if is_advice and steps == trace[ACTION]:  # a guide that acts alone
                 continue
-            columns = np.array(steps, dtype=np.float64).T if steps else np.empty((0, 0))
+            columns = np.array(steps, dtype=np.float64).T
             for number, column in enumerate(columns):
+                title = ACTION if is_advice else kind
                 titled = title if len(columns) == 1 else f"{title} {number}"
-                panels.setdefault(titled, []).append((name, column, dotted))
+                panels.setdefault(titled, []).append((name, column, is_advice))
     return dict(sorted(panels.items(), key=lambda panel: panel[0].startswith("action")))

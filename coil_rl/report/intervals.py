@@ -19,29 +19,11 @@ if TYPE_CHECKING:
 COLOUR = style.AGENTS[0]
 LEAST_SEEDS = 4  # of an interval in a picture
 LONGEST_NAME = 50  # characters of the name of a row
+CIRCLE: dict[str, Any] = {"ls": "", "marker": "o"}
 BAR: dict[str, Any] = {"alpha": 0.38, "lw": 8, "solid_capstyle": "butt"}
-SEED: dict[str, Any] = {
-    "ls": "",
-    "marker": "o",
-    "ms": 3.6,
-    "mfc": style.QUIET,
-    "mec": "none",
-    "alpha": 0.5,
-}
-DOT: dict[str, Any] = {
-    "ls": "",
-    "marker": "o",
-    "ms": 5.5,
-    "mec": style.BACKGROUND,
-    "mew": 0.6,
-}
-HOLLOW: dict[str, Any] = {
-    "ls": "",
-    "marker": "o",
-    "ms": 5.0,
-    "mfc": style.BACKGROUND,
-    "mew": 1.1,
-}
+SEED = CIRCLE | {"ms": 3.6, "mfc": style.QUIET, "mec": "none", "alpha": 0.5}
+DOT = CIRCLE | {"ms": 5.5, "mec": style.BACKGROUND, "mew": 0.6}
+HOLLOW = CIRCLE | {"ms": 5.0, "mfc": style.BACKGROUND, "mew": 1.1}
 GUIDE: dict[str, Any] = {"color": style.GUIDES[0], "ls": style.DASHED, "lw": 1.3, "zorder": 1.5}
 
 
@@ -82,22 +64,22 @@ def driver_intervals(
         strokes: those of the policies by name, for their colours; by default those of
             `style.strong_strokes`.
     """
-    groups, rows = list(groups), []
+    groups = list(groups)
     strokes = strokes or style.strong_strokes(dict.fromkeys(group.name for group in groups))
-    for group in groups:
-        few = len(group.returns) < LEAST_SEEDS
-        row = Interval(
+    no_bar = math.nan, math.nan
+    bars = [each.reward[1:3] if len(each.returns) >= LEAST_SEEDS else no_bar for each in groups]
+    return [
+        Interval(
             group.title,
             group.reward.mean,
-            math.nan if few else group.reward.low,
-            math.nan if few else group.reward.high,
+            *bar,
             points=group.returns.mean(axis=1).tolist() if len(group.returns) > 1 else [],
             guide=group.guide.reward.mean if group.guide else None,
             hollow=bool(group.advice),
             colour=strokes[group.name].colour,
         )
-        rows.append(row)
-    return rows
+        for group, bar in zip(groups, bars, strict=True)
+    ]
 
 
 def draw_intervals(

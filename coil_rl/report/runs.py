@@ -94,17 +94,15 @@ def read_runs(folders: Sequence[Path]) -> list[Run]:
             raise UserError(
                 f"folder={folder} does not exist; give a folder with runs of coil-train"
             )
-        run_folders = [
-            path.parent for path in sorted(folder.rglob("config.yaml")) if _is_run(path, folder)
-        ]
-        if not run_folders:
+        configs = [path for path in sorted(folder.rglob("config.yaml")) if _is_run(path, folder)]
+        if not configs:
             raise UserError(
                 f"folder={folder} holds no run of coil-train: nothing in it has a config.yaml"
             )
         # Overlapping folders may hold the same run.
-        for path in run_folders:
+        for path in configs:
             if path.resolve() not in runs:
-                runs[path.resolve()] = _read_run(path)
+                runs[path.resolve()] = _read_run(path.parent)
     return list(runs.values())
 
 

@@ -6,7 +6,7 @@ The colours are safe for colour-blind readers.
 import io
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
@@ -16,6 +16,7 @@ import matplotlib as mpl
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.transforms import BboxTransformTo, ScaledTranslation
 
 from coil_rl.files import whole_file
@@ -102,11 +103,11 @@ def strokes(labels: Iterable[str]) -> dict[str, Stroke]:
     """
     labels = list(labels)
     guides = [label for label in labels if label.lower().startswith("guide")]
-    greys = {}
-    for index, label in enumerate(guides):
-        greys[label] = Stroke(GUIDES[index % len(GUIDES)], DASHED)
+    greys = {
+        label: Stroke(grey, DASHED) for label, grey in zip(guides, cycle(GUIDES), strict=False)
+    }
     strong = strong_strokes(label for label in labels if label not in greys)
-    return {label: greys.get(label) or strong[label] for label in labels}
+    return {label: (greys | strong)[label] for label in labels}
 
 
 def strong_strokes(labels: Iterable[str]) -> dict[str, Stroke]:
@@ -138,6 +139,34 @@ def _free_strokes(taken: Sequence[Stroke]) -> Iterator[Stroke]:
     dashed = [Stroke(colour, dashes) for dashes in LATER_ROUNDS for colour in AGENTS]
     yield from (stroke for stroke in dashed if stroke not in taken)
     yield from cycle(dashed)
+
+
+def handles(strokes: Mapping[str, Stroke], **options: Any) -> list[Artist]:
+    """Return a line of the legend for each policy, by its label.
+
+    Args:
+        options: of matplotlib, for all lines.
+    """
+    return [
+        Line2D([], [], color=stroke.colour, ls=stroke.linestyle, label=label, **options)
+        for label, stroke in strokes.items()
+    ]
+
+
+def panels(figure: Figure, titles: Sequence[str], most: int, size: float = 9) -> list[Axes]:
+    """Return a panel for each title, in rows of at most `most`, all with the same limits.
+
+    Args:
+        size: of the titles, points.
+    """
+    columns = min(most, len(titles))
+    shape = (-(-len(titles) // columns), columns)
+    grid = list(figure.subplots(*shape, sharex=True, sharey=True, squeeze=False).flat)
+    for axes, title in zip(grid, titles, strict=False):
+        axes.set_title(title, size=size, loc="left")
+    for axes in grid[len(titles) :]:
+        axes.remove()
+    return grid[: len(titles)]
 
 
 @contextmanager
