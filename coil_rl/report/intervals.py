@@ -64,22 +64,22 @@ def driver_intervals(
         strokes: those of the policies by name, for their colours; by default those of
             `style.strong_strokes`.
     """
-    groups = list(groups)
+    groups, rows = list(groups), []
     strokes = strokes or style.strong_strokes(dict.fromkeys(group.name for group in groups))
-    no_bar = math.nan, math.nan
-    bars = [each.reward[1:3] if len(each.returns) >= LEAST_SEEDS else no_bar for each in groups]
-    return [
-        Interval(
+    for group in groups:
+        few = len(group.returns) < LEAST_SEEDS
+        row = Interval(
             group.title,
             group.reward.mean,
-            *bar,
+            math.nan if few else group.reward.low,
+            math.nan if few else group.reward.high,
             points=group.returns.mean(axis=1).tolist() if len(group.returns) > 1 else [],
             guide=group.guide.reward.mean if group.guide else None,
             hollow=bool(group.advice),
             colour=strokes[group.name].colour,
         )
-        for group, bar in zip(groups, bars, strict=True)
-    ]
+        rows.append(row)
+    return rows
 
 
 def draw_intervals(
