@@ -2,16 +2,14 @@
 
 import copy
 from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from coil_rl.comparison.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, ZERO
@@ -25,7 +23,7 @@ from coil_rl.report import write_csv
 from coil_rl.run import checkpoint
 from coil_rl.run.curve import POLICIES
 from coil_rl.run.evaluation import EvaluationResult
-from coil_rl.run.parts import TEST, EnvMaker
+from coil_rl.run.parts import TEST
 from coil_rl.transforms.action_space import ActionSpace
 
 FILE = "baselines.csv"
@@ -48,52 +46,38 @@ LATE = {
 }
 
 
-class Acting(TensorDictModuleBase):
-    """Policy without an observation: neutral or random actions, in the unit of the env.
+Policy = Callable[[TensorDictBase], TensorDictBase]
 
-    Args:
-        env: the env.
-        vectors: returns the action vectors of all rows.
+
+def space_of(env: EnvBase) -> ActionSpace:
+    """Return the actions of an env, in its own unit."""
+    return ActionSpace(env.full_action_spec[env.action_key], env.batch_dims)
+
+
+def neutral(env: EnvBase) -> tuple[Policy, str]:
+    """Return a policy with the neutral action, and what that is in words.
+
+    It is 0 in each number only where each range is around 0.
     """
-
-    def __init__(self, env: EnvBase, vectors: Callable[[ActionSpace, torch.Size], Tensor]) -> None:
-        self.in_keys: list[NestedKey] = []
-        self.out_keys: list[NestedKey] = [env.action_key]
-        super().__init__()
-        self.space = ActionSpace(env.full_action_spec[env.action_key], env.batch_dims)
-        self.vectors = vectors
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        vectors = self.vectors(self.space, tensordict.batch_size)
-        return tensordict.set(self.out_keys[0], self.space.actions(vectors))
-
-    @classmethod
-    def random(cls, env: EnvBase, seed: int = 0) -> "Acting":
-        """Return a policy with random actions, uniform in those of the env."""
-        return cls(env, partial(_random, torch.Generator().manual_seed(seed)))
-
-    @classmethod
-    def zero(cls, env: EnvBase) -> "Acting":
-        """Return a policy with the neutral action, see `words`."""
-        return cls(env, _neutral)
-
-    @property
-    def words(self) -> str:
-        """What the neutral action is: 0 in each number only where each range is around 0."""
-        if self.space.units is None:
-            return FIRST_CHOICE
-        return ZERO_ACTIONS if (self.space.units.centre == 0).all() else MIDDLE
+    space = space_of(env)
+    vector = space.neutral()
+    action = space.actions(vector.expand(*env.batch_size, *vector.shape))
+    words = FIRST_CHOICE
+    if space.units is not None:
+        words = ZERO_ACTIONS if (space.units.centre == 0).all() else MIDDLE
+    return lambda tensordict: tensordict.set(env.action_key, action.clone()), words
 
 
-def _random(generator: torch.Generator, space: ActionSpace, batch: torch.Size) -> Tensor:
-    draws = torch.rand((*batch, *space.agents, space.size), generator=generator)
-    return space.random(draws.to(space.spec.device, space.dtype))
+def uniform(env: EnvBase, seed: int = 0) -> Policy:
+    """Return a policy with random actions, uniform in those of the env."""
+    space, generator = space_of(env), torch.Generator().manual_seed(seed)
+    shape = (*env.batch_size, *space.agents, space.size)
 
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        draws = torch.rand(shape, generator=generator).to(space.spec.device, space.dtype)
+        return tensordict.set(env.action_key, space.actions(space.random(draws)))
 
-def _neutral(space: ActionSpace, batch: torch.Size) -> Tensor:
-    neutral = space.neutral()
-    return neutral.expand(*batch, *neutral.shape)
+    return act
 
 
 def measure_baselines(config: DictConfig, folder: Path) -> None:
@@ -102,10 +86,8 @@ def measure_baselines(config: DictConfig, folder: Path) -> None:
         return
     evaluation, make_env = build_evaluation(config), env_maker(config)
     cases = len(evaluation.cases)
-    opposite = EnvMaker(
-        make_env.bare,
-        disturb=make_env.disturb,
-        guides=make_env.guides,
+    opposite = replace(
+        make_env,
         degrade=lambda: [*make_env.degrade(), *build_all({"opposite": REVERSED}, "degrade")],
     )
     rows: list[dict[str, Any]] = []
@@ -115,11 +97,10 @@ def measure_baselines(config: DictConfig, folder: Path) -> None:
     }.items():
         rows += _rows(name, evaluation.run(env, policy))
     env = make_env.plain(cases, TEST)
-    neutral = Acting.zero(env)
-    found = _rows(ZERO, evaluation.run(env, neutral))
-    rows += [row | {ACTION: neutral.words} for row in found]
+    policy, words = neutral(env)
+    rows += [row | {ACTION: words} for row in _rows(ZERO, evaluation.run(env, policy))]
     env = make_env.plain(cases, TEST)
-    rows += _rows(RANDOM, evaluation.run(env, Acting.random(env, config.seed)))
+    rows += _rows(RANDOM, evaluation.run(env, uniform(env, config.seed)))
     write_csv(rows, folder / FILE)
 
 

@@ -3,8 +3,7 @@
 import math
 import shlex
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,7 @@ from coil_rl.comparison.entry import IDLE, Entry
 from coil_rl.comparison.jobs import job_name, run_jobs
 from coil_rl.comparison.outcome import Outcome, first_of, read_outcome
 from coil_rl.comparison.page import command_of, delayed_sentence, draw, page_of
-from coil_rl.comparison.same import PLAN, identity_of, keep_plan, known_plan
+from coil_rl.comparison.same import identity_of, keep_plan, known_plan
 from coil_rl.comparison.timing import Plan
 from coil_rl.comparison.verdict import NOTHING, Verdict, verdict
 from coil_rl.config.check import check
@@ -46,7 +45,7 @@ from coil_rl.config.python import Named, composed, named, new_folder
 from coil_rl.config.trust import trust_own
 from coil_rl.config.unread import check_read
 from coil_rl.errors import UserError
-from coil_rl.files import FAILED_JOBS, remove_unfinished, write_text
+from coil_rl.files import FAILED_JOBS, write_text
 from coil_rl.output import decoration, quietly, say
 from coil_rl.record import json_file
 from coil_rl.report import write_csv
@@ -166,36 +165,22 @@ class Comparison:
         config = self._checked()
         torch.set_num_threads(config.threads)  # as the trainings, whose steps are timed
         self.overhead = time.process_time() - start
-        with self._new_or_kept():
-            (self.folder / FAILED_JOBS).unlink(missing_ok=True)
+        identity = identity_of(self.given, config, self.minutes, self.seed)
+        plan = known_plan(self.folder, identity)
+        if plan is not None:
+            say(f"{self.folder} goes on. {plan.described(self.minutes)}", error=True)
+        else:
             plan = self._plan(config)
+        with locked(self.folder):  # nothing is made before there is a plan
+            plan = known_plan(self.folder, identity) or plan
+            keep_plan(self.folder, identity, plan)
+            (self.folder / FAILED_JOBS).unlink(missing_ok=True)
             short = short_words(self.given.words, config, plan.cases)
             with quietly():
                 base = self._config(ANCHORED, plan.frames[ANCHORED], short)
                 measure_baselines(base, self.folder)
             failed = run_jobs(self._jobs(plan, short), self.folder)
             return self._judge(plan, base, failed)
-
-    @contextmanager
-    def _new_or_kept(self) -> Iterator[None]:
-        """Lock the folder, and remove what was made for that if nothing else was written.
-
-        What another process or the user made stays.
-        """
-        lock = self.folder / ".lock"
-        is_new = not lock.exists()
-        made = [each for each in (self.folder, *self.folder.parents) if not each.exists()]
-        with locked(self.folder):
-            remove_unfinished(self.folder)
-            try:
-                yield
-            except BaseException:
-                if is_new and not (self.folder / PLAN.name).exists():
-                    lock.unlink(missing_ok=True)
-                    for each in made:
-                        with suppress(OSError):  # it is not empty
-                            each.rmdir()
-                raise
 
     @property
     def tunes(self) -> bool:
@@ -227,12 +212,7 @@ class Comparison:
         return composed(job, self.folder / name)
 
     def _plan(self, config: DictConfig) -> Plan:
-        """Return what is going to be done, and say it; a comparison that goes on has its plan."""
-        identity = identity_of(self.given, config, self.minutes, self.seed)
-        plan = known_plan(self.folder, identity)
-        if plan is not None:
-            say(f"{self.folder} goes on. {plan.described(self.minutes)}", error=True)
-            return plan
+        """Return what is going to be done in a new comparison, and say it."""
         if any(self.folder.rglob("config.yaml")):
             raise UserError(f"{self.folder} holds runs of something else; choose another folder")
         if self.command:
@@ -245,7 +225,6 @@ class Comparison:
                 plain[SAC] = self._config(SAC, short=["learner.starts=1"])
             pace = timing.measure(plain, self.overhead)
         plan = timing.plan(plain, pace, arms, self.minutes)
-        keep_plan(self.folder, identity, plan)
         say(f"{pace.sentence}\n{plan.described(self.minutes)}", error=True)
         return plan
 

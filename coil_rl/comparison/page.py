@@ -1,14 +1,11 @@
 """The page of a comparison: a picture, a table, three sentences, and the command to go on with."""
 
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 
 from coil_rl.comparison.arms import ARMS, GUIDE, RANDOM, TUNE
 from coil_rl.comparison.entry import Entry, difference
@@ -92,7 +89,7 @@ def command_of(given: Named, verdict: Verdict) -> str:
     if not [key for key in given.nodes if key != "tune"]:
         if arm.name == TUNE and tune is not None:
             words.append(f"tune={_bounds(tune)}")
-        return shlex.join(["coil-train", *map(_plain, [*words, *arm.words])])
+        return shlex.join(["coil-train", *words, *arm.words])
     method = arm.words[0].partition("=")[2]
     others = [word for word in words if not word.startswith(("env=", "env.id=", "guide"))]
     overrides = [*others, *arm.words[1:]]
@@ -102,21 +99,6 @@ def command_of(given: Named, verdict: Verdict) -> str:
     if overrides:
         arguments.append(f"overrides={overrides!r}")
     return f"coil_rl.train(env, guide=guide, {', '.join(arguments)})"
-
-
-def _plain(word: str) -> str:
-    """Return a word without the quotes of its value, if Hydra reads the same value without them."""
-    bare = re.sub(r"^([\w.+@/]+)='([\w.:/-]+)'$", r"\1=\2", word)
-    return bare if _read(bare) == _read(word) else word
-
-
-def _read(word: str) -> tuple[type, Any] | None:
-    """Return the value of a word as Hydra reads it, with its type; None for what it cannot read."""
-    try:
-        value = OverridesParser.create().parse_override(word).value()
-    except HydraException:
-        return None
-    return type(value), value
 
 
 def _bounds(tune: Mapping[str, Any] | str) -> str:

@@ -45,7 +45,8 @@ def compare(arguments: Sequence[str]) -> None:
     minutes, seed = _number(own, "minutes", 2.0), _number(own, "seed", 0)
     if not isinstance(seed, int):
         raise UserError(f"seed={own['seed']} must be a whole number")
-    compose_train([*words, "method=coil_anchored", "run_dir=unused"])  # mistakes, in a moment
+    # Mistakes, in a moment.
+    composed = compose_train([*words, "method=coil_anchored", "run_dir=unused"])
     # They import PyTorch, which takes seconds.
     from coil_rl.comparison.compare import Comparison
     from coil_rl.config.python import Named, new_folder
@@ -54,8 +55,7 @@ def compare(arguments: Sequence[str]) -> None:
     nodes: dict[str, Any] = {}
     if "tune" in own:
         nodes["tune"] = _value("tune", own["tune"])
-    trust = _value("trust", next((w[6:] for w in words if w.startswith("trust=")), "[]"))
-    trust_packages(trust)
+    trust_packages(composed.trust)
     place = new_folder("compare") if folder is None else folder
     others = [argument for argument in arguments if not argument.startswith("folder=")]
     command = shlex.join(["coil-compare", *others, f"folder={place}"])

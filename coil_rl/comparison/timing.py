@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import torch
 from omegaconf import DictConfig
-from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from coil_rl.comparison.arms import (
@@ -20,7 +19,7 @@ from coil_rl.comparison.arms import (
     Arm,
     curve_cases,
 )
-from coil_rl.comparison.baselines import Acting
+from coil_rl.comparison.baselines import Policy, uniform
 from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.run.evaluation import episodes
 from coil_rl.run.parts import TEST
@@ -131,17 +130,17 @@ def measure(plain: Mapping[str, DictConfig], overhead: float) -> Pace:
         env, follow = make_env.guided(EPISODES, TEST)
         length = _length(env, follow)
         env = make_env.plain(EPISODES, TEST)
-        length = max(length, _length(env, Acting.random(env)))
+        length = max(length, _length(env, uniform(env)))
         guided = _stepped(*make_env.guided(ROWS, TEST))
         env = make_env.plain(ROWS, TEST)
-        clock = _stepped(env, Acting.random(env))
+        clock = _stepped(env, uniform(env))
         step = clock.seconds / ROWS
         learning = {name: _frame(config) + clock.waiting / ROWS for name, config in plain.items()}
     learning = {name: max(frame, step) for name, frame in learning.items()}
     return Pace(step, max(guided.seconds / ROWS - step, 0.0), learning, length, overhead)
 
 
-def _length(env: EnvBase, policy: TensorDictModuleBase) -> float:
+def _length(env: EnvBase, policy: Policy) -> float:
     """Return the mean number of steps of an episode; one that does not end counts as `LONGEST`."""
     rows = env.batch_size.numel()
     steps = torch.zeros(rows)
@@ -178,7 +177,7 @@ class Clock:
         return sum(own for _, own in self.laps) / max(len(self.laps), 1) + self.waiting
 
 
-def _stepped(env: EnvBase, policy: TensorDictModuleBase) -> Clock:
+def _stepped(env: EnvBase, policy: Policy) -> Clock:
     """Return the clock of some steps of all rows; the first step may prepare something."""
     steps = itertools.islice(episodes(env, policy), STEPS + 1)
     next(steps)

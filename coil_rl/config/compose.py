@@ -127,11 +127,15 @@ def key_of(text: str) -> str:
 
 
 def quoted(text: str) -> str:
-    """Return a text in quotes of Hydra, where a backslash is special before a quote only.
+    """Return a text as Hydra reads it: a plain name as it is, others in quotes.
+
+    In these a backslash is special before a quote only.
 
     Args:
         text: a value for an override on the command line.
     """
+    if re.fullmatch(r"(?ai)(?!(null|true|false|nan|inf)$)[a-z][\w.:/-]*", text):
+        return text
     escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), text)
     return f"'{escaped}'"
 

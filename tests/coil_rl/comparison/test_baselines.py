@@ -10,9 +10,9 @@ import coil_rl.config.schema  # noqa: F401 registers the configuration schema
 from coil_rl.comparison.arms import GUIDE
 from coil_rl.comparison.baselines import (
     FILE,
-    Acting,
     measure_baselines,
     measure_delayed,
+    neutral,
     read_baselines,
 )
 from coil_rl.comparison.outcome import read_outcome
@@ -84,9 +84,9 @@ def test_neutral_action_is_called_what_it_is(space, action, words):
             return np.zeros(1, np.float32), {}
 
     env = GymnasiumEnv(Plant)
-    policy = Acting.zero(env)
+    policy, said = neutral(env)
     assert policy(env.reset())["action"][0].tolist() == action
-    assert policy.words == words
+    assert said == words
 
 
 def test_table_says_what_the_action_of_zero_is_and_old_files_have_zero_actions(tmp_path):

@@ -36,7 +36,7 @@ def test_delay_says_nothing_of_a_distance_that_there_is_not(own):
     ],
 )
 def test_printed_command_has_the_values_of_the_comparison(word):
-    words = ["env=gym", "env.id='Pendulum-v1'", word]
+    words = ["env=gym", "env.id=Pendulum-v1", word]
     command = command_of(Named(words, {}), Verdict("ppo", "ppo", 1.0, 1.0, False))
     program, *printed = shlex.split(command)
     assert (program, printed[1]) == ("coil-train", "env.id=Pendulum-v1")
