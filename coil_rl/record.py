@@ -57,7 +57,7 @@ class File(Generic[T]):
         path = folder / self.name
         if not path.exists():
             return None
-        with file_of_a_run(path, self._remedy(folder)):
+        with file_of_a_run(path, self.remedy.format(folder=shlex.quote(str(folder)))):
             return self.parse(read_file(path, self.largest))
 
     def need(self, folder: Path) -> T:
@@ -76,9 +76,6 @@ class File(Generic[T]):
     def write(self, folder: Path, content: T) -> None:
         """Write the content into the folder of a run, complete or not at all."""
         write_text(folder / self.name, self.text_of(content))
-
-    def _remedy(self, folder: Path) -> str:
-        return self.remedy.format(folder=shlex.quote(str(folder)))
 
 
 def json_file(name: str, kind: type[T], remedy: str) -> File[T]:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv, check_env_specs
 
 from coil_rl.foreign.faults import shortened
-from coil_rl.foreign.trial import Finding, Recorded, Trial
+from coil_rl.foreign.trial import Finding, Recorded, Trial, difference
 from coil_rl.transforms import GuideActions, set_progress
 from coil_rl.transforms.action_space import ActionSpace, nested_key, space_of
 from coil_rl.transforms.guide_actions import unfit_action
@@ -106,7 +106,11 @@ def _check_history(
     trial = Trial(env, steps)
     recorded = trial.recorded()
     space = space_of(Recorded(env, recorded), action_key)
-    hook = guide.register_forward_hook(_CheckedAction(space, action_key))
+
+    def check(guide: nn.Module, _: object, written: TensorDictBase) -> None:
+        _check_action(guide, written[action_key], written.batch_size, space)
+
+    hook = guide.register_forward_hook(check)
     try:
         trial.ask_guide(guide, recorded, action_key, tolerance)
     finally:
@@ -114,29 +118,18 @@ def _check_history(
     _raise_or_warn(trial.findings)
 
 
-class _CheckedAction:
-    """A forward hook of a guide that raises a `ValueError` for an invalid action.
-
-    Args:
-        space: of the action.
-        action_key: of the action.
-    """
-
-    def __init__(self, space: ActionSpace, action_key: NestedKey) -> None:
-        self.space, self.action_key = space, action_key
-
-    def __call__(self, guide: nn.Module, _: object, written: TensorDictBase) -> None:
-        action, batch, space = written[self.action_key], written.batch_size, self.space
-        try:
-            space.check_advice(action, batch)
-        except ValueError as error:
-            raise unfit_action("guide", guide, action, batch, space, str(error)) from None
-        if space.continuous and not action.is_floating_point():
-            raise ValueError(
-                f"the guide's action is of {action.dtype}, but the env's of {space.spec.dtype}"
-            )
-        if space.bounds is not None and not torch.equal(action, action.clamp(*space.bounds)):
-            raise ValueError("the guide's action lies outside the bounds of the env's action")
+def _check_action(guide: nn.Module, action: Tensor, batch: torch.Size, space: ActionSpace) -> None:
+    """Raise a `ValueError` for an action of a guide that is no action of the env."""
+    try:
+        space.check_advice(action, batch)
+    except ValueError as error:
+        raise unfit_action("guide", guide, action, batch, space, str(error)) from None
+    if space.continuous and not action.is_floating_point():
+        raise ValueError(
+            f"the guide's action is of {action.dtype}, but the env's of {space.spec.dtype}"
+        )
+    if space.bounds is not None and not torch.equal(action, action.clamp(*space.bounds)):
+        raise ValueError("the guide's action lies outside the bounds of the env's action")
 
 
 def check_transform(env: EnvBase, transform: Transform) -> None:
@@ -209,17 +202,10 @@ def _difference(env: TransformedEnv, unused: Transform) -> str:
     torch.set_rng_state(numbers)
     found, _ = _stepped(again, begun, RESUMED_AT)
     for step, (one, other) in enumerate(zip(expected, found, strict=True), 1):
-        for key, value in one.items(True, True):
-            if not _is_same(value, other.get(key)):
-                return f"{key} in step {step}"
+        key = difference(one, other)
+        if key is not None:
+            return f"{key} in step {step}"
     return ""
-
-
-def _is_same(one: object, other: object) -> bool:
-    """Return whether two entries hold the same numbers; others than tensors are not compared."""
-    if not isinstance(one, Tensor):
-        return True
-    return isinstance(other, Tensor) and torch.equal(one.nan_to_num(), other.nan_to_num())
 
 
 def _stepped(
