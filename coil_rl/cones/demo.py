@@ -29,7 +29,8 @@ def demo(path: Path) -> None:
     from coil_rl.envs import shipped_track
 
     print(f"demo: one lap on a track that {POLICY} has never seen ...", flush=True)
-    agent, guide = driven().split(2)
+    laps = driven()
+    agent, guide = laps[:1], laps[1:]
     lines, crashed = {}, {}
     for name, result in (("guide alone", guide), ("agent with its advice", agent)):
         lines[name] = [pose[:, :2] for pose in result.histories["pose"]]

@@ -30,8 +30,8 @@ from coil_rl.config.trust import make_logger, to_trust
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
+from coil_rl.run.curve import GuideReturns
 from coil_rl.run.folder import locked
-from coil_rl.run.guide_returns import GuideReturns
 from coil_rl.run.judge import Trial, guide_titles
 from coil_rl.run.parts import EnvMaker
 from coil_rl.run.reasons import about_returns

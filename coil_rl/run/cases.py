@@ -1,6 +1,6 @@
 """The cases of a training in which policies are compared; their steps are frames."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -88,22 +88,25 @@ class TrainingCases:
         self.env_seed = int(torch.randint(SEEDS, (), generator=self.generator))
         self.count, self.copies = count, copies
         if self.env is None:
-            self._copy(copies)
+            self._build(count * copies)
+
+    def blocks(self, first: int, frames: int) -> Iterator[int]:
+        """Yield the number of new cases of each part of a test, as long as its frames allow.
+
+        Args:
+            first: number of the first part, which has at least `LEAST_CASES`.
+            frames: that the test may take.
+        """
+        begun, done, count = self.steps, 0, first
+        while count >= LEAST_CASES:
+            yield count
+            done += count
+            count = further_cases(done, self.steps - begun, frames)
 
     def can_copy(self) -> bool:
         """Return whether several rows of the env can have the same case."""
         env = self._build(SOME_ROWS) if self.env is None else self.env
-        return seeded_env(env) is not None
-
-    def _copy(self, copies: int) -> EnvBase:
-        """Return an env that has each of the present cases in that many rows."""
-        if self.count == 0:
-            raise RuntimeError("there are no cases yet; call renew first")
-        env = self._build(self.count * copies)
-        seeded = seeded_env(env)
-        if seeded is not None:
-            seeded.different = self.count if copies > 1 else None
-        return env
+        return isinstance(env.base_env if isinstance(env, TransformedEnv) else env, SeededEnv)
 
     def _build(self, rows: int) -> EnvBase:
         """Return the env with that many rows; it is made unless it has them."""
@@ -125,7 +128,7 @@ class TrainingCases:
         """
         sampled = [False] * len(policies) if sampled is None else sampled
         if len(policies) > 1 and self._can_act_beside(policies):
-            env = self._copy(len(policies))
+            env = self._build(self.count * len(policies))
             beside = [
                 Acting(self._exploring(env, traced(policy), samples, len(policies)), samples)
                 for policy, samples in zip(policies, sampled, strict=True)
@@ -133,7 +136,7 @@ class TrainingCases:
             totals = self._acted(env, OnRows(beside), sampled=False, teaches=True)
             self.taken = [int(part.sum()) for part in totals.steps.split(self.count)]
             return list(totals.results()["return"].split(self.count))
-        env = self._copy(1)
+        env = self._build(self.count)
         self.taken, returns = [], []
         for policy, samples in zip(policies, sampled, strict=True):
             exploring = self._exploring(env, policy, samples)
@@ -165,7 +168,7 @@ class TrainingCases:
 
     def returns(self, policy: TensorDictModuleBase) -> Tensor:
         """Return the return of a policy in each row of the present cases, [rows]."""
-        env = self._copy(self.copies)
+        env = self._build(self.count * self.copies)
         return self._acted(env, policy, sampled=False).results()["return"]
 
     def _acted(
@@ -233,12 +236,6 @@ def further_cases(done: int, taken: int, frames: int) -> int:
         frames: that the test may take.
     """
     return min(int(frames * done / taken), MOST_CASES, 2 * done) - done
-
-
-def seeded_env(env: EnvBase | None) -> SeededEnv | None:
-    """Return the env below all transforms, if its rows can have one case; None for another env."""
-    base = env.base_env if isinstance(env, TransformedEnv) else env
-    return base if isinstance(base, SeededEnv) else None
 
 
 def guide_calls(env: EnvBase) -> int:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, is_tensor_collection, unravel_key
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type
@@ -159,28 +159,17 @@ class Controller:
                 names = ", ".join(map(str, (key, *others)))
                 raise ValueError(f"this env has the entries {names}; give a mapping with them")
             observation = {key: observation}
-        given = set[NestedKey]()
-        for key, value in observation.items():
-            if key not in spec.keys(True):
-                continue
-            if isinstance(value, Mapping) or is_tensor_collection(value):
-                for inner, part in value.items():
-                    if (key, inner) in spec.keys(True, True):
-                        _put(entries, (key, inner), part)
-                        given.add((key, inner))
-            else:
+        for key in spec.keys(True, True):
+            value: Any = observation
+            for part in (key,) if isinstance(key, str) else key:
+                value = value.get(part, {}) if hasattr(value, "get") else {}
+            if not isinstance(value, Mapping):
                 _put(entries, key, value)
-                given.add(key)
-        self._check_given(given, entries)
-        return entries
-
-    def _check_given(self, given: set[NestedKey], entries: TensorDictBase) -> None:
-        """Refuse an observation without an entry that is read, or with one that is not finite."""
-        for key in self.read.intersection(entries.keys(True, True)):
-            if key not in given:
+            elif key in self.read:
                 raise ValueError(f"{key} is missing, which the policy or its guide reads")
-            if not entries[key].isfinite().all():
+            if key in self.read and not entries[key].isfinite().all():
                 raise ValueError(f"{key} holds a number that is not finite")
+        return entries
 
     def _decoded(self, action: Tensor) -> Any:
         if isinstance(self.plant, GymnasiumEnv):

@@ -6,7 +6,7 @@ each in the same cases.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -20,10 +20,12 @@ from torchrl.envs import EnvBase
 
 from coil_rl.measures import Measure
 from coil_rl.output import progress
-from coil_rl.report.runs import RETURN
+from coil_rl.report.runs import EVALUATION, RETURN
 from coil_rl.run import checkpoint
 from coil_rl.run.evaluation import totals_of
+from coil_rl.run.judge import guide_titles
 from coil_rl.run.metrics import Metrics
+from coil_rl.run.parts import EnvMaker
 from coil_rl.run.policy_batch import policy_batch
 
 POLICIES = "policies"  # subfolder with the kept policies
@@ -63,8 +65,7 @@ class EvaluationCurve:
     names: Sequence[str] = field(default=(), init=False)
 
     def __post_init__(self) -> None:
-        measured = ["return", *(name for group in self.watch.values() for name in group)]
-        self.columns = [f"{cases}/{name}" for cases in self.envs for name in measured]
+        self.columns = columns_of(self.envs, self.watch)
 
     def attach(self, metrics: Metrics, stages: Sequence[int], frames: int, before: int) -> None:
         """Tell the curve about the run.
@@ -94,11 +95,11 @@ class EvaluationCurve:
 
     def kept(self) -> list[int]:
         """Return the updates of the run after which the policy is kept."""
-        return _evenly([0, *self.stages], self.points)
+        return evenly([0, *self.stages], self.points)
 
     def batch(self, update: int) -> list[int]:
         """Return the updates whose policies are evaluated after an update, if any."""
-        ends = _evenly([0, *self.stages], self.batches)
+        ends = evenly([0, *self.stages], self.batches)
         if update not in ends[1:]:
             return []
         begin = ends[ends.index(update) - 1]
@@ -130,15 +131,33 @@ class EvaluationCurve:
                 env = make_env(len(updates))
                 count = env.batch_size.numel() // len(updates)
                 results = measures(env, policies, cases=count, watch=self.watch, tick=bar.update)
-                for name, values in results.items():
-                    numbers = values.view(len(updates), -1).double()
-                    means = numbers.mean(1) if name == "return" else numbers.nanmean(1)
-                    for row, mean in zip(rows, means.tolist(), strict=True):
-                        row[f"{cases}/{name}"] = mean
+                for row, means in zip(rows, means_of(results, cases, len(rows)), strict=True):
+                    row |= means
         return rows
 
 
-def _evenly(ends: Sequence[int], parts: int) -> list[int]:
+def columns_of(sets: Iterable[str], watch: Watch) -> list[str]:
+    """Return the names of what a curve measures in some sets of cases."""
+    measured = ["return", *(name for group in watch.values() for name in group)]
+    return [f"{cases}/{name}" for cases in sets for name in measured]
+
+
+def means_of(results: Mapping[str, Tensor], cases: str, parts: int) -> list[dict[str, float]]:
+    """Return the means of equal parts of the rows of an env, by their columns.
+
+    Args:
+        results: of `measures`, in that set of cases.
+    """
+    rows: list[dict[str, float]] = [{} for _ in range(parts)]
+    for name, values in results.items():
+        numbers = values.view(parts, -1).double()
+        means = numbers.mean(1) if name == "return" else numbers.nanmean(1)
+        for row, mean in zip(rows, means.tolist(), strict=True):
+            row[f"{cases}/{name}"] = mean
+    return rows
+
+
+def evenly(ends: Sequence[int], parts: int) -> list[int]:
     """Return numbers that divide each interval between consecutive ends into equal parts."""
     numbers = set()
     for begin, end in pairwise(ends):
@@ -170,3 +189,54 @@ def measures(
         keys = (watch or {}).get(group, {})
         measured |= {name: Measure.of(key, reduction=reduction) for name, key in keys.items()}
     return totals_of(env, policy, measured, cases=cases, tick=tick).results()
+
+
+class GuideReturns:
+    """Mean return of each guide of a learner that trains its guides, with its present parameters.
+
+    A `Callback`. It measures nothing without a curve.
+
+    Args:
+        make_env: makes the env.
+        guides: of the learner, by name.
+        each_phase: whether to measure after each phase that changed a guide, not only before and
+            after the training.
+    """
+
+    def __init__(
+        self,
+        make_env: EnvMaker,
+        guides: Mapping[str, TensorDictModuleBase],
+        *,
+        each_phase: bool = True,
+    ) -> None:
+        self.make_env, self.guides, self.each_phase = make_env, guides, each_phase
+        measured = guides if EVALUATION in make_env.sizes else ()
+        self.names: Sequence[str] = [f"guide/{name}" for name in measured]
+
+    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+        """Return whether the guides have changed, or the training begins or ends."""
+        if update in (0, updates):
+            return True
+        return self.each_phase and bool(row["learner/guides_changed"])
+
+    def after_update(self, update: int) -> dict[str, float]:
+        """Return the means by their names in the log."""
+        returns = guide_returns(self.make_env, self.guides)
+        return dict(zip(self.names, returns.values(), strict=True))
+
+
+def guide_returns(
+    make_env: EnvMaker, guides: Mapping[str, TensorDictModuleBase]
+) -> dict[str, float]:
+    """Return the mean return of each guide in the cases of the curve.
+
+    It is empty without cases or guides.
+    """
+    if EVALUATION not in make_env.sizes or not guides:
+        return {}
+    cases = make_env.sizes[EVALUATION]
+    env, policy = make_env.guided(cases, EVALUATION, guides)
+    with torch.random.fork_rng():
+        returns = measures(env, policy, cases=cases)["return"].view(len(guides), -1).mean(1)
+    return dict(zip(guide_titles(guides), returns.tolist(), strict=True))

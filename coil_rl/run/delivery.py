@@ -27,7 +27,7 @@ from coil_rl.learners.anchor import hold_of
 from coil_rl.learners.learner import Learner
 from coil_rl.report.statistics import difference
 from coil_rl.run import checkpoint
-from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
+from coil_rl.run.cases import TrainingCases
 from coil_rl.run.curve import EvaluationCurve
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.judge import guide_titles
@@ -227,19 +227,16 @@ class Delivery:
         }
         earlier = policies.pop("earlier", None)
         self.cases.begin()
-        begun, count = self.cases.steps, FIRST_CASES
-        while count >= LEAST_CASES:
+        begun = self.cases.steps
+        for count in self.cases.blocks(FIRST_CASES, reserve):
             self.cases.renew(count)
             self._act(policies, returns)
-            taken = self.cases.steps - begun
             if earlier is not None:
                 # It is as long as the others, as far as is known.
-                if taken * (1 + 1 / len(policies)) <= reserve:
+                if (self.cases.steps - begun) * (1 + 1 / len(policies)) <= reserve:
                     self._act({"earlier": earlier}, returns)
                     policies["earlier"] = earlier
-                    taken = self.cases.steps - begun
                 earlier = None
-            count = further_cases(len(returns["last"]), taken, reserve)
         return returns
 
     def _act(self, policies: Mapping[str, Any], returns: dict[str, Tensor]) -> None:

@@ -48,11 +48,6 @@ class EvaluationResult:
         """Mean of the episodes."""
         return sum(self.rewards) / len(self.episodes)
 
-    def split(self, parts: int) -> list[EvaluationResult]:
-        """Return consecutive parts of equally many episodes."""
-        size = len(self.episodes) // parts
-        return [self[end - size : end] for end in range(size, len(self.episodes) + 1, size)]
-
     def __getitem__(self, rows: slice) -> EvaluationResult:
         """Return the episodes of some rows."""
         histories = {name: history[rows] for name, history in self.histories.items()}

@@ -132,18 +132,13 @@ class Experiment:
         Raises:
             UserError: if the checkpoint or the log is damaged, or belongs to another run.
         """
-        state = checkpoint.load_newest(self.folder)
-        if state is not None:
-            newest = self.folder / checkpoint.NEWEST
-            with file_of_a_run(newest, PUT_BACK):
-                lengths = (self.frames, *self.stages)
-                check_identity(state["identity"], self.identity, lengths, newest)
-                self.load_state_dict(state)
+        lengths = (self.frames, *self.stages)
+        known = go_on(self.folder, self.identity, lengths, self.load_state_dict)
         self.metrics.truncate(self.updates + 1 if self.updates else 0)
         if self.curve is not None:
             self.metrics.check_columns(self.curve.columns)
         where = f"after update {self.updates}"
-        if state is None:
+        if not known:
             where = "from the beginning: there is no checkpoint yet"
         say(f"{self.folder} continues {where}", error=True)
 
@@ -371,29 +366,38 @@ class Experiment:
             torch.cuda.set_rng_state_all(state["cuda_rng"])
 
 
-def check_identity(
-    saved: Mapping[str, Any], ours: Mapping[str, Any], lengths: Sequence[int], file: Path
-) -> None:
-    """Check that a checkpoint belongs to a run.
+def go_on(
+    folder: Path,
+    identity: Mapping[str, Any],
+    lengths: Sequence[int],
+    load: Callable[[dict[str, Any]], object],
+) -> bool:
+    """Load the last intact checkpoint of a run; return whether there is one.
 
     A run that was made longer has the checkpoint of the shorter one.
 
     Args:
+        identity: of the run.
         lengths: of the run, and earlier ones, in frames.
+        load: restores the state.
 
     Raises:
-        UserError: if it belongs to a run with another configuration.
+        UserError: if it is damaged, or belongs to a run with another configuration.
     """
-    length = ("budget.frames", "budget.stages")
-    one, other = (
-        {key: value for key, value in each.items() if key not in length} for each in (saved, ours)
-    )
-    check_same(one, other, f"{file} belongs to a run", PUT_BACK)
-    frames = saved.get("budget.frames", lengths[0])
-    if frames not in lengths:
-        raise UserError(
-            f"{file} belongs to a run with budget.frames={frames}, not {lengths[0]}; {PUT_BACK}"
-        )
+    state = checkpoint.load_newest(folder)
+    if state is None:
+        return False
+    file = folder / checkpoint.NEWEST
+    with file_of_a_run(file, PUT_BACK):
+        saved, ours = dict(state["identity"]), dict(identity)
+        frames = saved.get("budget.frames")
+        if frames in lengths:
+            for each in (saved, ours):
+                each.pop("budget.frames", None)
+                each.pop("budget.stages", None)
+        check_same(saved, ours, f"{file} belongs to a run", PUT_BACK)
+        load(state)
+    return True
 
 
 def watched_keys(env: EnvBase, watch: Watch) -> list[NestedKey]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -113,11 +113,17 @@ class Trial:
     def guide_results(
         self, evaluation: Evaluation, pictures: Sequence[Picture] = ()
     ) -> dict[str, EvaluationResult]:
-        """Evaluate each guide alone, see `evaluate_guides`; there may be none."""
+        """Evaluate each guide alone, once in each case of the test; there may be none."""
         if not self.guides:
             return {}
-        guides = self.make_env.guides()
-        return evaluate_guides(self.make_env, evaluation, guides, self.count, pictures)
+        cases = len(evaluation.cases)
+        rows = {title: slice(n * cases, (n + 1) * cases) for n, title in enumerate(self.guides)}
+        env, policy = self.make_env.guided(cases, TEST, count=self.count)
+        with progress(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
+            result = evaluation.run(
+                env, policy, tick=bar.update, watch=watching(env, pictures, rows)
+            )
+        return {title: result[part] for title, part in rows.items()}
 
     def chance(self) -> float:
         """Return the mean reward of random actions in the cases of the test.
@@ -183,8 +189,7 @@ def judge(
     """
     judgement = Judgement(trial.evaluation.measures)
     if policy is None or not trial.together:
-        watching = [picture for picture in trial.pictures if picture.watches]
-        for name, result in trial.guide_results(trial.evaluation, watching).items():
+        for name, result in trial.guide_results(trial.evaluation, trial.pictures).items():
             judgement.add(result, name)
     said: list[str] = []
     torch.manual_seed(seed)
@@ -236,14 +241,13 @@ def _evaluate_with(
     env = trial.env(own + len(guides) * count, advice)
     if trial.compiled:
         compile_steps(env)
-    watching = [] if advice else [picture for picture in trial.pictures if picture.watches]
-    shown = {trial.label: 0} | {name: rows.start for name, rows in guides.items()}
+    pictures = [] if advice else trial.pictures
     acting = [Acting(policy, rows=slice(count), whole=True)]
     if repeats:
         acting.append(Acting(policy, sampled=True, rows=slice(count, own), whole=True))
     for number, rows in enumerate(guides.values()):
         acting.append(Acting(FollowAdvice(env, number), rows=rows))
-    watch = partial(_watch, env, watching, shown) if watching else None
+    watch = watching(env, pictures, {trial.label: slice(count), **guides})
     drives = OnRows(acting) if len(acting) > 1 else policy
     result = trial.evaluation.run(env, drives, tick=bar.update, watch=watch)
     for name, rows in guides.items():
@@ -312,28 +316,28 @@ def not_worse(
     )
 
 
-def _watch(
-    env: EnvBase,
-    pictures: list[Picture],
-    rows: Mapping[str, int],
-    running: Tensor,
-    before: TensorDictBase,
-    after: TensorDictBase,
-) -> None:
-    """Show a step of an env to pictures; one that fails is taken out of the list.
+def watching(
+    env: EnvBase, pictures: Sequence[Picture], rows: Mapping[str, slice]
+) -> Callable[[Tensor, TensorDictBase, TensorDictBase], None] | None:
+    """Return what shows each step of an env to the pictures that watch; None without any.
+
+    A picture that fails is left out from then on.
 
     Args:
-        rows: the row in which each policy drives the first case.
-        running: whether each row was in its episode, [rows].
-        before: the entries before the step.
-        after: the entries after it.
+        rows: of each policy; the first one drives the first case.
     """
-    rows = {name: row for name, row in rows.items() if running[row]}
-    for picture in list(pictures):
-        pictures.remove(picture)
-        with decoration(f"the picture {type(picture).__name__}"):
-            picture.watch(env, rows, before, after)
-            pictures.append(picture)
+    present = [picture for picture in pictures if picture.watches]
+
+    def watch(running: Tensor, before: TensorDictBase, after: TensorDictBase) -> None:
+        firsts = {name: part.start or 0 for name, part in rows.items()}
+        shown = {name: row for name, row in firsts.items() if running[row]}
+        for picture in list(present):
+            present.remove(picture)
+            with decoration(f"the picture {type(picture).__name__}"):
+                picture.watch(env, shown, before, after)
+                present.append(picture)
+
+    return watch if present else None
 
 
 def report_outcome(folder: Path) -> float:
@@ -354,30 +358,6 @@ def report_outcome(folder: Path) -> float:
     shown = format(reward, return_format([reward]))
     say(f"{own[-1]['driver']}: mean test reward {shown}{share}; see {folder}")
     return reward
-
-
-def evaluate_guides(
-    make_env: EnvMaker,
-    evaluation: Evaluation,
-    guides: Mapping[str, TensorDictModuleBase],
-    count: int | None = None,
-    pictures: Sequence[Picture] = (),
-) -> dict[str, EvaluationResult]:
-    """Evaluate each guide alone, once in each case of the test.
-
-    The results have the names of `guide_titles`.
-
-    Args:
-        guides: by name.
-        count: number of cases, if it is not the env's own.
-    """
-    cases, titles = len(evaluation.cases), guide_titles(guides)
-    rows = {title: cases * index for index, title in enumerate(titles)}
-    env, policy = make_env.guided(cases, TEST, guides, count=count)
-    with progress(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
-        watch = partial(_watch, env, list(pictures), rows) if pictures else None
-        result = evaluation.run(env, policy, tick=bar.update, watch=watch)
-    return dict(zip(titles, result.split(len(guides)), strict=True))
 
 
 def guide_titles(guides: Iterable[str]) -> list[str]:

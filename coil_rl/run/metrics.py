@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from coil_rl.errors import UserError, file_of_a_run
-from coil_rl.files import LARGEST_TABLE, read_file, whole_file
+from coil_rl.files import LARGEST_TABLE, read_file, whole_file, write_text
 from coil_rl.output import decoration
-from coil_rl.record import curve, table
+from coil_rl.record import csv_text, curve, table
 from coil_rl.report.runs import RETURN
 
 REMEDY = "put the whole file back, or train again in another folder"  # for a damaged log
@@ -87,7 +87,7 @@ class Metrics:
         self.rows.append(row)
         first = not self.path.exists()
         with self.path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, columns)
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
             if first:
                 writer.writeheader()
             writer.writerow(row)
@@ -122,13 +122,7 @@ class Metrics:
         rows: list[dict[str, Any]] = list(table(read_file(self.path, LARGEST_TABLE)))
         for number, values in results.items():
             rows[number] |= values
-        with (
-            whole_file(self.path) as unfinished,
-            unfinished.open("w", encoding="utf-8", newline="") as file,
-        ):
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+        write_text(self.path, csv_text(rows))
 
     def newest(self, name: str = RETURN) -> float | None:
         """Return the newest number in a column; None if there is none yet."""

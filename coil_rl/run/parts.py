@@ -103,7 +103,7 @@ class EnvMaker:
             UserError: if the transforms do not fit the env, or each other.
         """
         bare = self.bare if self.of_agent is None else self.of_agent
-        return self._around(bare(rows, cases, count), self.disturb(cases), advice)
+        return self.around(bare(rows, cases, count), advice, self.disturb(cases))
 
     def plain(
         self, rows: int, cases: str, *, count: int | None = None, controllers: bool = True
@@ -119,21 +119,19 @@ class EnvMaker:
         make = self.bare if controllers or self.alone is None else self.alone
         return transformed(make(rows, cases, count), self.disturb(cases), "disturb")
 
-    def around(self, env: EnvBase, advice: str = "") -> EnvBase:
+    def around(self, env: EnvBase, advice: str = "", disturb: Sequence[Transform] = ()) -> EnvBase:
         """Return any env with normalised actions and the transforms of the method.
 
-        Nothing disturbs it: a recording, or a machine, has its own delays.
+        By default nothing disturbs it: a recording, or a machine, has its own delays.
 
         Args:
             env: the env.
             advice: as above.
+            disturb: transforms that disturb it.
 
         Raises:
             UserError: as above.
         """
-        return self._around(env, (), advice)
-
-    def _around(self, env: EnvBase, disturb: Sequence[Transform], advice: str) -> EnvBase:
         try:
             first = normalising(env)
         except ValueError as error:

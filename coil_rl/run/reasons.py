@@ -93,34 +93,28 @@ def still_rising(rows: Sequence[Mapping[str, float]]) -> bool:
     return last - before > RISE * (max(returns) - min(returns))
 
 
-def next_in_python(frames: int, rows: Sequence[Mapping[str, float]]) -> str:
-    """Return a line with what usually follows a training in Python.
-
-    Args:
-        frames: of the run.
-        rows: of `metrics.csv`.
-    """
-    longer = f"run.train(frames={2 * frames})"
-    if still_rising(rows):
-        return f"Still rising at the end: {longer}"
-    return f"Next: run.evaluate(cases=100) | run.controller() | {longer}"
-
-
 def next_step(
     folder: Path,
     frames: int,
     rows: Sequence[Mapping[str, float]] = (),
     trust: Sequence[str] = (),
+    *,
+    in_python: bool = False,
 ) -> str:
-    """Return a line with the commands that usually follow a finished training.
+    """Return a line with what usually follows a finished training.
 
     Args:
         rows: of `metrics.csv`.
-        trust: packages that these commands must trust.
+        trust: packages that commands must trust.
+        in_python: whether it is said in Python, not for a shell.
     """
-    longer = f"{resume_command(folder, trust)} budget.frames={2 * frames}"
-    swept = (folder.parent / SWEEP).exists()
-    report = f"coil-report folder={shlex.quote(str(folder.parent if swept else folder))}"
+    if in_python:
+        steps = ["run.evaluate(cases=100)", "run.controller()", f"run.train(frames={2 * frames})"]
+    else:
+        swept = (folder.parent / SWEEP).exists()
+        report = f"coil-report folder={shlex.quote(str(folder.parent if swept else folder))}"
+        longer = f"{resume_command(folder, trust)} budget.frames={2 * frames}"
+        steps = [command_of("coil-evaluate", "run", folder, trust), report, longer]
     if still_rising(rows):
-        return f"Still rising at the end: {longer}"
-    return f"Next: {command_of('coil-evaluate', 'run', folder, trust)} | {report} | {longer}"
+        return f"Still rising at the end: {steps[-1]}"
+    return f"Next: {' | '.join(steps)}"

@@ -29,16 +29,15 @@ from coil_rl.report.runs import EVALUATION, begun_with
 from coil_rl.run import checkpoint
 from coil_rl.run.beside import Beside, Driver
 from coil_rl.run.controller import Controller
-from coil_rl.run.curve import Watch
+from coil_rl.run.curve import Watch, guide_returns
 from coil_rl.run.delivery import guide_of
-from coil_rl.run.experiment import PUT_BACK
+from coil_rl.run.experiment import go_on
 from coil_rl.run.folder import (
     CODE,
     CODE_BEFORE,
     HANDED_OVER,
     begin,
     changed_code,
-    check_same,
     code_of,
     is_begun,
     is_evaluated,
@@ -47,10 +46,9 @@ from coil_rl.run.folder import (
     weights_file,
     write_config,
 )
-from coil_rl.run.guide_returns import guide_returns
 from coil_rl.run.judge import Trial, judge, report_outcome
 from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, try_out
-from coil_rl.run.reasons import SENTENCES, handed_over, next_in_python, next_step, start_test
+from coil_rl.run.reasons import SENTENCES, handed_over, next_step, start_test
 from coil_rl.run.shown import line_of, page_of
 from coil_rl.run.stopping import resume_command
 from coil_rl.run.training import training_of
@@ -247,12 +245,6 @@ class Run:
         return self
 
     @as_before()
-    def resume(self) -> float:
-        """Finish a run that was stopped; return the mean test reward of its policy."""
-        with locked(self.folder):
-            return self.finish_begun()
-
-    @as_before()
     def evaluate(self, cases: int | None = None, folder: str | Path | None = None) -> pd.DataFrame:
         """Evaluate the policy and the guides, and return the rows of `evaluation.csv`.
 
@@ -409,15 +401,8 @@ class Run:
         Raises:
             UserError: if it differs from the one in the checkpoint.
         """
-        state = checkpoint.load_newest(self.folder)
-        if state is not None:
-            newest = self.folder / checkpoint.NEWEST
-            check_same(
-                state["identity"],
-                self.identity,
-                f"{newest} belongs to a run",
-                PUT_BACK,
-            )
+        lengths = (self.budget.frames, *self.budget.stages)
+        go_on(self.folder, self.identity, lengths, lambda state: None)
 
     def finish(self, *, resumed: bool = False) -> float:
         """Train and evaluate in the folder, which is locked and holds the configuration."""
@@ -427,7 +412,8 @@ class Run:
                 report_changed_versions(self.folder)
             policy = self.learn(resumed=resumed) if self.has_agent else None
             drivers = self.drivers(policy)
-            judge(self._trial_with_reasons(), policy, self.folder, self.seed, drivers)
+            trial = replace(self.trial, notes=[*self.trial.notes, *self.reasons()])
+            judge(trial, policy, self.folder, self.seed, drivers)
             reward = report_outcome(self.folder)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"continue with: {self.resume_command}") from None
@@ -453,10 +439,7 @@ class Run:
         if not self.has_agent:
             return
         rows, frames = record.METRICS.need(self.folder), self.budget.frames
-        if self.in_python:
-            say(next_in_python(frames, rows))
-        else:
-            say(next_step(self.folder, frames, rows, self.trust))
+        say(next_step(self.folder, frames, rows, self.trust, in_python=self.in_python))
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
         """Train, draw the learning curve and return the policy to evaluate."""
@@ -465,32 +448,33 @@ class Run:
         guide_returns = self._saved_guide_returns()
         # After the guides, which a resumed run does not evaluate again.
         torch.manual_seed(self.seed)
-        experiment = training_of(self, before)
+        training = self.training(before)
         if resumed:
-            experiment.resume()
+            training.resume()
         start = time.monotonic()
-        rows = experiment.run(max(guide_returns.values(), default=None))
+        rows = training.run(max(guide_returns.values(), default=None))
         if not resumed:  # the time before the interruption is unknown
             record.SECONDS.write(self.folder, {"seconds": time.monotonic() - start})
-        learner = experiment.learner
+        learner, path = training.learner, self.folder / "learning_curve.png"
         with decoration(f"the learning curve in {self.folder}"):
-            self._draw(rows, learner, guide_returns)
-        experiment.metrics.close()
+            if learner is not None and learner.kind == "guides":
+                draw_phases(rows, list(learner.guides), path, title=self.label)
+            else:
+                cases = self.make_env.sizes.get(EVALUATION)
+                draw_learning_curves({self.label: [rows]}, path, guides=guide_returns, cases=cases)
+        training.metrics.close()
+        if learner is None:
+            return self.load_policy(self.make_env())
         learner.export(self.folder)
-        return self._loaded(learner.policy, experiment.rollout.env, self.which)
+        return self._loaded(learner.policy, training.rollout.env, self.which)
 
-    def _draw(
-        self,
-        rows: Sequence[dict[str, float]],
-        learner: Learner,
-        guide_returns: Mapping[str, float],
-    ) -> None:
-        path, label = self.folder / "learning_curve.png", self.label
-        if learner.kind == "guides":
-            draw_phases(rows, list(learner.guides), path, title=label)
-        else:
-            cases = self.make_env.sizes.get(EVALUATION)
-            draw_learning_curves({label: [rows]}, path, guides=guide_returns, cases=cases)
+    def training(self, before: int) -> Any:
+        """Return the training, an `Experiment`; a search for numbers has no learner.
+
+        Args:
+            before: frames that were taken before it.
+        """
+        return training_of(self, before)
 
     def _saved_guide_returns(self) -> dict[str, float]:
         """Return the mean return of each guide in the cases of the curve, measured once.
@@ -549,11 +533,6 @@ class Run:
             return guide
         checkpoint.put_weights(policy, state, path)
         return policy
-
-    def _trial_with_reasons(self) -> Trial:
-        """Return the trial with notes on the tests of the training."""
-        notes = [*self.trial.notes, *self.reasons()]
-        return replace(self.trial, notes=notes)
 
     def reasons(self) -> list[str]:
         """Return the sentences on how the training began, and on its tests."""

@@ -39,14 +39,8 @@ class Tuning(Search, OwnRun):
 
     def maker(self, config: DictConfig) -> Callable[..., Run]:
         """Return what makes the run."""
-        make_guide = GuideWithNumbers(config)
-        return partial(
-            TunedRun,
-            numbers=numbers_to_tune(config),
-            make_guide=make_guide,
-            search=self,
-            words=make_guide.words,
-        )
+        numbers, make_guide = numbers_to_tune(config), GuideWithNumbers(config)
+        return partial(TunedRun, numbers=numbers, make_guide=make_guide, search=self)
 
     def found(self, config: DictConfig, folder: Path) -> DictConfig:
         """Return the configuration whose guide has the numbers that the run has found.

@@ -88,7 +88,7 @@ def numbers_to_tune(config: DictConfig) -> list[Number]:
 
 def _own_bounds(node: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Return the bounds that the class of a guide knows itself, by its method `tunable`."""
-    target, arguments = _arguments(node, name)
+    target, _, arguments = _arguments(node, name)
     if not hasattr(target, "tunable"):
         raise UserError(
             f"tune={AUTO}: {name} knows no bounds; give them, such as tune='{{kp: [0.1, 10, log]}}'"
@@ -129,7 +129,7 @@ def _number(name: str, bounds: Any, own: float, whole: bool) -> Number:
 
 def numbers_of(node: Mapping[str, Any], name: str) -> dict[str, tuple[float, bool]]:
     """Return the numbers of a guide by name: own value, and whether it is an integer."""
-    target, arguments = _arguments(node, name)
+    target, _, arguments = _arguments(node, name)
     found: dict[str, tuple[float, bool]] = {}
     for key, parameter in _parameters(target).items():
         if key in OTHERS and not is_foreign(target):
@@ -150,7 +150,7 @@ def with_numbers(node: Mapping[str, Any], name: str, values: Mapping[str, float]
         values: numbers by name.
     """
     changed = copy.deepcopy(dict(node))
-    target, arguments = _arguments(changed, name)
+    target, place, arguments = _arguments(changed, name)
     parameters = _parameters(target)
     for key, value in values.items():
         argument, _, index = key.partition(".")
@@ -161,32 +161,23 @@ def with_numbers(node: Mapping[str, Any], name: str, values: Mapping[str, float]
         items = list(arguments.get(argument, parameters[argument].default))
         items[int(index)] = number
         arguments[argument] = items
-    return _with_arguments(changed, arguments)
+    return changed | {place: arguments} if place else arguments
 
 
-def _arguments(node: Mapping[str, Any], name: str) -> tuple[Any, dict[str, Any]]:
-    """Return the class or function of a guide's numbers, and its arguments in the node."""
-    target = find_target(node.get("_target_"), name)
+def _arguments(node: Mapping[str, Any], name: str) -> tuple[Any, str, dict[str, Any]]:
+    """Return the class or function of a guide's numbers, and where its arguments are, and these.
+
+    They are the node itself, or the entry of the node that has the returned name.
+    """
+    target, place = find_target(node.get("_target_"), name), ""
     if target is ControllerGuide:
-        of = node.get("of")
-        thing = load(of) if isinstance(of, str) else build(of, f"{name}.of")
-        return thing, dict(node.get("options") or {})
-    if target is classic.ClassicGuide:
-        return getattr(classic, node["controller"]), dict(node.get("options") or {})
-    if target is PerRow and isinstance(node.get("make"), Mapping):
-        make = node["make"]
-        return find_target(make.get("_target_"), f"{name}.make"), dict(make)
-    return target, dict(node)
-
-
-def _with_arguments(node: dict[str, Any], arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return the node of a guide with other arguments of its class or function."""
-    target = find_target(node.get("_target_"), "guide")
-    if target in (ControllerGuide, classic.ClassicGuide):
-        return node | {"options": arguments}
-    if target is PerRow and isinstance(node.get("make"), Mapping):
-        return node | {"make": arguments}
-    return arguments
+        of, place = node.get("of"), "options"
+        target = load(of) if isinstance(of, str) else build(of, f"{name}.of")
+    elif target is classic.ClassicGuide:
+        target, place = getattr(classic, node["controller"]), "options"
+    elif target is PerRow and isinstance(node.get("make"), Mapping):
+        target, place = find_target(node["make"].get("_target_"), f"{name}.make"), "make"
+    return target, place, dict(node.get(place) or {}) if place else dict(node)
 
 
 def _parameters(target: Any) -> Mapping[str, inspect.Parameter]:

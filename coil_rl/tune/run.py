@@ -6,8 +6,7 @@ policy of the run follows that guide.
 
 import math
 import shlex
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,22 +18,22 @@ from torchrl.envs import EnvBase
 from coil_rl import record
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.guides.simple import FollowAdvice
-from coil_rl.output import decoration, progress, say
-from coil_rl.report import draw_learning_curves
+from coil_rl.output import progress, say
 from coil_rl.report.runs import EVALUATION
 from coil_rl.report.table import return_format
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
-from coil_rl.run.curve import measures
+from coil_rl.run.curve import columns_of, evenly, means_of, measures
 from coil_rl.run.delivery import GUIDE, GuideActs
-from coil_rl.run.experiment import PUT_BACK, check_identity
+from coil_rl.run.experiment import PUT_BACK, go_on
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.parts import TESTS
 from coil_rl.run.run import Run
 from coil_rl.run.stopping import STOP
 from coil_rl.tune.candidates import Candidates
-from coil_rl.tune.search import BEST, MEAN, OWN, MakeGuide, Number, Search, Tuner, Values, chosen
+from coil_rl.tune.numbers import GuideWithNumbers
+from coil_rl.tune.search import BEST, MEAN, OWN, Number, Search, Tuner, Values, chosen
 
 NAMES = {OWN: "guide", MEAN: "tuned", BEST: "best_candidate"}  # in delivery.json
 
@@ -47,14 +46,12 @@ class TunedRun(Run):
         numbers: of the guide that are searched.
         make_guide: makes the guide with some values of them.
         search: settings.
-        words: returns the words of a command line that give the guide some values.
     """
 
     _: KW_ONLY
     numbers: Sequence[Number] = ()
-    make_guide: MakeGuide
+    make_guide: GuideWithNumbers
     search: Search = field(default_factory=Search)
-    words: Callable[[Values], Sequence[str]] = lambda values: ()
 
     @property
     def has_agent(self) -> bool:
@@ -77,35 +74,9 @@ class TunedRun(Run):
             )
         return self._loaded(GuideActs(env), env, which)
 
-    def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
-        """Tune the guide, draw the learning curve, and return the policy that follows the guide."""
-        self._saved_guide_returns()
-        candidates = Candidates(
-            [self.make_guide({number.name: number.own for number in self.numbers})]
-        )
-        cases = TrainingCases(self._env_of(candidates), self.budget.frames, self.seed)
-        tuner = Tuner(
-            self.numbers, self.make_guide, candidates, cases, search=self.search, seed=self.seed
-        )
-        metrics = Metrics(
-            self.folder / "metrics.csv", self.logger() if self.logger is not None else None
-        )
-        if resumed:
-            self._resume(tuner, metrics)
-        start = time.monotonic()
-        self._search(tuner, metrics)
-        self._hand_over(tuner, metrics)
-        if not resumed:  # the time before the interruption is unknown
-            record.SECONDS.write(self.folder, {"seconds": time.monotonic() - start})
-        with decoration(f"the learning curve in {self.folder}"):
-            draw_learning_curves(
-                {self.label: [metrics.rows]},
-                self.folder / "learning_curve.png",
-                guides=self._saved_guide_returns(),
-                title=self.label,
-                cases=self.make_env.sizes.get(EVALUATION),
-            )
-        return self.load_policy(self.make_env())
+    def training(self, before: int) -> Any:
+        """Return the search, a `TunedTraining`."""
+        return TunedTraining(self)
 
     def reasons(self) -> list[str]:
         """Return the sentences on the test, the numbers of the guide, and a budget too small."""
@@ -118,7 +89,7 @@ class TunedRun(Run):
     def _say_next(self) -> None:
         """Print what usually follows: a training with the guide itself, faster than this run."""
         values = read_tuned(self.folder, self.numbers) or {}
-        tuned = [*self.words(values)]
+        tuned = self.make_guide.words(values)
         if self.in_python:
             each = (f"{name}={str(value).removesuffix('.0')}" for name, value in values.items())
             numbers = ", ".join(each)
@@ -138,93 +109,117 @@ class TunedRun(Run):
         kept = [word for word in typed if not word.lstrip("+").startswith(tuple(own))]
         say(f"Next: {shlex.join([*kept, *tuned, 'method=coil_anchored'])}")
 
-    def _env_of(self, candidates: Candidates) -> Any:
-        """Return what makes the env in which candidates act."""
+
+class TunedTraining:
+    """The search of a run and the test of what it found, in the place of an `Experiment`.
+
+    Args:
+        run: whose guide is tuned.
+    """
+
+    learner = None
+
+    def __init__(self, run: TunedRun) -> None:
+        self.tuned, self.folder, self.make_env = run, run.folder, run.make_env
+        self.candidates = Candidates(
+            [run.make_guide({each.name: each.own for each in run.numbers})]
+        )
+        self.cases = TrainingCases(self._build, run.budget.frames, run.seed)
+        self.tuner = Tuner(
+            run.numbers,
+            run.make_guide,
+            self.candidates,
+            self.cases,
+            search=run.search,
+            seed=run.seed,
+        )
+        logger = run.logger() if run.logger is not None else None
+        self.metrics = Metrics(self.folder / "metrics.csv", logger)
+
+    def _build(self, rows: int) -> EnvBase:
+        return self._env(rows, TESTS, self.candidates)
+
+    def _env(self, rows: int, cases: str, candidates: Candidates) -> EnvBase:
+        """Return an env in which candidates act in the place of the guide."""
         (name,) = self.make_env.guides()
+        return self.make_env.guided(rows, cases, {name: candidates})[0]
 
-        def build(rows: int) -> EnvBase:
-            return self.make_env.guided(rows, TESTS, {name: candidates})[0]
-
-        return build
-
-    def _resume(self, tuner: Tuner, metrics: Metrics) -> None:
+    def resume(self) -> None:
         """Go on from the last intact checkpoint of the folder; without one begin anew."""
-        state = checkpoint.load_newest(self.folder)
-        if state is not None:
-            newest = self.folder / checkpoint.NEWEST
-            with file_of_a_run(newest, PUT_BACK):
-                lengths = (self.budget.frames, *self.budget.stages)
-                check_identity(state["identity"], self.identity, lengths, newest)
-                tuner.load_state_dict(state["tuner"])
-        metrics.truncate(len(tuner.told) + 1 if tuner.told else 0)
-        say(f"{self.folder} continues after generation {len(tuner.told)}", error=True)
+        budget = self.tuned.budget
+        lengths = (budget.frames, *budget.stages)
+        go_on(self.folder, self.tuned.identity, lengths, self._load)
+        done = len(self.tuner.told)
+        self.metrics.truncate(done + 1 if done else 0)
+        say(f"{self.folder} continues after generation {done}", error=True)
 
-    def _search(self, tuner: Tuner, metrics: Metrics) -> None:
-        """Search to the end, with a row of the log and a checkpoint for each generation."""
-        frames = self.budget.frames
+    def _load(self, state: Mapping[str, Any]) -> None:
+        self.tuner.load_state_dict(state["tuner"])
+
+    def run(self, guide_return: float | None = None) -> list[dict[str, float]]:
+        """Search to the end, test which numbers the guide gets, and return the rows of the log."""
+        tuner, cases, metrics = self.tuner, self.cases, self.metrics
         with (
             progress(
-                total=frames, initial=tuner.cases.steps, unit="frame", unit_scale=True, desc="tune"
+                total=cases.frames, initial=cases.steps, unit="frame", unit_scale=True, desc="tune"
             ) as bar,
             STOP.after_update(),
         ):
             while tuner.may_go_on() and not (tuner.told and tuner.converged):
-                before = tuner.cases.steps
-                means = tuner.generation()
-                row = self._row(tuner, means)
+                before = cases.steps
+                row = self._row(tuner.generation())
                 if not metrics.rows:
                     metrics.append(self._first_row(row))
                 metrics.append(row)
                 metrics.flush()
-                bar.update(tuner.cases.steps - before)
+                bar.update(cases.steps - before)
                 shown = format(row["train/return"], return_format([row["train/return"]]))
                 bar.set_postfix({"candidates": shown})
-                self._save(tuner)
+                self._save()
                 if STOP.requested:
                     raise KeyboardInterrupt
+        self._hand_over()
+        return metrics.rows
 
-    def _row(self, tuner: Tuner, means: Sequence[float]) -> dict[str, float]:
+    def _row(self, means: Sequence[float]) -> dict[str, float]:
         """Return the row of the log after a generation."""
+        sets = self.make_env.sizes.keys() & {EVALUATION}
         row = {
-            **dict.fromkeys(self._columns(), math.nan),
-            "frames": tuner.cases.steps,
+            **dict.fromkeys(columns_of(sets, self.tuned.watch), math.nan),
+            "frames": self.cases.steps,
             "frames/before": 0,
             "frames/rollout": 0,
-            "frames/tests": tuner.cases.steps,
-            "guide/calls": tuner.cases.calls,
+            "frames/tests": self.cases.steps,
+            "guide/calls": self.cases.calls,
             "train/return": sum(means) / len(means),
             "tune/best": max(means),
-            "tune/spread": tuner.spread,
+            "tune/spread": self.tuner.spread,
         }
-        return row | {f"tune/number/{name}": value for name, value in tuner.mean.items()}
+        return row | {f"tune/number/{name}": value for name, value in self.tuner.mean.items()}
 
     def _first_row(self, row: Mapping[str, float]) -> dict[str, float]:
         """Return the row of the state before the first generation."""
         counted = [name for name in row if name.startswith(("frames", "guide/calls"))]
-        own = {f"tune/number/{number.name}": number.own for number in self.numbers}
+        own = {f"tune/number/{name}": value for name, value in self.tuner.own.items()}
         return dict.fromkeys(row, math.nan) | dict.fromkeys(counted, 0) | own
 
-    def _columns(self) -> list[str]:
-        """Return the names of what the curve measures."""
-        if EVALUATION not in self.make_env.sizes:
-            return []
-        measured = ["return", *(name for group in self.watch.values() for name in group)]
-        return [f"{EVALUATION}/{name}" for name in measured]
-
-    def _hand_over(self, tuner: Tuner, metrics: Metrics) -> None:
+    def _hand_over(self) -> None:
         """Test which numbers the guide gets, unless that is done, and evaluate the kept ones."""
         with STOP.at_once():
             report = record.DELIVERY.read(self.folder)
-            if report is None or not (self.folder / "policy_last.pt").exists():
-                report = self._test(tuner)
-            tuner.cases.steps, tuner.cases.calls = report.steps, report.calls
+            if report is None or not weights_file(self.folder).exists():
+                report = self._test()
+            self.cases.steps, self.cases.calls = report.steps, report.calls
             counted = {"frames": report.steps, "frames/tests": report.steps}
-            metrics.fill({len(metrics.rows) - 1: counted | {"guide/calls": report.calls}})
-            self._fill_curve(metrics)
-        self._save(tuner)
+            last = len(self.metrics.rows) - 1
+            self.metrics.fill({last: counted | {"guide/calls": report.calls}})
+            if EVALUATION in self.make_env.sizes:
+                self._fill_curve(last)
+        self._save()
 
-    def _test(self, tuner: Tuner) -> record.Delivery:
+    def _test(self) -> record.Delivery:
         """Test, and write the numbers that the guide gets and why; return why."""
+        tuner = self.tuner
         values = {OWN: tuner.own, MEAN: tuner.mean, BEST: tuner.best}
         returns = tuner.test()
         name = chosen(returns)
@@ -234,41 +229,34 @@ class TunedRun(Run):
         report = record.Delivery(
             policy=NAMES[name],
             cases=len(returns[OWN]),
-            steps=tuner.cases.steps,
-            calls=tuner.cases.calls,
+            steps=self.cases.steps,
+            calls=self.cases.calls,
             returns={NAMES[each]: float(found.mean()) for each, found in returns.items()},
         )
         record.DELIVERY.write(self.folder, report)
         return report
 
-    def _save(self, tuner: Tuner) -> None:
+    def _save(self) -> None:
         """Write the checkpoint."""
-        state = {"tuner": tuner.state_dict(), "identity": self.identity}
+        state = {"tuner": self.tuner.state_dict(), "identity": self.tuned.identity}
         checkpoint.save_newest(state, self.folder)
 
-    def _fill_curve(self, metrics: Metrics) -> None:
-        """Evaluate the guide with the numbers of some generations in the cases of the curve."""
-        if not self._columns():
-            return
-        last = len(metrics.rows) - 1
-        points = min(self.budget.points, last)
-        kept = sorted({round(last * point / points) for point in range(points + 1)})
-        guides = [self.make_guide(self._numbers_of(metrics.rows[each])) for each in kept]
-        cases = self.make_env.sizes[EVALUATION]
-        (name,) = self.make_env.guides()
-        env, _ = self.make_env.guided(len(kept) * cases, EVALUATION, {name: Candidates(guides)})
-        with torch.random.fork_rng():
-            results = measures(env, FollowAdvice(env), cases=cases, watch=self.watch)
-        rows: dict[int, dict[str, float]] = {each: {} for each in kept}
-        for measured, numbers in results.items():
-            means = numbers.view(len(kept), -1).double().mean(1).tolist()
-            for each, mean in zip(kept, means, strict=True):
-                rows[each][f"{EVALUATION}/{measured}"] = mean
-        metrics.fill(rows)
+    def _fill_curve(self, last: int) -> None:
+        """Evaluate the guide with the numbers of some generations in the cases of the curve.
 
-    def _numbers_of(self, row: Mapping[str, float]) -> Values:
-        """Return the numbers around which candidates were drawn after a row of the log."""
-        return {number.name: row[f"tune/number/{number.name}"] for number in self.numbers}
+        Args:
+            last: number of the last row.
+        """
+        kept = evenly([0, last], min(self.tuned.budget.points, last))
+        rows = [self.metrics.rows[each] for each in kept]
+        values = [{name: row[f"tune/number/{name}"] for name in self.tuner.own} for row in rows]
+        candidates = Candidates(list(map(self.tuned.make_guide, values)))
+        cases = self.make_env.sizes[EVALUATION]
+        env = self._env(len(kept) * cases, EVALUATION, candidates)
+        with torch.random.fork_rng():
+            found = measures(env, FollowAdvice(env), cases=cases, watch=self.tuned.watch)
+        means = means_of(found, EVALUATION, len(kept))
+        self.metrics.fill(dict(zip(kept, means, strict=True)))
 
 
 def beyond_budget(folder: Path, frames: int) -> list[str]:

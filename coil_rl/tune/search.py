@@ -19,7 +19,7 @@ from torch import Tensor
 
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.ranges import Count, Ge, Interval, checked
-from coil_rl.run.cases import LEAST_CASES, TrainingCases, further_cases
+from coil_rl.run.cases import LEAST_CASES, TrainingCases
 from coil_rl.tune.candidates import Candidates
 
 OWN, MEAN, BEST = "own", "mean", "best"  # the candidates of the test at the end
@@ -176,18 +176,15 @@ class Tuner:
         """Return the returns of `OWN`, `MEAN` and `BEST` in the same further new cases, [C]."""
         values = {OWN: self.own, MEAN: self.mean, BEST: self.best}
         reserve = self.cases.frames - self.cases.steps
-        found: dict[str, list[Tensor]] = {name: [] for name in values}
-        begun, count = self.cases.steps, FIRST_CASES
+        first = FIRST_CASES
         if self.cases.episodes:
             length = self.cases.steps / self.cases.episodes
-            count = max(LEAST_CASES, min(count, int(reserve / (len(values) * length))))
-        while count >= LEAST_CASES:
-            new = self.returns(list(values.values()), count)
-            for known, returns in zip(found.values(), new, strict=True):
-                known.append(returns)
-            taken = self.cases.steps - begun
-            count = further_cases(sum(map(len, found[OWN])), taken, reserve)
-        return {name: torch.cat(returns) for name, returns in found.items()}
+            first = max(LEAST_CASES, min(first, int(reserve / (len(values) * length))))
+        parts = [
+            self.returns(list(values.values()), count)
+            for count in self.cases.blocks(first, reserve)
+        ]
+        return dict(zip(values, map(torch.cat, zip(*parts, strict=True)), strict=True))
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the next generation depends on."""

@@ -354,7 +354,8 @@ def test_run_from_parts_is_trained_resumed_and_reported(tmp_path):
     run = Run(tmp_path / "runs" / "mine", **parts).train()
     assert math.isfinite(run.evaluate()["reward"].mean())
     again = Run(tmp_path / "runs" / "mine", **parts)
-    assert again.resume() == pytest.approx(float(rows(run.folder / "evaluation.csv")[-1]["reward"]))
+    reward = float(rows(run.folder / "evaluation.csv")[-1]["reward"])
+    assert again.finish_begun() == pytest.approx(reward)
     called("report", f"folder={tmp_path / 'runs'}")
     assert "mine" in (tmp_path / "runs" / "report.md").read_text()
     refused = called("evaluate", f"run={run.folder}", code=2).stderr

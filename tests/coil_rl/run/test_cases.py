@@ -139,16 +139,19 @@ def test_cases_of_the_cone_world_are_new_places_with_the_whole_time_limit():
 @pytest.mark.fast(1)
 @pytest.mark.parametrize("words", [["env=pendulum"], ["guide=zero", *LAP]], ids=["gym", "cones"])
 def test_rows_may_begin_in_the_same_cases(words):
-    cases, _ = built(*words, "training.tests.starts=30" if "guide=zero" in words else "seed=0")
+    cases, learner = built(
+        *words, "training.tests.starts=30" if "guide=zero" in words else "seed=0"
+    )
     assert cases.can_copy()
-    cases.begin()
-    cases.renew(2, copies=3)
-    first = cases.env.reset()["observation"].reshape(3, 2, -1)
-    assert torch.equal(first[0], first[1])
-    assert torch.equal(first[0], first[2])
-    cases.begin()
+    seen = []
+    cases.teach(["observation"], seen.append)
+    cases.renew(2)
+    cases.compared([learner.policy] * 3)
+    first, *others = seen[0]["observation"][:, 0].reshape(3, 2, -1)
+    assert all(torch.equal(first, each) for each in others)
     cases.renew(6)
-    assert len(cases.env.reset()["observation"].reshape(6, -1).unique(dim=0)) > 2
+    cases.compared([learner.policy])
+    assert len(seen[1]["observation"][:, 0].unique(dim=0)) > 2
 
 
 @pytest.mark.slow

@@ -299,7 +299,7 @@ def test_parts_of_a_result_keep_their_histories():
     whole = evaluate_policy(
         env, RandomPolicy(env.action_spec), record={"place": "place"}, cases=["a", "b", "c"]
     )
-    first, second = whole.split(2)
+    first, second = whole[:3], whole[3:]
     assert [*first.episodes, *second.episodes] == whole.episodes
     assert [episode["case"] for episode in second.episodes] == ["a", "b", "c"]
     assert [*first.histories["place"], *second.histories["place"]] == whole.histories["place"]

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from types import SimpleNamespace
 
 import pytest
 from hydra import compose, initialize_config_module
@@ -34,7 +35,8 @@ def test_next_command_names_each_number_of_the_guide_once(mark, tmp_path, capsys
     run = TunedRun.__new__(TunedRun)
     run.folder, run.in_python, run.numbers = tmp_path, False, ()
     run.command = ["coil-train", "method=tune", "tune={gain: [1, 4]}", *words]
-    run.words = lambda values: ["guide.swing_up.gain=3.5", "+guide.swing_up.more=1"]
+    said = ["guide.swing_up.gain=3.5", "+guide.swing_up.more=1"]
+    run.make_guide = SimpleNamespace(words=lambda values: said.copy())
     run._say_next()
     said = shlex.split(capsys.readouterr().out)
     kept = [word for word in words if "gain" not in word]
@@ -61,6 +63,6 @@ def test_next_step_in_python_gives_the_numbers_as_the_guide_takes_them(
     monkeypatch.setattr("coil_rl.tune.run.read_tuned", lambda folder, numbers: {"gain": 3.5})
     run = TunedRun.__new__(TunedRun)
     run.folder, run.in_python, run.numbers = tmp_path, True, ()
-    run.words = lambda values: [word]
+    run.make_guide = SimpleNamespace(words=lambda values: [word])
     run._say_next()
     assert capsys.readouterr().out == f"Next: coil_rl.train(ENV, {said})\n"

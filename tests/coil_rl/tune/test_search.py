@@ -10,10 +10,8 @@ from programs import LAP, called
 
 from coil_rl import LearnedGuide, open_run
 from coil_rl.report.runs import read_runs
-from coil_rl.run.cases import TrainingCases
-from coil_rl.run.judge import evaluate_guides
-from coil_rl.tune.candidates import Candidates
-from coil_rl.tune.search import BEST, MEAN, OWN, Number, Search, Tuner, chosen
+from coil_rl.run.parts import TEST
+from coil_rl.tune.search import BEST, MEAN, OWN, Number, Tuner, chosen
 
 pytest.importorskip("gymnasium.envs.classic_control")
 SMALL = [
@@ -107,8 +105,9 @@ def test_tuned_guide_is_a_guide_that_acts_as_the_policy_of_its_run(run):
     evaluation = opened.trial.evaluation
     of_run = opened.evaluate()
     mean = of_run[(of_run["driver"] == "tune") & (of_run["case"] == "mean")]["reward"].item()
-    results = evaluate_guides(opened.make_env, evaluation, {"learned": LearnedGuide(str(run))})
-    assert results["guide"].mean_reward == pytest.approx(mean)
+    guides = {"learned": LearnedGuide(str(run))}
+    result = evaluation.run(*opened.make_env.guided(len(evaluation.cases), TEST, guides))
+    assert result.mean_reward == pytest.approx(mean)
 
 
 @pytest.mark.slow
@@ -224,9 +223,7 @@ def test_candidates_of_a_generation_act_in_the_same_cases_side_by_side_or_in_tur
 
 
 def _tuner(opened):
-    candidates = Candidates([opened.make_guide({"gain": 1.0})])
-    cases = TrainingCases(opened._env_of(candidates), 1000, 0)
-    return Tuner(opened.numbers, opened.make_guide, candidates, cases, search=Search())
+    return opened.training(0).tuner
 
 
 def test_own_numbers_are_kept_unless_others_are_clearly_better():
