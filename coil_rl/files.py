@@ -58,15 +58,11 @@ def read_file(path: str | os.PathLike[str], largest: int) -> bytes:
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        blocks: list[bytes] = []
-        read = 0
         # Some files of the system have no size before they are read.
-        while size <= largest and read <= largest and (block := file.read(max(size, BLOCK))):
-            blocks.append(block)
-            read += len(block)
-    if max(size, read) > largest:
+        content = file.read(max(size, BLOCK)) if size <= largest else b""
+    if max(size, len(content)) > largest:
         raise OSError(errno.EINVAL, f"it has more than {largest:,} bytes", os.fspath(path))
-    return b"".join(blocks)
+    return content
 
 
 def read_text(path: str | os.PathLike[str], largest: int) -> str:

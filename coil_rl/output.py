@@ -9,7 +9,7 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from importlib.util import find_spec
 from time import time
@@ -131,14 +131,6 @@ def say(text: str, *, error: bool = False) -> None:
     stream.flush()
 
 
-def warn(text: str) -> None:
-    """Show a warning."""
-    try:
-        warnings.warn(text, stacklevel=3)
-    except (OSError, ValueError):  # standard error is closed
-        return
-
-
 @contextmanager
 def decoration(name: str) -> Iterator[None]:
     """Turn any error in the block into a warning of one sentence.
@@ -150,4 +142,6 @@ def decoration(name: str) -> Iterator[None]:
         yield
     except Exception as error:  # whatever a library or an env raises
         reason = textwrap.shorten(f"{type(error).__name__}: {error}", 200, placeholder=" ...")
-        warn(f"{name} is left out ({reason}); the results are complete without it")
+        text = f"{name} is left out ({reason}); the results are complete without it"
+        with suppress(OSError, ValueError):  # standard error is closed
+            warnings.warn(text, stacklevel=2)

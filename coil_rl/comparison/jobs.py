@@ -7,10 +7,8 @@ from typing import Any
 from coil_rl.config.messages import reason_of
 from coil_rl.config.python import Named, prepared
 from coil_rl.files import FAILED_JOBS
-from coil_rl.learners.learner import Callback, Learner
 from coil_rl.output import decoration, progress, quietly, say
 from coil_rl.run.folder import is_evaluated
-from coil_rl.run.run import Run
 
 BAR = "compare, {desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}"  # in trainings
 
@@ -46,23 +44,14 @@ def _run_job(job: Named, folder: Path, bar: Any) -> str | None:
     try:
         with quietly():
             run = prepared(job, folder)
-            _show(run, bar)
+            others = run.callbacks
+            run.callbacks = lambda learner: [*others(learner), Tick(bar)]
             run.train()
     except Exception as error:
         reason = reason_of(error)
         say(f"coil-compare: {folder.name} failed: {reason}; the others go on", error=True)
         return reason
     return None
-
-
-def _show(run: Run, bar: Any) -> None:
-    """Let a run tell a progress bar of its frames."""
-    others = run.callbacks
-
-    def callbacks(learner: Learner) -> list[Callback]:
-        return [*others(learner), Tick(bar)]
-
-    run.callbacks = callbacks
 
 
 def show_progress(bar: Any, done: float) -> None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,8 @@ def read_outcome(folder: Path, arms: Sequence[str], failed: Mapping[str, str]) -
     entries: dict[str, Entry] = {}
     rows: list[dict[str, Any]] = []
     for name, table in read_baselines(folder).groupby(NAME, sort=False):
-        entries[str(name)] = _baseline(str(name), table)
+        action = action_words(table) if name == ZERO else ZERO_ACTIONS
+        entries[str(name)] = Entry(str(name), table["reward"].to_numpy()[None], action=action)
         asked = int(table["steps"].sum()) if name in (GUIDE, OPPOSITE) else 0
         rows.append(_row(entries[str(name)], [table], calls=asked))
     runs: dict[str, list[Run]] = {name: [] for name in arms}
@@ -63,12 +64,6 @@ def read_outcome(folder: Path, arms: Sequence[str], failed: Mapping[str, str]) -
         entries[name] = Entry(name, returns, rising)
         rows.append(_learned_row(entries[name], tables, runs[name], reasons))
     return Outcome(entries, rows, {name: each for name, each in runs.items() if each})
-
-
-def _baseline(name: str, table: pd.DataFrame) -> Entry:
-    """Return what acts without learning, from its episodes."""
-    entry = Entry(name, table["reward"].to_numpy()[None])
-    return replace(entry, action=action_words(table)) if name == ZERO else entry
 
 
 def _own(run: Run) -> pd.DataFrame:

@@ -103,18 +103,14 @@ class Plan:
         if self.seconds > 1.3 * 60 * minutes:
             more = f" (minutes={minutes:g} is not enough: each training needs a few batches)"
         frames = ", ".join(f"{name} {frames:,}" for name, frames in self.frames.items())
+        duration = f"{max(self.seconds, 1):.0f} s"
+        if self.seconds >= 90:
+            duration = f"{self.seconds / 60:.1f} min"
         return (
             f"It runs {self.jobs} trainings (frames: {frames}; {self.seeds} seeds), beside the "
             "guide, its opposite, zero, random actions and the first network, and takes about "
-            f"{_duration(self.seconds)}{more}."
+            f"{duration}{more}."
         )
-
-
-def _duration(seconds: float) -> str:
-    """Return a duration in words."""
-    if seconds < 90:
-        return f"{max(seconds, 1):.0f} s"
-    return f"{seconds / 60:.1f} min"
 
 
 def measure(plain: Mapping[str, DictConfig], overhead: float) -> Pace:

@@ -183,7 +183,9 @@ class Experiment:
                         row = self.update(self.updates / updates)
                     row |= self._measure(row)
                     row = self._taken() | row
-                    self._log(row)
+                    if not self.metrics.rows:
+                        self.metrics.append({**dict.fromkeys(row, math.nan), **self.first})
+                    self.metrics.append(row)
                     bar.update(frames)
                     with decoration("the progress bar"):
                         self._show(bar, row, guide_return)
@@ -212,12 +214,6 @@ class Experiment:
                 if not math.isfinite(value) and not (without and math.isnan(value)):
                     raise UserError(f"{name} is {value} in update {self.updates}")
         return {**row, **learned}
-
-    def _log(self, row: dict[str, float]) -> None:
-        """Log an update."""
-        if not self.metrics.rows:
-            self.metrics.append({**dict.fromkeys(row, math.nan), **self.first})
-        self.metrics.append(row)
 
     def _measure(self, row: Mapping[str, float]) -> dict[str, float]:
         """Return the numbers of the callbacks that measure, NaN where they are not due."""

@@ -147,21 +147,20 @@ class Metrics:
         Raises:
             UserError: if there are fewer rows, or the file is damaged.
         """
-        lines: list[bytes] = []
-        if self.path.exists():
-            with file_of_a_run(self.path, REMEDY):
-                lines = read_file(self.path, LARGEST_TABLE).splitlines(keepends=True)
-        if len(lines) <= count and count:
-            found = max(len(lines) - 1, 0)
-            raise UserError(
-                f"{self.path} has {found} of the {count} rows that belong to the checkpoint; "
-                f"{REMEDY}"
-            )
         self.rows = []
-        if count:
+        with file_of_a_run(self.path, REMEDY):
+            content = read_file(self.path, LARGEST_TABLE) if self.path.exists() else b""
+            lines = content.splitlines(keepends=True)
+            if len(lines) <= count and count:
+                found = max(len(lines) - 1, 0)
+                raise UserError(
+                    f"{self.path} has {found} of the {count} rows that belong to the checkpoint; "
+                    f"{REMEDY}"
+                )
             kept = b"".join(lines[: count + 1])
-            with file_of_a_run(self.path, REMEDY):
+            if count:
                 self.rows = curve(kept)
+        if count:
             with whole_file(self.path) as unfinished:
                 unfinished.write_bytes(kept)
         else:
