@@ -10,32 +10,22 @@ same tensor operations for all cars, whatever happens to them, and does not wait
 """
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial, reduce
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torch import Tensor
 
 from coil_rl.envs.boundaries import Boundaries
 from coil_rl.envs.constants import constant
 from coil_rl.envs.limits import Degrees, Laps, Seconds, Starts
 from coil_rl.envs.meanings import of_cones
-from coil_rl.envs.reward import (
-    HISTORY,
-    TERMS,
-    Outcome,
-    RewardWeights,
-    check_weights,
-    recent_mean,
-    weighted_terms,
-)
-from coil_rl.envs.seeded_env import SeededEnv
+from coil_rl.envs.reward import LapsEnv
+from coil_rl.envs.seeded_env import declare_specs
 from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SAMPLES, SIGHT, Frame, View, view
 from coil_rl.envs.splines import spline_fit
-from coil_rl.envs.track import NEVER, Track, begin_in_sight, places
+from coil_rl.envs.track import NEVER, Track, begin_in_sight
 from coil_rl.envs.track_map import Location, TrackMap
 from coil_rl.ranges import Count, Interval, Positive, Seed, checked
 
@@ -43,7 +33,7 @@ FINISH_RADIUS = 0.625  # m
 
 
 @checked
-class ConeTrackEnv(SeededEnv):
+class ConeTrackEnv(LapsEnv):
     """Cars on tracks between cones.
 
     Reads `action` [B, 1], the steering angle as a fraction of `max_steering`. It writes:
@@ -108,7 +98,7 @@ class ConeTrackEnv(SeededEnv):
         torch.Size([8, 3, 20])
     """
 
-    reward_terms: ClassVar[tuple[str, ...]] = TERMS
+    begun: ClassVar[tuple[str, ...]] = (*LapsEnv.begun, "samples", "sampled")
 
     def __init__(
         self,
@@ -139,7 +129,6 @@ class ConeTrackEnv(SeededEnv):
     ) -> None:
         if round(time_limit * rate) < 1:
             raise ValueError(f"time_limit={time_limit} must be at least one step of 1/{rate} s")
-        check_weights("reward", reward or {}, RewardWeights._fields)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.dtype_, self.generator = dtype, torch.Generator()
         self.rate, self.laps, self.held_steps = rate, laps, held_steps
@@ -153,14 +142,12 @@ class ConeTrackEnv(SeededEnv):
         if finish_in_sight:
             tracks = [begin_in_sight(track, sight, HALF_FIELD_OF_VIEW) for track in tracks]
         self.map = TrackMap(tracks, sight=sight, dtype=dtype).to(self.device)
-        weights = torch.tensor(RewardWeights(**(reward or {})), dtype=dtype, device=self.device)
-        self.weights: Tensor = nn.Buffer(weights, persistent=False)
-        self._declare_specs()
-        self._register_state(num_envs)
+        self._register_state(reward)
         self.compiled: Callable[..., Sequence[Tensor]] | None = None
         self.tables = [self.weights, *self.map.buffers()]
         self.staggered = starts is not None
         self._register_starts(starts)
+        declare_specs(self, ConeTrackEnv._reset(self))
         self.set_seed(seed)
 
     @property
@@ -168,69 +155,23 @@ class ConeTrackEnv(SeededEnv):
         """What the entries mean, see `coil_rl.envs.meanings`."""
         return of_cones(self.sight, math.degrees(self.max_steering))
 
-    def _declare_specs(self) -> None:
-        real = partial(Unbounded, dtype=self.dtype_, device=self.device)
-        count = partial(Unbounded, dtype=torch.int64, device=self.device)
-        bounded = partial(Bounded, -1, 1, dtype=self.dtype_, device=self.device)
-        flag = Binary(1, dtype=torch.bool, device=self.device)
-        observation = Composite(
-            observation=bounded((4 * SAMPLES,)),
-            cones=real((2, self.kept_cones, 2)),
-            cone_count=count((2,)),
-            steering=bounded((1,)),
-            motion=real((3,)),
-        )
-        if self.info:
-            terms = Composite({term: real((1,)) for term in self.reward_terms})
-            observation["info"] = Composite(
-                track=count((1,)),
-                lap=count((1,)),
-                lap_time=real((1,)),
-                crashed=flag,
-                completed=flag,
-                clearance=real((1,)),
-                smoothness=real((1,)),
-                pose=real((3,)),
-                reward=terms,
-            )
-        ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
-        self.observation_spec = observation.expand(self.batch_size)
-        self.done_spec = Composite(ends, device=self.device).expand(self.batch_size)
-        self.action_spec = bounded((*self.batch_size, 1))
-        self.reward_spec = real((*self.batch_size, 1))
-
-    def _register_state(self, cars: int) -> None:
+    def _register_state(self, reward: Mapping[str, float] | None) -> None:
         """Register all state as buffers; their last dimension is the cars."""
-
-        def zeros(*shape: int, dtype: torch.dtype = self.dtype_) -> nn.Buffer:
-            return nn.Buffer(torch.zeros((*shape, cars), dtype=dtype, device=self.device))
-
-        self.track: Tensor = zeros(dtype=torch.int64)  # index
-        self.pose: Tensor = zeros(3)  # m, m, radians
-        self.history: Tensor = zeros(HISTORY)  # actions, newest first
-        self.steps: Tensor = zeros(dtype=torch.int32)  # of the episode
-        self.lap: Tensor = zeros(dtype=torch.int32)  # completed laps
-        # Step of the last entry of the finish circle.
-        self.lap_start: Tensor = zeros(dtype=torch.int32)
-        self.in_finish: Tensor = zeros(dtype=torch.bool)  # whether inside the finish circle
+        self._register_laps(reward)
         # Number of steps over all episodes, and of resets; a clock that never goes back.
-        self.epoch: Tensor = zeros(dtype=torch.int32)
-        self.lap_epoch: Tensor = zeros(dtype=torch.int32)  # epoch in which the lap began
+        self.epoch: Tensor = self._zeros(dtype=torch.int32)
+        self.lap_epoch: Tensor = self._zeros(dtype=torch.int32)  # epoch in which the lap began
         # Epoch of each cone's last sighting.
-        self.last_seen: Tensor = zeros(2 * self.map.slots, dtype=torch.int32)
+        self.last_seen: Tensor = self._zeros(2 * self.map.slots, dtype=torch.int32)
         # m, last boundary estimate, in world coordinates.
-        self.samples: Tensor = zeros(2, SAMPLES, 2)
-        self.sampled: Tensor = zeros(2)  # 1 for a side with an estimate
+        self.samples: Tensor = self._zeros(2, SAMPLES, 2)
+        self.sampled: Tensor = self._zeros(2)  # 1 for a side with an estimate
         buffers = self.named_buffers(recurse=False)
         self.state_names = [name for name, _ in buffers if name != "weights"]
 
     def _register_starts(self, starts: int | None) -> None:
         """Observe all P places where an episode may begin once, so that a reset only copies."""
-        index, pose, driven = map(torch.as_tensor, places(self.map.tracks, starts))
-        tracks, pose = index.to(self.device), pose.T.contiguous().to(self.map.starts)
-        # A negative step: the one at which a car at full speed would have been at the finish.
-        lap_start = torch.where(driven.isnan(), NEVER, -driven * self.rate / self.speed)
-        lap_start = lap_start.round().int().to(self.device)
+        tracks, pose, lap_start = self._places(self.map.tracks, starts)
         frame = Frame(pose)
         location = self.map.locate(tracks, frame.position)
         visible, _, cones = self._view(location, pose, frame)
@@ -254,67 +195,16 @@ class ConeTrackEnv(SeededEnv):
             self.register_buffer(f"start_{name}", value, persistent=False)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        everyone = torch.arange(self.batch_size[0], device=self.device)
-        cars = everyone if mask is None else mask.view(-1).nonzero().squeeze(-1)
-        place, steps = self._assign_places(cars, first=mask is None)
-
-        def start(of_places: Tensor) -> Tensor:
-            return of_places.index_select(-1, place)
-
-        self._begin(cars, steps, start)
-        zero = torch.zeros_like(self.pose[0])
-        observation, cones, count = (
-            at.new_zeros(*at.shape[:-1], len(everyone)).index_copy_(-1, cars, start(at))
-            for at in (self.start_observation, self.start_cones, self.start_count)
-        )
-        flags = {"crashed": zero.bool(), "completed": zero.bool()}
-        info = {"lap_time": zero, **flags, "clearance": zero, "smoothness": zero}
-        motion, terms = torch.zeros_like(self.pose), dict.fromkeys(self.reward_terms, zero)
-        return self._output(observation.t(), cones, count, motion, info, terms)
-
-    def _assign_places(self, cars: Tensor, *, first: bool) -> tuple[Tensor, Tensor]:
-        """Choose where cars begin their episodes.
-
-        Args:
-            cars: [N], indices of the cars that are reset.
-            first: whether this is a reset of all cars, not of those whose episodes ended.
-
-        Returns:
-            The place of each car, and the number of steps of its time limit that are over, [N]
-            each.
-        """
-        count = len(self.start_track)
-        steps = torch.zeros_like(cars, dtype=self.steps.dtype)
-        if self.assignment == "cyclic":
-            return cars % count, steps
-        # One draw per car, reset or not, keeps the random sequence independent of the data.
-        drawn = self._drawn(count)
-        place = drawn.to(self.device).index_select(0, cars)
-        if first and self.staggered and self.assignment == "random":
-            over = self._drawn(self.max_steps)
-            steps = over.to(steps)
-        return place, steps
-
-    def _begin(self, cars: Tensor, steps: Tensor, start: Callable[[Tensor], Tensor]) -> None:
-        """Write the state at the start of an episode.
-
-        Args:
-            cars: [N], indices of the cars that are reset.
-            steps: [N], number of steps of the time limit that are over.
-            start: takes a table over all places [..., P] and returns the columns of the cars.
-        """
-        kept = ("track", "pose", "samples", "sampled")
-        copied = {name: start(getattr(self, f"start_{name}")) for name in kept}
-        copied |= {"steps": steps, "in_finish": start(self.start_in_finish)}
-        copied["lap_start"] = steps + start(self.start_lap_start)
-        for name, value in copied.items():
-            setattr(self, name, getattr(self, name).index_copy(-1, cars, value))
-        for name in ("history", "lap"):
-            setattr(self, name, getattr(self, name).index_fill(-1, cars, 0))
+        cars, start = self._begin(tensordict)
         # Under either rule of the cone bonus, no cone was seen in the epoch before the new one.
         self.epoch = self.epoch.index_add(0, cars, torch.full_like(cars, 2, dtype=self.epoch.dtype))
         self.lap_epoch = self.lap_epoch.index_copy(0, cars, self.epoch.index_select(0, cars))
+        observation, cones, count = (
+            at.new_zeros(*at.shape[:-1], len(self.steps)).index_copy_(-1, cars, start(at))
+            for at in (self.start_observation, self.start_cones, self.start_count)
+        )
+        motion = torch.zeros_like(self.pose)
+        return self._first(self._observed(observation.t(), cones, count, motion))
 
     def compile_steps(
         self, compiled: Callable[[Callable[..., list[Tensor]]], Callable[..., Sequence[Tensor]]]
@@ -353,91 +243,25 @@ class ConeTrackEnv(SeededEnv):
         """Drive one step with actions [B], and return the entries after it."""
         if self.held_steps:
             action = action * (self.steps >= self.held_steps)
-        roughness = (action - recent_mean(self.history)).abs_()
-        self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
+        roughness = self._act(action)
         self.pose, motion = self._move(action)
-        self.steps = self.steps + constant(1, self.steps)
-
         frame = Frame(self.pose)
         location = self.map.locate(self.track, frame.position)
-        lap_time, finished = self._count_laps(location)
+        lap_time, finished = self._count_laps(_in_finish(location))
         visible, slots, cones = self._view(location, self.pose, frame)
         discovered, new = self._count_new_cones(visible, slots, finished)
-        observation = self._next_observation(frame, visible, cones, new)
-        outcome, clearance = self._outcome(
-            location, action, roughness, lap_time, finished, discovered
-        )
-        return self._judged(observation, visible, motion, outcome, clearance)
-
-    def _outcome(
-        self,
-        location: Location,
-        action: Tensor,
-        roughness: Tensor,
-        lap_time: Tensor,
-        finished: Tensor,
-        discovered: Tensor,
-    ) -> tuple[Outcome, Tensor]:
-        """Find out who crashed; return the outcome of the step, and the distance to a crash [B] m.
-
-        The arguments after the location are those of `Outcome`.
-        """
-        to_boundaries = self.map.to_boundaries(location)
-        clearance = self.map.clearance(location, to_boundaries)
-        crashed = clearance <= constant(0, clearance)
-        alive = (~crashed).to(action.dtype)
-        outcome = Outcome(
-            action, roughness, lap_time, finished, discovered, to_boundaries, crashed, alive
-        )
-        return outcome, clearance
-
-    def _next_observation(self, frame: Frame, visible: View, cones: Tensor, new: Tensor) -> Tensor:
-        """Estimate the boundaries, and return the observation [B, 20]."""
         observed = self.boundaries.observe(frame, visible, cones, new, self.samples, self.sampled)
         observation, self.samples, self.sampled = observed
-        return observation
-
-    def _judged(
-        self,
-        observation: Tensor,
-        visible: View,
-        motion: Tensor,
-        outcome: Outcome,
-        clearance: Tensor,
-    ) -> TensorDict:
-        """Return the entries after a step, with its reward and the ends of episodes.
-
-        Args:
-            observation: [B, 20].
-            visible: the cones in sight.
-            motion: [3, B], m ahead, m to the left, radians.
-            outcome: what happened in the step.
-            clearance: [B] m, distance to a crash.
-        """
-        crashed = outcome.crashed
-        terms = self._reward(outcome)
-        completed = (self.lap >= constant(self.laps, self.lap)) & ~crashed
-        terminated = crashed | completed
-        truncated = (self.steps >= constant(self.max_steps, self.steps)) & ~terminated
-        reward = reduce(torch.add, terms.values()).to(outcome.action.dtype)
-        info = {
-            "lap_time": outcome.lap_time,
-            "crashed": crashed,
-            "completed": completed,
-            "clearance": clearance,
-            "smoothness": outcome.roughness,
-        }
-        return self._output(
-            observation,
-            visible.cones,
-            visible.count.long(),
-            motion,
-            info,
-            terms,
-            reward=reward,
-            terminated=terminated,
-            truncated=truncated,
-            done=terminated | truncated,
+        to_boundaries = self.map.to_boundaries(location)
+        return self._judged(
+            self._observed(observation, visible.cones, visible.count.long(), motion),
+            self.map.clearance(location, to_boundaries),
+            action=action,
+            roughness=roughness,
+            lap_time=lap_time,
+            finished=finished,
+            discovered=discovered,
+            to_boundaries=to_boundaries,
         )
 
     def _move(self, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -453,20 +277,6 @@ class ConeTrackEnv(SeededEnv):
         pose = torch.addcmul(self.pose, strides, torch.stack([heading.cos(), heading.sin(), turn]))
         forward = constant((step, 0.0), pose).expand(2, len(turn))
         return pose, torch.cat([forward, (turn * strides[2]).unsqueeze(0)])
-
-    def _count_laps(self, location: Location) -> tuple[Tensor, Tensor]:
-        """Count laps; return lap time and whether a lap was completed, [B] each.
-
-        The lap time is in s, 0 unless a lap was completed.
-        """
-        inside = _in_finish(location)
-        entered = inside & ~self.in_finish
-        finished = entered & (self.lap_start > constant(NEVER, self.lap_start))
-        lap_time = (self.steps - self.lap_start) * finished / constant(self.rate, location.position)
-        self.in_finish = inside
-        self.lap_start = torch.where(entered, self.steps, self.lap_start)
-        self.lap = self.lap + finished
-        return lap_time, finished
 
     def _view(self, location: Location, pose: Tensor, frame: Frame) -> tuple[View, Tensor, Tensor]:
         """Return the visible cones, and the slots and positions of all candidates."""
@@ -500,51 +310,26 @@ class ConeTrackEnv(SeededEnv):
         last_seen.scatter_(0, index, torch.where(visible.real.bool(), self.epoch, last).flatten())
         return rewarded.amax(0).sum(0), entered.flatten(0, 1).amax(0).bool()
 
-    def _reward(self, outcome: Outcome) -> dict[str, Tensor]:
-        """Return the terms of the reward, [B] each."""
-        weights = dict(zip(RewardWeights._fields, self.weights.unbind(0), strict=True))
-        return weighted_terms(outcome, weights)
-
-    def _output(
-        self,
-        observation: Tensor,
-        cones: Tensor,
-        count: Tensor,
-        motion: Tensor,
-        info: dict[str, Tensor],
-        terms: dict[str, Tensor],
-        **ends: Tensor,
-    ) -> TensorDict:
-        """Put the entries of a reset or a step together, with the batch first.
+    def _observed(
+        self, observation: Tensor, cones: Tensor, count: Tensor, motion: Tensor
+    ) -> dict[str, Tensor]:
+        """Return what the cars observe, with the batch first.
 
         Args:
             observation: [B, 20].
             cones: [2, at most K, 2, B] m.
             count: [2, B].
-            motion: [3, B].
-            info: entries of `info` that this env does not hold itself, [B] each.
-            terms: terms of the reward, [B] each.
-            ends: reward and ends of episodes after a step, [B] each; none after a reset.
+            motion: [3, B], m ahead, m to the left, radians.
         """
         missing = self.kept_cones - cones.shape[1]
         if missing > 0:
             cones = torch.cat([cones, cones.new_zeros(2, missing, *cones.shape[2:])], 1)
-        data: dict[str, Any] = {
+        return {
             "observation": observation,
             "cones": cones.permute(3, 2, 1, 0),
             "cone_count": count.t(),
             "motion": motion.t(),
-            "steering": self.history[0].unsqueeze(-1),
         }
-        data |= {key: value.unsqueeze(-1) for key, value in ends.items()}
-        if self.info:
-            info = {"track": self.track, "lap": self.lap.long(), **info}
-            entries: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in info.items()}
-            rewards = {key: value.to(self.dtype_).unsqueeze(-1) for key, value in terms.items()}
-            entries["pose"] = self.pose.t()
-            entries["reward"] = TensorDict(rewards, self.batch_size, device=self.device)
-            data["info"] = TensorDict(entries, self.batch_size, device=self.device)
-        return TensorDict(data, self.batch_size, device=self.device)
 
 
 def _in_finish(location: Location) -> Tensor:

@@ -14,11 +14,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from coil_rl.envs.simulator_files import is_of_simulator, simulator_track
+from coil_rl.envs.simulator_files import Row, is_of_simulator, numbers, simulator_track
 from coil_rl.envs.track import Track, TrackError
 from coil_rl.files import read_file, whole_file
 
-Row = tuple[int, list[str]]  # number of the line, and its cells
 Split = Literal["train", "test", "all"]
 
 MAX_BYTES = 10_000_000  # a hundred times the longest track
@@ -41,16 +40,14 @@ def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = Non
     """
     path = Path(path)
     header, rows = _table(path)
-    columns = [name.casefold() for name in header]
     pose = _pose(path, start)
     try:
-        if is_of_simulator(columns):
-            return simulator_track(path.stem, columns, rows, pose)
-        left, right = _sides(path, header, rows)
+        if is_of_simulator(header):
+            return simulator_track(path.stem, header[0].casefold(), rows, pose)
+        left, right = _sides(header, rows)
         return Track(path.stem, left, right, pose)  # type: ignore[arg-type]
     except TrackError as error:
-        text = str(error).rstrip(".")
-        raise TrackError(f"{text}." if text.startswith(str(path)) else f"{path}: {text}.") from None
+        raise TrackError(f"{path}: {str(error).rstrip('.')}.") from None
 
 
 def _pose(path: Path, start: Sequence[float] | None) -> tuple[float, float, float] | None:
@@ -67,33 +64,19 @@ def _pose(path: Path, start: Sequence[float] | None) -> tuple[float, float, floa
     return x, y, math.radians(degrees)
 
 
-def _sides(path: Path, header: Sequence[str], rows: Sequence[Row]) -> list[NDArray[np.float64]]:
-    """Return the cones of both sides, [N, 2] m each, y pointing up.
-
-    Args:
-        rows: number of the line, and its cells.
-    """
-    columns = [name.casefold() for name in header]
+def _sides(header: Sequence[str], rows: Sequence[Row]) -> list[NDArray[np.float64]]:
+    """Return the cones of both sides, [N, 2] m each, y pointing up."""
     for column in COLUMNS:
-        if column.casefold() not in columns:
+        if column.casefold() not in [name.casefold() for name in header]:
             raise TrackError(
-                f"{path} has no column {column}; the columns of its first line are {header}."
+                f"it has no column {column}; the columns of its first line are {header}"
             )
-    order = [columns.index(column.casefold()) for column in COLUMNS]
     sides: dict[str, list[tuple[float, float]]] = {"LEFT": [], "RIGHT": []}
     for line, row in rows:
-        side, *cells = [row[i] if i < len(row) else "" for i in order]
+        side = row.get("cone_type", "")
         if side.upper() not in sides:
-            raise TrackError(
-                f"{path}, line {line}: Cone_Type is {side!r}; it must be LEFT or RIGHT."
-            )
-        try:
-            x, y = np.asarray_chkfinite(cells, dtype=np.float64)
-        except ValueError:
-            raise TrackError(
-                f"{path}, line {line}: Cone_X, Cone_Y are {cells}; they must be finite numbers in "
-                "m."
-            ) from None
+            raise TrackError(f"line {line}: Cone_Type is {side!r}; it must be LEFT or RIGHT")
+        x, y = numbers(row, COLUMNS[1:], line)
         sides[side.upper()].append((x, -y))
     return [np.reshape(cones, (-1, 2)) for cones in sides.values()]
 
@@ -123,11 +106,9 @@ def load_tracks(path: str | os.PathLike[str], start: Sequence[float] | None = No
 
 def _natural_order(file: Path) -> list[str | int]:
     """Return a key that sorts MAP_2 before MAP_10: the name in parts, its numbers as numbers."""
-    parts: list[str | int] = []
     # Every second part of the split is a number.
-    for index, part in enumerate(re.split(r"([0-9]+)", file.name)):
-        parts.append(int(part) if index % 2 else part)
-    return parts
+    parts = enumerate(re.split(r"([0-9]+)", file.name))
+    return [int(part) if index % 2 else part for index, part in parts]
 
 
 def save_track(track: Track, path: str | os.PathLike[str]) -> None:
@@ -191,7 +172,7 @@ def _shipped(split: str) -> list[Track]:
 
 
 def _table(path: Path) -> tuple[list[str], list[Row]]:
-    """Return the header, and the number of the line and the cells of each row that is not blank."""
+    """Return the header, and each row that is not blank."""
     reader = csv.reader(io.StringIO(_read(path)))
     try:
         header = [name.strip() for name in next(reader)]
@@ -199,7 +180,8 @@ def _table(path: Path) -> tuple[list[str], list[Row]]:
         for row in reader:
             cells = [cell.strip() for cell in row]
             if any(cells):
-                rows.append((reader.line_num, cells))
+                named = zip(map(str.casefold, header), cells, strict=False)
+                rows.append((reader.line_num, dict(named)))
     except csv.Error as error:
         raise TrackError(
             f"{path}, line {reader.line_num}: {error}; save the level as plain CSV."

@@ -4,7 +4,6 @@ from typing import Annotated
 
 from coil_rl.ranges import Interval
 
-LARGEST_SEED = 2**63 - 1
 # Of an episode: laps, seconds, and places where it may begin.
 Laps = Annotated[int, Interval(gt=0, le=10**6)]
 Seconds = Annotated[float, Interval(gt=0, le=10**6)]

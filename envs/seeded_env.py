@@ -3,8 +3,10 @@
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, make_composite_from_td
 
 
 class SeededEnv(EnvBase):
@@ -54,3 +56,22 @@ class SeededEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.generator.manual_seed(seed)
+
+
+def declare_specs(env: EnvBase, example: TensorDictBase) -> None:
+    """Set the specs of an env in a world with cones.
+
+    Args:
+        env: with an action [B, 1].
+        example: of its entries after a reset.
+    """
+    batch, device, dtype = env.batch_size, env.device, example["observation"].dtype
+    spec = make_composite_from_td(example, unsqueeze_null_shapes=False)
+    for key in ("observation", "steering"):
+        spec[key] = Bounded(-1, 1, example[key].shape, device=device, dtype=dtype)
+    env.observation_spec = spec
+    env.action_spec = Bounded(-1, 1, (*batch, 1), device=device, dtype=dtype)
+    env.reward_spec = Unbounded((*batch, 1), device=device, dtype=dtype)
+    flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
+    ends = dict.fromkeys(("done", "terminated", "truncated"), flag)
+    env.done_spec = Composite(ends, shape=batch, device=device)

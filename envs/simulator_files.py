@@ -14,44 +14,41 @@ from numpy.typing import NDArray
 from coil_rl.envs.track import Track, TrackError
 
 Array = NDArray[np.float64]
+Row = tuple[int, Mapping[str, str]]  # number of the line, and its cells by column in lower case
 
 SIDES_OF_COLOURS = {"blue": "left", "yellow": "right"}
 KINDS = ("cone_type", "tag")  # names of the column with the colour
 START = "car_start"
 
 
-def is_of_simulator(columns: list[str]) -> bool:
-    """Return whether the columns of a CSV, in lower case, are those of a simulator."""
-    return columns[:1] in [[kind] for kind in KINDS] and {"x", "y"} <= set(columns)
+def is_of_simulator(header: Sequence[str]) -> bool:
+    """Return whether the columns of a CSV are those of a simulator."""
+    columns = [name.casefold() for name in header]
+    return columns[0] in KINDS and {"x", "y"} <= set(columns)
 
 
 def simulator_track(
-    name: str,
-    columns: Sequence[str],
-    rows: Sequence[tuple[int, Sequence[str]]],
-    start: tuple[float, float, float] | None,
+    name: str, column: str, rows: Sequence[Row], start: tuple[float, float, float] | None
 ) -> Track:
     """Return the track of a simulator's file.
 
     Cones of other colours than blue and yellow are left out, unless a column names their side.
 
     Args:
-        columns: in lower case.
-        rows: number of the line, and its cells.
+        column: with the colours.
         start: m, m, radians; None for that of the file, or just before the first cones.
 
     Raises:
         TrackError: for a number that is none, and for cones that are no track.
     """
     sides: dict[str, list[tuple[float, float]]] = {"left": [], "right": []}
-    for line, cells in rows:
-        row = dict(zip(columns, cells, strict=False))
-        kind = row.get(columns[0], "").casefold()
+    for line, row in rows:
+        kind = row.get(column, "").casefold()
         side = SIDES_OF_COLOURS.get(kind) or _flagged(row)
         if side is not None:
-            sides[side].append(_numbers(row, ("x", "y"), line))  # type: ignore[arg-type]
+            sides[side].append(numbers(row, ("x", "y"), line))  # type: ignore[arg-type]
         elif kind == START and start is None:
-            start = _numbers(row, ("x", "y", "direction"), line)  # type: ignore[assignment]
+            start = numbers(row, ("x", "y", "direction"), line)  # type: ignore[assignment]
     left, right = (np.reshape(cones, (-1, 2)) for cones in sides.values())
     if min(len(left), len(right)) < 1:
         raise TrackError(
@@ -72,9 +69,13 @@ def _flagged(row: Mapping[str, str]) -> str | None:
     return flags[0] if len(flags) == 1 else None
 
 
-def _numbers(row: Mapping[str, str], keys: Sequence[str], line: int) -> tuple[float, ...]:
-    """Return finite numbers of a row; a missing direction is 0."""
-    cells = [row.get(key) or ("0" if key == "direction" else "") for key in keys]
+def numbers(row: Mapping[str, str], keys: Sequence[str], line: int) -> tuple[float, ...]:
+    """Return finite numbers of a row, by columns in any case; a missing direction is 0.
+
+    Args:
+        line: number of the row, for the message of a `TrackError`.
+    """
+    cells = [row.get(key.casefold()) or ("0" if key == "direction" else "") for key in keys]
     try:
         return tuple(np.asarray_chkfinite(cells, dtype=np.float64).tolist())
     except ValueError:

@@ -33,7 +33,8 @@ def smallest(values: Tensor, masked: Tensor, k: int) -> Tensor:
             entries fill up columns with fewer, in any order.
     """
     if torch.compiler.is_exporting():  # ONNX cannot read a float as an integer
-        return _smallest_by_value(values, masked, k)
+        keys = torch.add(values, masked, alpha=_MASKED)
+        return keys.topk(k, 0, largest=False).indices.to(_BITS[values.dtype])
     rows_padded = 1 << max(1, (len(values) - 1).bit_length())
     integer = _BITS[values.dtype]
     rows = constant(range(len(values)), values, integer)
@@ -50,12 +51,6 @@ def smallest(values: Tensor, masked: Tensor, k: int) -> Tensor:
     else:
         first = _bitonic_sort(keys, k)
     return first.bitwise_and_(constant(rows_padded - 1, rows))
-
-
-def _smallest_by_value(values: Tensor, masked: Tensor, k: int) -> Tensor:
-    """Return the same rows as `smallest` by comparing the values themselves."""
-    keys = torch.add(values, masked, alpha=_MASKED)
-    return keys.topk(k, 0, largest=False).indices.to(_BITS[values.dtype])
 
 
 def _bitonic_sort(keys: Tensor, k: int) -> Tensor:

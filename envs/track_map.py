@@ -69,7 +69,6 @@ class TrackMap(nn.Module):
     """
 
     cones: Tensor  # [2, slots of all sides of all tracks] m
-    starts: Tensor  # [3, tracks]
     # A block holds the candidates of one cell in all sectors; cells without candidates share block
     # 0.
     block: Tensor  # [cells]
@@ -211,7 +210,6 @@ def _computed_tables(
     field = np.concatenate([boundary_distances(track, dtype) for track in tracks])
     numbers: dict[str, tuple[NDArray[np.generic], torch.dtype]] = {
         "cones": (cones.reshape(2, -1), dtype),
-        "starts": (np.array([track.start for track in tracks]).T, dtype),
         "block": (np.where(filled, filled.cumsum(), 0), torch.int64),
         "candidate": (slot.swapaxes(-1, -2).reshape(-1, 2 * candidate.shape[-1]), torch.int16),
         "candidate_count": ((candidate >= 0).sum(-1).max(-1).ravel(), torch.int16),

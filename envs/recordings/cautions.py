@@ -1,9 +1,10 @@
-"""What makes the meaning of a replay doubtful: its view, and the commands that were recorded.
+"""What a replay has to learn, and what makes its meaning doubtful: the view and the commands.
 
 A scan that is mirrored or turned, one of a room, and the commands of another drive give numbers
 like any other ones. What is seen in all scans together, and the odometry, tell them apart.
 """
 
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -176,3 +177,45 @@ def _related(
     product, squares = float(one @ other), float(one @ one)
     size = np.sqrt(squares * float(other @ other))
     return (product / size, product / squares) if size > 0 else (0.0, 1.0)
+
+
+def about_demonstrations(env: "McapReplayEnv") -> Iterator[str]:
+    """Yield a line about each recording, and one about all together.
+
+    It says how many scans are learned, how many are left out and why, and what makes the meaning of
+    the recording doubtful.
+
+    Raises:
+        ValueError: if no scan has steering to learn.
+    """
+    kept, total = 0, 0
+    _check_different(env.recordings)
+    for row, recording in enumerate(env.recordings):
+        scans = env.scans_of(row)
+        stale, standing = env.stale[scans], env.standing[scans]
+        number, usable = len(stale), int((~stale & ~standing).sum())
+        kept, total = kept + usable, total + number
+        line = (
+            f"{recording.path}: {usable} of {number} scans are learned; left out: "
+            f"{int(stale.sum())} without a command of the last {recording.command_age:.2f} s, "
+            f"{int((standing & ~stale).sum())} of a robot that stands"
+        )
+        yield "; the file ".join([line, *recording.remarks])
+        yield from (f"Warning: {text}." for text in env.cautions(row))
+    yield f"{len(env.recordings)} recordings: {kept} of {total} scans are learned."
+    if not kept:
+        raise ValueError(
+            "no scan has recorded steering to learn: there is no recent command at any, or the "
+            "robot stands; give env.command=TOPIC, or other recordings"
+        )
+
+
+def _check_different(recordings: Sequence[Recording]) -> None:
+    """Raise a `ValueError` for a recording that is there twice, which would test itself."""
+    known: dict[bytes, Recording] = {}
+    for recording in recordings:
+        other = known.setdefault(recording.ranges.tobytes(), recording)
+        if other is not recording:
+            raise ValueError(
+                f"{other.path} and {recording.path} hold the same scans; leave one of them out"
+            )

@@ -351,14 +351,11 @@ def _records(
                 return
             parts = [record]
             if type(record) is records.Chunk:
-                unpacked = _unpacked(record, left)
+                unpacked = _unpacked(file, record, left)
                 left -= len(unpacked.data)
                 parts = breakup_chunk(unpacked, validate_crc=True)
-        except _TooLargeError:
-            raise RecordingError(
-                f"{file} has {size:,} bytes, but unpacks to more than {UNPACKED_SHARE} times as "
-                "many; no recording of a robot does."
-            ) from None
+        except RecordingError:
+            raise
         # Damaged bytes raise almost any exception in the libraries below.
         except Exception as error:
             end = stream.tell()
@@ -366,7 +363,9 @@ def _records(
                 contents.cut_off = True
                 return
             summary = _summary(stream)
-            places = _places(summary)
+            places = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
+            places += [each.offset for each in summary.metadata_indexes]
+            places += [each.offset for each in summary.attachment_indexes]
             following = [place for place in places if place > start]
             if record:
                 following.append(end)
@@ -390,18 +389,18 @@ def _records(
         yield from parts
 
 
-class _TooLargeError(Exception):
-    """A chunk that unpacks to more bytes than are left."""
-
-
-def _unpacked(chunk: records.Chunk, left: int) -> records.Chunk:
+def _unpacked(file: Path, chunk: records.Chunk, left: int) -> records.Chunk:
     """Return a chunk without compression.
 
     Args:
-        left: number of bytes that it may unpack to; more are a `_TooLargeError`.
+        file: that it is from, for a message.
+        left: number of bytes that it may unpack to; more are a `RecordingError`.
     """
     if chunk.uncompressed_size > left:
-        raise _TooLargeError
+        raise RecordingError(
+            f"{file} has {file.stat().st_size:,} bytes, but unpacks to more than {UNPACKED_SHARE} "
+            "times as many; no recording of a robot does."
+        )
     most = chunk.uncompressed_size + 1
     if chunk.compression == "zstd":
         with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
@@ -410,20 +409,9 @@ def _unpacked(chunk: records.Chunk, left: int) -> records.Chunk:
         data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most)
     else:
         data = chunk.data
-    if len(data) > left:
-        raise _TooLargeError
     if chunk.compression and len(data) != chunk.uncompressed_size:
         raise ValueError(f"a chunk does not unpack to {chunk.uncompressed_size} bytes")
     return replace(chunk, compression="", data=data)
-
-
-def _places(summary: Summary) -> list[int]:
-    """Return the places in a file of all chunks, metadata records and attachments."""
-    return [
-        *(chunk.chunk_start_offset for chunk in summary.chunk_indexes),
-        *(metadata.offset for metadata in summary.metadata_indexes),
-        *(attachment.offset for attachment in summary.attachment_indexes),
-    ]
 
 
 def _summary(stream: BinaryIO) -> Summary:

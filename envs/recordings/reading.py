@@ -189,17 +189,13 @@ def _ignore_other_types(
             "they are ignored"
         )
     other_topics = _topics(contents, types)
-    if topic == scan and not other_topics:
-        raise RecordingError(
-            f"{path} has messages of {kind} in {encoding} on topic {topic}, not of {needed} in "
-            f"cdr; record the scans as {SCAN} with ROS 2."
-        )
-    if topic == scan:
-        raise RecordingError(
-            f"{path} has messages of {kind} in {encoding} on topic {topic}, not of {needed} in "
-            f"cdr; give the topic of such messages, here {other_topics}."
-        )
     remedy = f"; give the topic of such messages, here {other_topics}" if other_topics else ""
+    if topic == scan:
+        remedy = remedy or f"; record the scans as {SCAN} with ROS 2"
+        raise RecordingError(
+            f"{path} has messages of {kind} in {encoding} on topic {topic}, not of {needed} in "
+            f"cdr{remedy}."
+        )
     return (
         f"has messages of {kind} in {encoding} on topic {topic}, not of {needed} in cdr, and they "
         f"are ignored{remedy}"

@@ -19,14 +19,14 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import Degrees
-from coil_rl.envs.recordings.cautions import cautions_about
-from coil_rl.envs.recordings.demonstrations import about_demonstrations
+from coil_rl.envs.recordings.cautions import about_demonstrations, cautions_about
 from coil_rl.envs.recordings.folders import RecordingError, files_of
 from coil_rl.envs.recordings.mcap_files import read_messages
 from coil_rl.envs.recordings.reading import read_recording
 from coil_rl.envs.recordings.recording import STANDS, Recording
 from coil_rl.envs.reward import HISTORY, recent_mean
-from coil_rl.envs.robot.perception import BoundaryMemory, Perception, declare_specs
+from coil_rl.envs.robot.perception import BoundaryMemory, Perception
+from coil_rl.envs.seeded_env import declare_specs
 from coil_rl.envs.sight import SIGHT
 from coil_rl.ranges import Count, Interval, Positive, checked
 

@@ -9,6 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,6 +19,8 @@ from torch.nn.utils.rnn import pad_sequence
 from coil_rl.envs.sight import Frame
 from coil_rl.envs.track import SIDES, Array, Track, TrackError, resample
 from coil_rl.ranges import NonNegative, checked
+
+Sides = Literal["left", "right", "both"]
 
 THIN, THICK = 0.020, 0.045  # m, radius of a cone on the left and on the right
 HALF_WIDTH = 0.18  # m, from the centre line to the middle of a cone
@@ -170,27 +173,19 @@ def _root(squares: Tensor) -> Tensor:
     return squares.double().sqrt().to(squares.dtype)
 
 
-def cones_of(track: Track, *, left: bool = True, right: bool = True) -> tuple[Tensor, Tensor]:
+def cones_of(track: Track, sides: Sides = "both") -> tuple[Tensor, Tensor]:
     """Return the cones of a robot's track, thin ones left and thick ones right.
 
     Args:
-        left: whether to include the cones of the left side.
-        right: whether to include those of the right side; neither side is a `ValueError`.
+        sides: those whose cones are there.
 
     Returns:
         Centres [2, M] m and radii [M] m.
     """
-    rings = []
-    if left:
-        rings.append((track.left, THIN))
-    if right:
-        rings.append((track.right, THICK))
-    if not rings:
-        raise ValueError(
-            "cones_of a track with neither left nor right has no cone; choose one side or both"
-        )
-    centres = torch.as_tensor(np.vstack([ring for ring, _ in rings]).T.copy(), dtype=torch.float32)
-    return centres, torch.cat([torch.full((len(ring),), size) for ring, size in rings])
+    rings = {"left": (track.left, THIN), "right": (track.right, THICK)}
+    chosen = [ring for side, ring in rings.items() if sides in (side, "both")]
+    centres = torch.as_tensor(np.vstack([ring for ring, _ in chosen]).T.copy(), dtype=torch.float32)
+    return centres, torch.cat([torch.full((len(ring),), size) for ring, size in chosen])
 
 
 def middle_line(track: Track, spacing: float) -> Array:

@@ -11,10 +11,11 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type, step_mdp
@@ -26,6 +27,7 @@ from coil_rl.envs.recordings.recording import SIMULATED, Recording
 from coil_rl.envs.robot.course import (
     THICK,
     THIN,
+    Sides,
     cones_of,
     middle_line,
     noted_track,
@@ -38,7 +40,6 @@ from coil_rl.envs.track import Track, TrackError
 from coil_rl.ranges import checked
 
 Path = str | os.PathLike[str]
-Sides = Literal["left", "right", "both"]
 
 SPEED = 0.15  # m/s
 SWAY = 0.04  # m, greatest distance to the centre line
@@ -96,7 +97,7 @@ def simulated_drive(sides: Sides, seed: int, lidar: SimulatedLidar | None = None
     generator = torch.Generator().manual_seed(seed)
     line = torch.from_numpy(middle_line(track, SPEED / lidar.rate))
     poses = _poses_along(_swaying(line, generator), lidar.phase)
-    cones, radius = cones_of(track, left=sides != "right", right=sides != "left")
+    cones, radius = cones_of(track, sides)
     true, hit = cast_beams(poses, lidar.angles, cones, radius)
     ranges, outlier = lidar.measure(true, generator)
     return SimulatedDrive(
@@ -270,34 +271,17 @@ def record_drives(
         raise ValueError(f"{len(paths)} paths for {robots} robots; give one file for each")
     steps = _run_episode(env, base, policy, tick)
     speed = base.step_length * base.lidar.rate
-    turn_rate = (steps.action * base.max_steering).sin() * (speed / base.car_length)
+    turn_rate = (steps["action"] * base.max_steering).sin() * (speed / base.car_length)
     commands = torch.stack([torch.full_like(turn_rate, speed), turn_rate], -1)
     for robot, path in enumerate(paths):
-        own = steps.running[:, robot]
+        running = steps["running"][robot]
+        own = steps[robot][running]
         # The last scan ends at the second last pose; then the last command is executed.
-        poses = torch.cat([steps.start[own, robot], steps.end[own, robot][-2:]])
+        poses = torch.cat([own["start"], own["end"][-2:]])
         track = base.tracks[int(base.track[robot])]
         notes = _notes({"drive": "closed loop", **(about or {})}, track)
-        scans = steps.scan[own, robot]
-        _write(path, base.lidar.rate, base.lidar.angles, scans, poses, commands[own, robot], notes)
-
-
-class _Steps(NamedTuple):
-    """Steps of B robots, [B, ...] for one step or [T, B, ...] for all of an episode.
-
-    Attributes:
-        running: whether the episode of the robot was not over yet.
-        scan: [P] m, the scan to which the robot reacted.
-        start: [3], pose at the start of this scan.
-        action: the action that reached the robot.
-        end: [3], pose after the step.
-    """
-
-    running: Tensor
-    scan: Tensor
-    start: Tensor
-    action: Tensor
-    end: Tensor
+        ordered = commands[robot][running]
+        _write(path, base.lidar.rate, base.lidar.angles, own["scan"], poses, ordered, notes)
 
 
 def _run_episode(
@@ -305,26 +289,33 @@ def _run_episode(
     base: SimulatedRobotEnv,
     policy: TensorDictModuleBase,
     tick: Callable[[], Any] | None,
-) -> _Steps:
-    """Run a policy until the episodes of all robots of `base`, which is inside `env`, are over."""
+) -> TensorDict:
+    """Run a policy until the episodes of all robots of `base`, which is inside `env`, are over.
+
+    Returns:
+        Entries [B, T, ...]: `running`, whether the episode of the robot was not over yet; `scan`
+        [P] m, to which the robot reacted; `start` [3], pose at the start of this scan; `action`,
+        the one that reached the robot; `end` [3], pose after the step.
+    """
     state = env.eval().reset()
     start = state["info", "pose"]
-    steps: list[_Steps] = []
+    steps: list[TensorDict] = []
     running = torch.ones(env.batch_size[0], dtype=torch.bool)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         while running.any():
             scan, pose = base.scan, state["info", "pose"]
             step = env.step(policy(state))
             after = step["next"]
-            # The action that reached the robot: a transform may have changed the policy's.
-            action = after["steering"].squeeze(-1)
-            steps.append(_Steps(running, scan, start, action, after["info", "pose"]))
+            # A transform may have changed the policy's action.
+            action, end = after["steering"].squeeze(-1), after["info", "pose"]
+            noted = {"running": running, "scan": scan, "start": start, "action": action, "end": end}
+            steps.append(TensorDict(noted, env.batch_size))
             # The robot stands during the first scan, so the second one starts at the same pose.
             start, running = pose, running & ~after["done"].squeeze(-1)
             state = step_mdp(step)
             if tick is not None:
                 tick()
-    return _Steps(*(torch.stack(column) for column in zip(*steps, strict=True)))
+    return torch.stack(steps, 1)
 
 
 def _notes(drive: Mapping[str, str], track: Track | None) -> dict[str, dict[str, str]]:

@@ -8,7 +8,6 @@ not from a real robot.
 
 import math
 from collections.abc import Sequence
-from functools import reduce
 from typing import Any, Literal
 
 import numpy as np
@@ -18,32 +17,23 @@ from torch import Tensor, nn
 
 from coil_rl.envs.limits import Degrees, Laps, Seconds, Starts
 from coil_rl.envs.meanings import of_cones
-from coil_rl.envs.reward import (
-    HISTORY,
-    TERMS,
-    Outcome,
-    RewardWeights,
-    check_weights,
-    recent_mean,
-    weighted_terms,
-)
+from coil_rl.envs.reward import LapsEnv
 from coil_rl.envs.robot.course import RobotCourse, robot_track
 from coil_rl.envs.robot.lidar import SimulatedLidar, cast_beams, move_along_arc
 from coil_rl.envs.robot.perception import (
     BoundaryMemory,
     Perception,
-    declare_specs,
     simulated_cone_classifier,
 )
-from coil_rl.envs.seeded_env import SeededEnv
-from coil_rl.envs.track import NEVER, Track, places
+from coil_rl.envs.seeded_env import declare_specs
+from coil_rl.envs.track import NEVER, Track
 from coil_rl.ranges import Count, Positive, checked
 
 FINISH_RADIUS = 0.15  # m, covers the width between the cones
 
 
 @checked
-class SimulatedRobotEnv(SeededEnv):
+class SimulatedRobotEnv(LapsEnv):
     """Simulated robots on tracks between cones, independent of one another.
 
     Reads `action` [B, 1], the steering angle as a fraction of `max_steering`. Writes the entries of
@@ -110,7 +100,6 @@ class SimulatedRobotEnv(SeededEnv):
     ) -> None:
         if tracks is not None and not tracks:
             raise ValueError("tracks is empty; give at least one, or None for robot_track()")
-        check_weights("reward", reward or {}, RewardWeights._fields)
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
         self.tracks = [robot_track()] if tracks is None else list(tracks)
         self.assignment = assignment
@@ -121,20 +110,17 @@ class SimulatedRobotEnv(SeededEnv):
         self.speed, self.car_length = speed, car_length
         self.step_length = speed / self.rate
         self.max_steering = math.radians(max_steering)
-        weights = RewardWeights(**(reward or {}))._asdict()
-        self.weights = {key: torch.tensor(float(weight)) for key, weight in weights.items()}
         self.memory = BoundaryMemory(num_envs, spline, smoothing, sight=self.perception.sight)
         self.generator = torch.Generator()
         self.course = RobotCourse(self.tracks)
-        index, poses, driven = map(torch.as_tensor, places(self.tracks, starts))
-        self.start_track, self.start_pose = index, poses.T.float()
-        self.staggered = starts is not None
-        # A negative step: the one at which a robot at full speed would have been at the finish.
-        start_lap = torch.where(driven.isnan(), NEVER, -driven / self.step_length)
-        self.start_lap = start_lap.round().long()
         finish = np.stack([track.finish for track in self.tracks], axis=1)
         self.finish = torch.tensor(finish).float()
-        self._register_state(num_envs)
+        self.staggered = starts is not None
+        self.start_track, self.start_pose, self.start_lap_start = self._places(self.tracks, starts)
+        inside = self._inside(self.start_pose, self.start_track)
+        self.start_in_finish = inside & (self.start_lap_start > NEVER)
+        self._register_laps(reward)
+        self.scan: Tensor = nn.Buffer(torch.full((num_envs, self.lidar.beams), torch.inf))
         # The last scans, and the cones and their numbers that were perceived in them.
         self._seen: tuple[Tensor, Tensor, Tensor] | None = None
         declare_specs(self, self._reset())
@@ -151,94 +137,35 @@ class SimulatedRobotEnv(SeededEnv):
         super().set_extra_state(state)
         self._seen = None
 
-    def _register_state(self, num_envs: int) -> None:
-        """Register all state that is not in the memory of the boundaries as buffers."""
-        self.place: Tensor = nn.Buffer(torch.arange(num_envs) % len(self.start_track))
-        self.track: Tensor = nn.Buffer(self.start_track[self.place])
-        self.pose: Tensor = nn.Buffer(torch.zeros(3, num_envs))
-        self.history: Tensor = nn.Buffer(torch.zeros(HISTORY, num_envs))
-        self.steps: Tensor = nn.Buffer(torch.zeros(num_envs, dtype=torch.int64))
-        self.lap: Tensor = nn.Buffer(torch.zeros(num_envs, dtype=torch.int64))
-        self.lap_start: Tensor = nn.Buffer(torch.full((num_envs,), NEVER))
-        self.in_finish: Tensor = nn.Buffer(torch.zeros(num_envs, dtype=torch.bool))
-        self.scan: Tensor = nn.Buffer(torch.full((num_envs, self.lidar.beams), torch.inf))
-
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        steps = torch.zeros(self.batch_size, dtype=torch.int64)
         # All robots draw and measure, reset or not: the order of random numbers must not depend on
         # the data.
-        if self.assignment != "cyclic":
-            drawn = self._drawn(len(self.start_track))
-            if mask is None and self.staggered and self.assignment == "random":
-                steps = self._drawn(self.max_steps)
-            self.place = drawn if mask is None else torch.where(mask.view(-1), drawn, self.place)
-        mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)
-        place = self.place
-        start = {
-            "track": self.start_track[place],
-            "pose": self.start_pose[:, place],
-            "steps": steps,
-            "lap_start": steps + self.start_lap[place],
-            "history": torch.zeros(()),
-            "lap": torch.tensor(0),
-        }
-        for name, value in start.items():
-            setattr(self, name, torch.where(mask, value, getattr(self, name)))
-        begun = self.lap_start > NEVER
-        self.in_finish = torch.where(mask, self._inside() & begun, self.in_finish)
-        rows = mask.nonzero().squeeze(-1)
+        rows, _ = self._begin(tensordict)
+        mask = torch.zeros(self.batch_size, dtype=torch.bool).index_fill(0, rows, True)
         standing = self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams)
         known = self._seen is not None and self._seen[0] is self.scan
         self.scan = torch.where(mask.unsqueeze(-1), self._measure(standing, rows), self.scan)
         self.memory.reset(mask)
         # Robots that are not reset see what they saw, which does not change their memory.
-        view = self._perceive(rows if known else None)
-        zero = torch.zeros(self.batch_size)
-        terms = dict.fromkeys(TERMS, zero)
-        flags = {"crashed": zero.bool(), "completed": zero.bool()}
-        return self._tensordict(
-            view, terms, lap_time=zero, **flags, clearance=zero, smoothness=zero
-        )
+        return self._first(self._perceive(rows if known else None))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
-        roughness = (action - recent_mean(self.history)).abs()
-        self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
-        self.steps = self.steps + 1
+        roughness = self._act(action)
         self._move(action)
         view = self._perceive()
-
-        lap_time, finished = self._count_laps()
+        lap_time, finished = self._count_laps(self._inside(self.pose, self.track))
         clearance, to_boundaries = self.course.clearance(self.track, self.pose)
-        crashed = clearance <= 0
-        outcome = Outcome(
+        return self._judged(
+            view,
+            clearance,
             action=action,
             roughness=roughness,
             lap_time=lap_time,
             finished=finished,
             discovered=torch.zeros_like(action),
             to_boundaries=to_boundaries,
-            crashed=crashed,
-            alive=(~crashed).float(),
         )
-        terms = weighted_terms(outcome, self.weights)
-        completed = (self.lap >= self.laps) & ~crashed
-        terminated = crashed | completed
-        truncated = (self.steps >= self.max_steps) & ~terminated
-        out = self._tensordict(
-            view,
-            terms,
-            lap_time=lap_time,
-            crashed=crashed,
-            completed=completed,
-            clearance=clearance,
-            smoothness=roughness,
-        )
-        out["reward"] = reduce(torch.add, terms.values()).unsqueeze(-1)
-        out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
-        out["done"] = (terminated | truncated).unsqueeze(-1)
-        return out
 
     def _move(self, action: Tensor) -> None:
         """Move along an arc by the bicycle model (equations 99-100), and scan on the way."""
@@ -285,42 +212,14 @@ class SimulatedRobotEnv(SeededEnv):
                 all_counts.index_copy(0, rows, count),
             )
         self._seen = self.scan, cones, count
-        observation, valid = self.memory(cones, count)
-        return {"observation": observation, "cones": cones, "cone_count": count, "valid": valid}
+        observation, self.valid = self.memory(cones, count)
+        return {"observation": observation, "cones": cones, "cone_count": count}
 
-    def _count_laps(self) -> tuple[Tensor, Tensor]:
-        """Count laps; return lap time and whether a lap was completed, [B] each.
+    def _inside(self, pose: Tensor, track: Tensor) -> Tensor:
+        """Return whether poses [3, N] on tracks [N] are in the finish circle, [N]."""
+        return (pose[:2] - self.finish[:, track]).norm(dim=0) < FINISH_RADIUS
 
-        The lap time is in s, 0 unless a lap was completed.
-        """
-        inside = self._inside()
-        entered = inside & ~self.in_finish
-        finished = entered & (self.lap_start > NEVER)
-        lap_time = (self.steps - self.lap_start) * finished / self.rate
-        self.in_finish, self.lap = inside, self.lap + finished
-        self.lap_start = torch.where(entered, self.steps, self.lap_start)
-        return lap_time, finished
-
-    def _inside(self) -> Tensor:
-        """Return whether each robot is in the finish circle, [B]."""
-        return (self.pose[:2] - self.finish[:, self.track]).norm(dim=0) < FINISH_RADIUS
-
-    def _tensordict(
-        self, view: dict[str, Tensor], terms: dict[str, Tensor], **values: Tensor
-    ) -> TensorDict:
-        """Put the entries of a reset or a step together.
-
-        Args:
-            view: the entries that come from the scan.
-            terms: terms of the reward, [B] each.
-            values: other entries of `info`, [B] each.
-        """
-        columns = {"track": self.track, "lap": self.lap, **values}
-        reward = {key: value.unsqueeze(-1) for key, value in terms.items()}
-        info: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in columns.items()}
-        info["pose"], info["valid"] = self.pose.t(), view["valid"]
-        info["reward"] = TensorDict(reward, self.batch_size)
-        entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
-        entries["steering"] = self.history[0].unsqueeze(-1)
-        entries["info"] = TensorDict(info, self.batch_size)
-        return TensorDict(entries, self.batch_size, device=self.device)
+    def _output(self, *parts: Any, **ends: Any) -> TensorDict:
+        out = super()._output(*parts, **ends)
+        out["info", "valid"] = self.valid
+        return out

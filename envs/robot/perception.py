@@ -13,10 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, make_composite_from_td
 
 from coil_rl.envs.robot.clusters import GAP, Clusters, measure, points_of, single_linkage
 from coil_rl.envs.sight import SAMPLES, SIGHT, encode_samples
@@ -298,17 +295,3 @@ class BoundaryMemory(nn.Module):
         """Clear the rows where mask [B] is true."""
         self.samples = self.samples.masked_fill(mask, 0)
         self.ever_valid = self.ever_valid.masked_fill(mask, 0)
-
-
-def declare_specs(env: EnvBase, example: TensorDictBase) -> None:
-    """Set the specs of a simulated or replayed robot."""
-    batch, device = env.batch_size, env.device
-    spec = make_composite_from_td(example, unsqueeze_null_shapes=False)
-    for key in ("observation", "steering"):
-        spec[key] = Bounded(-1, 1, example[key].shape, device=device, dtype=torch.float32)
-    env.observation_spec = spec
-    env.action_spec = Bounded(-1, 1, (*batch, 1), device=device, dtype=torch.float32)
-    env.reward_spec = Unbounded((*batch, 1), device=device, dtype=torch.float32)
-    flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
-    ends = dict.fromkeys(("done", "terminated", "truncated"), flag)
-    env.done_spec = Composite(ends, shape=batch, device=device)

@@ -154,7 +154,7 @@ def test_partial_reset_changes_only_the_masked_cars(rings: list[Track], assignme
     after = buffers(env)
     for name, value in before.items():
         assert torch.equal(after[name][..., ~mask], value[..., ~mask]), name
-    assert torch.equal(env.pose[:, mask], env.map.starts[:, env.track[mask]])
+    assert torch.equal(env.pose[:, mask], env.start_pose[:, env.track[mask]])
     for name in ("history", "steps", "lap", "in_finish"):
         assert not after[name][..., mask].any(), name
     assert fresh["observation"][mask].ne(state["observation"][mask]).any(dim=-1).all()

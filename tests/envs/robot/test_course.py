@@ -67,10 +67,8 @@ def test_thin_cones_are_left_and_thick_ones_right():
     centres, radius = cones_of(track)
     assert centres.shape == (2, len(track.left) + len(track.right))
     assert radius.tolist() == pytest.approx([THIN] * len(track.left) + [THICK] * len(track.right))
-    np.testing.assert_allclose(cones_of(track, left=False)[0].T, track.right, atol=1e-6)
-    np.testing.assert_allclose(cones_of(track, right=False)[0].T, track.left, atol=1e-6)
-    with pytest.raises(ValueError, match="neither left nor right"):
-        cones_of(track, left=False, right=False)
+    np.testing.assert_allclose(cones_of(track, "right")[0].T, track.right, atol=1e-6)
+    np.testing.assert_allclose(cones_of(track, "left")[0].T, track.left, atol=1e-6)
 
 
 @pytest.mark.parametrize(("heading", "half"), [(0.0, 0.06), (math.pi / 2, 0.10)])
