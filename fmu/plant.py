@@ -152,7 +152,10 @@ class FMU(gymnasium.Env[dict[str, Floats], Floats]):
         try:
             for variable, part in zip(self.wiring.actions, parts, strict=True):
                 self.instance.write(variable, part.tolist())
-            self._advance()
+            length = clock.step / clock.parts
+            for number in range(clock.parts):
+                begun = clock.start + (self.count * clock.parts + number) * length
+                self.instance.advance(begun, length)
             outputs = self.instance.read()
         except SolverError as error:
             return self._failed(str(error))
@@ -168,13 +171,6 @@ class FMU(gymnasium.Env[dict[str, Floats], Floats]):
         self.now = ended._replace(setpoints=self._wanted(time))
         truncated = self.count >= clock.steps
         return self._observed(), reward, terminated, truncated, dict(self.info)
-
-    def _advance(self) -> None:
-        clock = self.clock
-        length = clock.step / clock.parts
-        for part in range(clock.parts):
-            begun = clock.start + (self.count * clock.parts + part) * length
-            self.instance.advance(begun, length)
 
     def _failed(self, message: str) -> tuple[dict[str, Floats], float, bool, bool, dict[str, Any]]:
         """End the episode, because the FMU could not do the step."""

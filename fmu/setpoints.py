@@ -8,9 +8,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from coil_rl.ranges import Positive, checked
+
 Floats = NDArray[np.float64]
 
 
+@checked
 @dataclass(frozen=True)
 class Course:
     """The setpoint of an output over an episode, drawn anew for each from its seed.
@@ -29,17 +32,13 @@ class Course:
 
     low: float = 0.0
     high: float = 0.0
-    every: float | None = None
+    every: Positive | None = None
     kind: Literal["steps", "ramps"] = "steps"
     file: str | os.PathLike[str] | None = None
 
     def __post_init__(self) -> None:
         if not float(self.low) <= float(self.high):
             raise ValueError(f"low={self.low} must be at most high={self.high}")
-        if self.every is not None and not self.every > 0:
-            raise ValueError(f"every={self.every} must be above 0 s")
-        if self.kind not in ("steps", "ramps"):
-            raise ValueError(f"kind={self.kind} must be steps or ramps")
         if self.file is not None:
             _table(self.file)
 

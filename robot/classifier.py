@@ -261,16 +261,15 @@ def label_clusters(
         drives: with the true cone of each range.
         max_distance: largest distance of a cluster, m.
     """
-    labelled = [_label_drive(drive, max_distance) for drive in drives]
-    columns: dict[str, Any] = {}
-    for column in ("features", "thick", "scan", "cone", "distance", "visibility"):
-        columns[column] = np.concatenate([getattr(of_drive, column) for of_drive in labelled])
-    counts = [len(of_drive.cone) for of_drive in labelled]
-    return LabelledClusters(drive=np.repeat(np.arange(len(labelled)), counts), **columns)
+    columns: dict[str, list[Any]] = {each.name: [] for each in fields(LabelledClusters)}
+    for number, drive in enumerate(drives):
+        for name, values in _label_drive(drive, number, max_distance).items():
+            columns[name].append(values)
+    return LabelledClusters(**{name: np.concatenate(parts) for name, parts in columns.items()})
 
 
-def _label_drive(drive: SimulatedDrive, max_distance: float) -> LabelledClusters:
-    """Return the labelled clusters of one drive, whose index is 0; see `label_clusters`."""
+def _label_drive(drive: SimulatedDrive, number: int, max_distance: float) -> dict[str, Any]:
+    """Return the columns of `LabelledClusters` of the drive with a number."""
     points = points_of(drive.ranges.numpy(), drive.angles.numpy(), RANGE_MIN, max_distance + MARGIN)
     label = single_linkage(points)
     clusters = measure(points, label)
@@ -281,15 +280,15 @@ def _label_drive(drive: SimulatedDrive, max_distance: float) -> LabelledClusters
     distance = np.hypot(*clusters.centroid.T)
     rows = (distance <= max_distance) & (cone >= 0)
     cone, scan = cone[rows], clusters.scan[rows]
-    return LabelledClusters(
-        features=clusters.features[rows],
-        thick=drive.thick.numpy()[cone],
-        drive=np.zeros(len(cone), dtype=np.int64),
-        scan=scan,
-        cone=cone,
-        distance=distance[rows],
-        visibility=drive.visibility.numpy()[scan, cone],
-    )
+    return {
+        "features": clusters.features[rows],
+        "thick": drive.thick.numpy()[cone],
+        "drive": np.full(len(cone), number),
+        "scan": scan,
+        "cone": cone,
+        "distance": distance[rows],
+        "visibility": drive.visibility.numpy()[scan, cone],
+    }
 
 
 def accuracy(classifier: ConeClassifier, labelled: LabelledClusters) -> dict[str, Share]:
@@ -320,8 +319,8 @@ def recall(
     """
     labelled = label_clusters(drives, RANGE + MARGIN)
     correct = classifier.classify(labelled.features) == labelled.thick
-    # Of each kind and drive: whether a cone is recognised in a scan, its distance and visibility.
-    columns: dict[str, list[tuple[Array, Array, Array]]] = {"thin": [], "thick": []}
+    # Of each cone in each scan: whether it is recognised and thick, its distance and visibility.
+    parts = []
     for number, drive in enumerate(drives):
         offset = drive.cones[:, None] - drive.poses[:2, :, 0, None]
         distance = (offset.norm(dim=0) - drive.radius).numpy()
@@ -329,16 +328,12 @@ def recall(
         recognised = np.zeros(distance.shape, dtype=bool)
         rows = (labelled.drive == number) & correct
         recognised[labelled.scan[rows], labelled.cone[rows]] = True
-        in_range = (distance > RANGE_MIN) & (distance <= RANGE) & (visibility > 0)
-        for name, thick in (("thin", False), ("thick", True)):
-            cells = in_range & (drive.thick.numpy() == thick)
-            columns[name].append(
-                (recognised[cells].astype(float), distance[cells], visibility[cells])
-            )
-    shares = {}
-    for name, parts in columns.items():
-        shares[name] = _shares(*map(np.concatenate, zip(*parts, strict=True)))
-    return shares
+        counted = (distance > RANGE_MIN) & (distance <= RANGE) & (visibility > 0)
+        thick = np.broadcast_to(drive.thick.numpy(), distance.shape)
+        parts.append([each[counted] for each in (recognised, distance, visibility, thick)])
+    *values, thick = map(np.concatenate, zip(*parts, strict=True))
+    kinds = {"thin": ~thick, "thick": thick}
+    return {name: _shares(*(each[rows] for each in values)) for name, rows in kinds.items()}
 
 
 def _shares(correct: NDArray[np.generic], distance: Array, visibility: Array) -> dict[str, Share]:

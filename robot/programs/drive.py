@@ -104,18 +104,16 @@ def _driver(config: DictConfig, controller: Any, setup: Setup, log: DriveLog) ->
     Raises:
         UserError: for a policy that cannot drive a car by the entries of the cone world.
     """
+    from coil_rl import build
     from coil_robot.driver import LiveDriver
-    from coil_robot.watchdog import Limits
 
     if setup.rate is None:
         raise UserError(
             f"run={config.run} is of env {type(controller.plant).__name__}, which has no rate of "
             "scans; give a run of env=cone_track or env=simulated_robot, or rate=NUMBER"
         )
-    try:
-        limits = Limits(setup.rate, **config.limits)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"limits: {error}") from error
+    node = {"_target_": "coil_robot.Limits", "rate": setup.rate, **config.limits}
+    limits = build(node, "limits")
     try:
         return LiveDriver(
             controller,
@@ -136,21 +134,21 @@ def _driver(config: DictConfig, controller: Any, setup: Setup, log: DriveLog) ->
 
 def _recording(config: DictConfig) -> Recording | None:
     """Return the recording to drive by, if there is one; a `UserError` if it cannot be read."""
-    from coil_rl.envs import RecordingError, read_recording
+    from coil_rl import build
 
     if config.recording is None:
         return None
-    try:
-        return read_recording(
-            config.recording,
-            scan=config.scan,
-            odometry=None,
-            command=None,
-            frame=config.frame,
-            strict=config.strict,
-        )
-    except RecordingError as error:
-        raise UserError(f"recording: {error}") from error
+    node = {
+        "_target_": "coil_rl.envs.read_recording",
+        "path": config.recording,
+        "scan": config.scan,
+        "odometry": None,
+        "command": None,
+        "frame": config.frame,
+        "strict": config.strict,
+    }
+    recording: Recording = build(node, "recording")
+    return recording
 
 
 def _driven(config: DictConfig, driver: LiveDriver, recording: Recording | None) -> Drive | None:

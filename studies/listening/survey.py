@@ -162,10 +162,8 @@ class Ablation(NamedTuple):
 
 def ablations(guides: int, sections: int) -> list[Ablation]:
     """Return the removal of each guide everywhere and in each section."""
-    removed = []
-    for guide in range(guides):
-        removed += [Ablation(guide, section) for section in (None, *range(sections))]
-    return removed
+    places = (None, *range(sections))
+    return [Ablation(guide, section) for guide in range(guides) for section in places]
 
 
 def drive_ablated(
