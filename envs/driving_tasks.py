@@ -11,10 +11,11 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Binary, Composite, OneHot
+from torchrl.data import OneHot
 
 from coil_rl.envs.cone_track import ConeTrackEnv
 from coil_rl.envs.reward import TERMS, Outcome, RewardWeights, check_weights, weighted_terms
+from coil_rl.envs.seeded_env import declare_specs
 from coil_rl.envs.sight import SIGHT
 from coil_rl.envs.track import Track
 
@@ -154,18 +155,10 @@ class DrivingTasksEnv(ConeTrackEnv):
         )
         first = 0 if only is None else self.tasks.index(only)
         self.task: Tensor = nn.Buffer(torch.full(self.batch_size, first, device=self.device))
-        self._declare_task_specs()
-
-    def _declare_task_specs(self) -> None:
-        count = len(self.tasks)
-        self.observation_spec["task"] = OneHot(
-            count, (*self.batch_size, count), dtype=self.dtype_, device=self.device
-        )
-        if self.info:
-            flag = Binary(1, (*self.batch_size, 1), dtype=torch.bool, device=self.device)
-            self.observation_spec["info", "task"] = Composite(
-                dict.fromkeys(self.tasks, flag), shape=self.batch_size
-            )
+        declare_specs(self, self._reset())
+        shape = (*self.batch_size, len(tasks))
+        self.observation_spec["task"] = OneHot(shape[-1], shape, dtype=dtype, device=self.device)
+        self.set_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         out = super()._reset(tensordict, **kwargs)
