@@ -4,13 +4,13 @@ That is where it values a state less than those that the guide visits.
 """
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.guides import FollowAdvice
@@ -102,8 +102,25 @@ class Fallback(Beside):
             learner: of the run.
             folder: of the run, for the message.
         """
-        check_cases_of_guide(make_env, folder)
-        critic_beside_guide(make_env(), learner, folder)
+        env = make_env()
+        # In these cases the values of the guide's states are seen.
+        if SELECTION not in make_env.sizes:
+            raise UserError(no_effect(folder, f"it has no evaluation.curve.cases.{SELECTION}"))
+        if "guide_action" not in env.observation_spec:
+            raise UserError(
+                no_effect(folder, "its agent has no guide in its env; train it with method=coil")
+            )
+        if any(isinstance(part, (MixedAction, ResidualAction)) for part in env.modules()):
+            raise UserError(
+                no_effect(
+                    folder,
+                    "its env adds the actions of agent and guide, so the guide cannot act alone",
+                )
+            )
+        if learner.critic is None:
+            raise UserError(
+                no_effect(folder, "its learner has no value function; train it with learner=ppo")
+            )
 
     @torch.no_grad()
     def driver(self, run: Run, policy: TensorDictModuleBase | None) -> Driver:
@@ -121,9 +138,10 @@ class Fallback(Beside):
         """
         if policy is None or run.make_learner is None:
             raise UserError(no_effect(run.folder, "there is no agent"))
-        check_cases_of_guide(run.make_env, run.folder)
+        learner = run.make_learner(run.make_env())
+        self.check(run.make_env, learner, run.folder)
         env = run.make_env(run.make_env.sizes[SELECTION], SELECTION)
-        critic = critic_beside_guide(env, run.make_learner(env), run.folder)
+        critic: Any = learner.critic
         newest = run.folder / checkpoint.NEWEST
         with file_of_a_run(newest, "train again"):
             critic.load_state_dict(checkpoint.load(newest, run.device)["learner"]["critic"])
@@ -135,40 +153,6 @@ class Fallback(Beside):
         leave, back = of_guide.quantile(of_guide.new_tensor([LEAVE, BACK])).tolist()
         acting = FallbackPolicy(policy, critic, guide, leave, back)
         return Driver(NAME, acting, acting.said)
-
-
-def check_cases_of_guide(make_env: EnvMaker, folder: Path) -> None:
-    """Raise a `UserError` without cases in which the values of the guide's states are seen."""
-    if SELECTION not in make_env.sizes:
-        raise UserError(no_effect(folder, f"it has no evaluation.curve.cases.{SELECTION}"))
-
-
-def critic_beside_guide(env: EnvBase, learner: Learner, folder: Path) -> TensorDictModuleBase:
-    """Return the critic that decides where the guide acts.
-
-    Args:
-        learner: of the run, trained or not.
-
-    Raises:
-        UserError: for a run without advice or critic, or whose env does not execute the advice as
-            it is.
-    """
-    if "guide_action" not in env.observation_spec:
-        raise UserError(
-            no_effect(folder, "its agent has no guide in its env; train it with method=coil")
-        )
-    if any(isinstance(part, (MixedAction, ResidualAction)) for part in env.modules()):
-        raise UserError(
-            no_effect(
-                folder, "its env adds the actions of agent and guide, so the guide cannot act alone"
-            )
-        )
-    critic: TensorDictModuleBase | None = learner.critic
-    if critic is None:
-        raise UserError(
-            no_effect(folder, "its learner has no value function; train it with learner=ppo")
-        )
-    return critic
 
 
 def no_effect(folder: Path, problem: str) -> str:

@@ -60,10 +60,7 @@ def draw_lines(
     """
     driven, ended = _finite(lines), crashed or {}
     strokes = style.strokes(driven)
-    handles = []
-    for label, stroke in strokes.items():
-        line_style = {"color": stroke.colour, "ls": stroke.linestyle}
-        handles.append(Line2D([], [], lw=1.8, label=label, **line_style))
+    handles = style.handles(strokes, lw=1.8)
     plot = TrackPlot(tracks, legend=[*handles, *_crash_handle(ended)])
     for z, (label, stroke) in enumerate(strokes.items()):
         line_style = {"color": stroke.colour, "ls": stroke.linestyle}
@@ -97,12 +94,24 @@ def animate_lines(
         seconds: maximum duration; lines are never shown slower than they were driven.
     """
     driven, ended = _finite(lines), crashed or {}
-    animation = _Animation(tracks, driven, ended, rate, seconds)
-    images = animation.frames()
+    strokes = style.strokes(driven)
+    handles = [
+        Line2D([], [], mfc=stroke.colour, label=label, **CAR) for label, stroke in strokes.items()
+    ]
+    plot = TrackPlot(tracks, legend=[*handles, *_crash_handle(ended)], dpi=GIF_RESOLUTION)
+    cars = []
+    for (label, stroke), index in itertools.product(strokes.items(), range(len(tracks))):
+        line = driven[label][index] + plot.offsets[index]
+        crashes = label in ended and ended[label][index]
+        cars.append(_Car(plot.axes, line, crashes, stroke.colour))
+    duration = (max([1, *(len(car.line) for car in cars)]) - 1) / rate
+    speed = max(1.0, duration / seconds)
+    times = np.linspace(0, duration, 1 + math.ceil(duration / speed * FPS)).tolist()
+    images = _frames(plot, cars, times, rate, speed)
     # The legend of the first frame has the colours of all policies.
     first = next(images).quantize(method=Image.Quantize.FASTOCTREE)
     others = (image.quantize(palette=first, dither=Image.Dither.NONE) for image in images)
-    durations = [round(1000 / FPS)] * (len(animation.times) - 1) + [round(1000 * PAUSE)]
+    durations = [round(1000 / FPS)] * (len(times) - 1) + [round(1000 * PAUSE)]
     with whole_file(path) as unfinished:
         first.save(
             unfinished,
@@ -140,56 +149,31 @@ class _Car:
         self.axes.draw_artist(self.head)
 
 
-class _Animation:
-    """The frames of an animation; the arguments are those of `animate_lines`.
+def _frames(
+    plot: TrackPlot, cars: Sequence[_Car], times: Sequence[float], rate: float, speed: float
+) -> Iterator[Image.Image]:
+    """Yield a frame for each time, in seconds of the drive, with a clock.
 
-    Attributes:
-        times: seconds of the drive that each frame shows.
+    Args:
+        rate: steps of the lines per second.
+        speed: seconds of the drive in one of the animation.
     """
-
-    def __init__(
-        self,
-        tracks: Sequence[Track],
-        lines: Mapping[str, Sequence[Array]],
-        crashed: Mapping[str, Sequence[bool]],
-        rate: float,
-        seconds: float,
-    ) -> None:
-        self.rate = rate
-        colours = {label: stroke.colour for label, stroke in style.strokes(lines).items()}
-        handles = [
-            Line2D([], [], mfc=colour, label=name, **CAR) for name, colour in colours.items()
-        ]
-        plot = TrackPlot(tracks, legend=[*handles, *_crash_handle(crashed)], dpi=GIF_RESOLUTION)
-        self.figure, self.canvas = plot.figure, plot.canvas
-        with mpl.rc_context(style.LETTERS):
-            right, bottom = 1 - style.MARGIN / style.WIDTH, 14 / self.figure.bbox.height
-            self.clock = self.figure.text(right, bottom, "", size=8, ha="right", va="center")
-            self.cars = []
-            for label, index in itertools.product(lines, range(len(tracks))):
-                line = lines[label][index] + plot.offsets[index]
-                crashes = label in crashed and crashed[label][index]
-                self.cars.append(_Car(plot.axes, line, crashes, colours[label]))
-            self.canvas.draw()
-        # Drawing the tracks in every frame would take three times as long.
-        self.background = self.canvas.copy_from_bbox(self.figure.bbox)
-        duration = (max([1, *(len(car.line) for car in self.cars)]) - 1) / rate
-        self.speed = max(1.0, duration / seconds)
-        count = 1 + math.ceil(duration / self.speed * FPS)
-        self.times = np.linspace(0, duration, count).tolist()
-
-    def frames(self) -> Iterator[Image.Image]:
-        for time in progress(
-            iterable=self.times, desc="animation", unit="frame", leave=False, disable=None
-        ):
-            self.canvas.restore_region(self.background)
-            now, start = round(time * self.rate), round((time - TAIL * self.speed) * self.rate)
-            for car in self.cars:
-                car.draw(now, start)
-            faster = f" ({self.speed:.0f}× speed)" if self.speed >= 1.5 else ""
-            self.clock.set_text(f"{time:.1f} s{faster}")
-            self.figure.draw_artist(self.clock)
-            yield Image.fromarray(np.asarray(self.canvas.buffer_rgba())).convert("RGB")
+    figure, canvas = plot.figure, plot.canvas
+    with mpl.rc_context(style.LETTERS):
+        right, bottom = 1 - style.MARGIN / style.WIDTH, 14 / figure.bbox.height
+        clock = figure.text(right, bottom, "", size=8, ha="right", va="center")
+        canvas.draw()
+    # Drawing the tracks in every frame would take three times as long.
+    background = canvas.copy_from_bbox(figure.bbox)
+    faster = f" ({speed:.0f}× speed)" if speed >= 1.5 else ""
+    for time in progress(iterable=times, desc="animation", unit="frame", leave=False, disable=None):
+        canvas.restore_region(background)
+        now, start = round(time * rate), round((time - TAIL * speed) * rate)
+        for car in cars:
+            car.draw(now, start)
+        clock.set_text(f"{time:.1f} s{faster}")
+        figure.draw_artist(clock)
+        yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
 
 
 def draw_listening_map(

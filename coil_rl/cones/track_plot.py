@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -52,7 +53,7 @@ class TrackPlot:
         self,
         tracks: Sequence[Track],
         *,
-        legend: Sequence[Line2D] = (),
+        legend: Sequence[Artist] = (),
         title: str | None = None,
         dpi: int = style.RESOLUTION,
         groups: int = 1,

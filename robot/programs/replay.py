@@ -7,7 +7,6 @@ import math
 import re
 import sys
 import warnings
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -171,7 +170,7 @@ def _numbered(names: Sequence[str]) -> list[str]:
 
 def _first_repeated(names: Sequence[str]) -> str | None:
     """Return the first name that was there before; None if all are different."""
-    return next((name for name, number in Counter(names).items() if number > 1), None)
+    return next((name for n, name in enumerate(names) if name in names[:n]), None)
 
 
 def _check_unique(key: str, paths: Sequence[Path]) -> None:

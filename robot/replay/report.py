@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.artist import Artist
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from coil_rl.report import markdown_table, style
@@ -111,12 +109,7 @@ def draw_steering(
     strokes = style.strong_strokes(result.policies)
     if RECORDED in result.steering:
         strokes[RECORDED] = style.Stroke(style.GUIDES[0], style.DASHED)
-    lines: dict[str, dict[str, Any]] = {}
-    for name, stroke in strokes.items():
-        lines[name] = {"color": stroke.colour, "ls": stroke.linestyle}
-    handles: list[Artist] = [
-        Line2D([], [], lw=1.6, label=name, **line) for name, line in lines.items()
-    ]
+    handles = style.handles(strokes, lw=1.6)
     if invalid.any():
         handles.append(Patch(color=style.ASPHALT, lw=0, label="a boundary from the memory"))
     with style.picture(path, title, handles, 5.0, h_pad=0.08) as figure:
@@ -140,8 +133,9 @@ def draw_steering(
                 lw=0,
             )
             axes.set_axisbelow(True)
-        for name, line in lines.items():
+        for name, stroke in strokes.items():
+            line: dict[str, Any] = {"color": stroke.colour, "ls": stroke.linestyle, "lw": 1.1}
             degrees = np.degrees(result.steering[name].action * result.max_steering)
-            steering_axes.plot(seconds, degrees, lw=1.1, **line)
-            omega_axes.plot(seconds, result.steering[name].omega, lw=1.1, **line)
+            steering_axes.plot(seconds, degrees, **line)
+            omega_axes.plot(seconds, result.steering[name].omega, **line)
         omega_axes.set_xlabel("time (s)")

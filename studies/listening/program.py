@@ -148,10 +148,9 @@ def _summary(label: str, table: Sequence[Mapping[str, Any]]) -> str:
     if rows:
         most = max(rows, key=lambda row: row["intervention"])
         there = f", and by {most['intervention']:.4f} in the section {most['section']}"
-    others = ""
-    for guide, change in means.items():
-        if guide != best:
-            others += f"; {guide} changes it by {change:.4f}"
+    others = "".join(
+        f"; {guide} changes it by {change:.4f}" for guide, change in means.items() if guide != best
+    )
     return (
         f"{label} depends most on {best}: "
         f"other advice of it changes the action by {means[best]:.4f}{there}{others}"

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 import torch
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from tensordict import NestedKey, TensorDictBase
@@ -132,9 +131,7 @@ class WholeEpisode:
         size = max(1, -(-int(data.step.max() + 1) // POINTS))
         rows = data.means(**{"from": data.step // size * size})
         strokes = style.strong_strokes(data.guides)
-        handles = []
-        for guide, stroke in strokes.items():
-            handles.append(Line2D([], [], color=stroke.colour, ls=stroke.linestyle, label=guide))
+        handles = style.handles(strokes)
         for measure, title, label, name in drawn(data.measures):
             with style.picture(folder / name, title, handles, 3.6) as figure:
                 axes = figure.add_subplot(xlabel="step of the episode", ylabel=label)
