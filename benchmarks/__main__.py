@@ -17,7 +17,6 @@ from typing import Any
 
 import torch
 from hydra.errors import HydraException
-from tabulate import tabulate
 from tqdm import tqdm
 
 from benchmarks.driving import (
@@ -45,6 +44,7 @@ from coil_rl.config.check import check
 from coil_rl.config.messages import sentence
 from coil_rl.errors import UserError
 from coil_rl.programs.app import program
+from coil_rl.report import markdown_table
 from coil_rl.run.folder import versions
 
 PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {
@@ -223,12 +223,12 @@ def _table(rows: Sequence[Row] | str) -> str:
     if isinstance(rows, str):
         return f"```\n{rows}\n```"
     cells = [{key: _cell(value) for key, value in row.items() if key != "rounds"} for row in rows]
-    return tabulate(cells, headers="keys", tablefmt="pipe", disable_numparse=True)
+    return markdown_table(cells, {key: (key, "") for row in cells for key in row})
 
 
-def _cell(value: Any) -> str:
+def _cell(value: Any) -> Any:
     if not isinstance(value, float):
-        return "" if value is None else str(value)
+        return value
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 

@@ -20,7 +20,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
-from tabulate import tabulate
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.envs import (
@@ -35,6 +34,7 @@ from tqdm import tqdm
 from benchmarks.timing import Stopwatch
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.learners import DQN, PPO, SAC, Mlp
+from coil_rl.report import markdown_table
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
 from coil_rl.transforms.normalised_action import given_units, normalising
@@ -275,25 +275,25 @@ def main(argv: Sequence[str] | None = None) -> None:
     values = {**VALUES[args.algorithm], **TUNED.get((args.algorithm, args.env), {})}
     values["envs"] = args.envs or values["envs"]
     learners = {"ours": ours, "Stable-Baselines3": theirs}
-    returns: dict[str, list[float]] = {name: [] for name in learners}
-    rates: dict[str, list[float]] = {name: [] for name in learners}
-    steps: dict[str, list[float]] = {name: [] for name in learners}
+    runs: dict[str, list[tuple[float, float, float]]] = {name: [] for name in learners}
     # In turns, so that a machine that becomes slower or faster is so for both.
-    runs = list(itertools.product(range(args.seeds), learners.items()))
-    for seed, (name, train) in tqdm(runs, disable=None):
+    turns = list(itertools.product(range(args.seeds), learners.items()))
+    for seed, (name, train) in tqdm(turns, disable=None):
         start = time.process_time()
-        act, rate = train(args.algorithm, args.env, values, args.frames, seed)
-        rates[name].append(args.frames / (time.process_time() - start))
-        steps[name].append(rate)
-        returns[name].append(mean_return(args.env, act))
+        act, steps = train(args.algorithm, args.env, values, args.frames, seed)
+        rate = args.frames / (time.process_time() - start)
+        runs[name].append((mean_return(args.env, act), rate, steps))
     rows = []
-    for name in learners:
-        spread = statistics.stdev(returns[name]) if args.seeds > 1 else math.nan
-        speed = [statistics.median(numbers[name]) for numbers in (rates, steps)]
-        rows.append([name, statistics.mean(returns[name]), spread, *speed])
+    for name, numbers in runs.items():
+        returns, rates, steps_a_second = zip(*numbers, strict=True)
+        row = {"": name, "return": statistics.mean(returns), "sd": math.nan}
+        if args.seeds > 1:
+            row["sd"] = statistics.stdev(returns)
+        row["frames per CPU s"] = statistics.median(rates)
+        row["gradient steps per CPU s"] = statistics.median(steps_a_second)
+        rows.append(row)
     print(f"{args.algorithm}, {args.env}, {args.frames} frames, {args.seeds} runs, {values}")
-    headings = ["", "return", "sd", "frames per CPU s", "gradient steps per CPU s"]
-    print(tabulate(rows, headings, floatfmt=".0f"))
+    print(markdown_table(rows, {name: (name, ".0f") for name in rows[0]}))
 
 
 if __name__ == "__main__":

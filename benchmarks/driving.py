@@ -171,10 +171,9 @@ def measure_compiled(args: Namespace) -> list[Row]:
         seconds = time.perf_counter() - start
         eager = Driving(driving_env(args, cars, guide=True), follow=True)
         rates = measure(args, {"eager": eager, "compiled": compiled})
-        row: Row = {"cars": cars, **medians(rates)}
-        row["ratio"] = median_ratio(rates["compiled"], rates["eager"])
-        row["compiling (s)"], row["rounds"] = seconds, rates
-        rows.append(row)
+        ratio = median_ratio(rates["compiled"], rates["eager"])
+        row = {"cars": cars, **medians(rates), "ratio": ratio, "compiling (s)": seconds}
+        rows.append({**row, "rounds": rates})
     return rows
 
 

@@ -12,7 +12,6 @@ import torch
 
 from benchmarks.beside_sb3 import VALUES, normalised_env, our_learner, their_learner
 from benchmarks.timing import Row, Stopwatch, median_ratio, medians
-from benchmarks.training import without_lean_forms
 from coil_rl.run.rollout import Rollout
 
 ENVS = ("Pendulum-v1", "CartPole-v1", "LunarLanderContinuous-v3")
@@ -38,11 +37,7 @@ def measure_gymnasium(args: Namespace) -> list[Row]:
 
 def compared(args: Namespace, env_id: str, values: dict[str, Any]) -> Row:
     """Return the speeds of both on an env, and the ratios of the whole and of its parts."""
-    subjects = {
-        "ours": ours(env_id, values),
-        "TorchRL's steps": ours(env_id, values, lean=False),
-        "sb3": theirs(env_id, values),
-    }
+    subjects = {"ours": ours(env_id, values), "sb3": theirs(env_id, values)}
     frames = values["envs"] * values["steps"]
     rates: dict[str, list[float]] = {name: [] for name in subjects}
     parts: dict[str, list[float]] = {}
@@ -60,20 +55,17 @@ def compared(args: Namespace, env_id: str, values: dict[str, Any]) -> Row:
             parts.setdefault(f"{name} update", []).append(frames / updates)
     row: Row = {f"{name} (frames/s)": rate for name, rate in medians(rates).items()}
     row["ratio"] = median_ratio(rates["ours"], rates["sb3"])
-    row["ratio, TorchRL's steps"] = median_ratio(rates["TorchRL's steps"], rates["sb3"])
     for part in ("collection", "update"):
         row[f"ratio, {part}"] = median_ratio(parts[f"ours {part}"], parts[f"sb3 {part}"])
     return {**row, "rounds": rates}
 
 
-def ours(env_id: str, values: dict[str, Any], *, lean: bool = True) -> Work:
-    """Return a batch and its updates of our learner, in its lean forms or without them."""
+def ours(env_id: str, values: dict[str, Any]) -> Work:
+    """Return a batch and its updates of our learner."""
     torch.manual_seed(0)
     env = normalised_env(env_id, values["envs"])
     learner = our_learner("ppo", env, values, seed=0)
     rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
-    if not lean:
-        without_lean_forms(rollout, learner)
     stopwatch = Stopwatch(time.process_time)
     stopwatch.wrap(learner, "update", "updates")
     return lambda: learner.update(rollout.collect()), stopwatch

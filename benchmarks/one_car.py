@@ -18,11 +18,9 @@ def measure_one_car(args: Namespace) -> list[Row]:
     """Return the speed of cars driven by the guide beside one car in NumPy and SciPy."""
     ours = Driving(driving_env(args, args.compare_cars, guide=True), follow=True)
     rates = measure(args, {"one car": one_car(args), "ours": ours})
-    row: Row = {"cars": args.compare_cars}
-    for name, rate in medians(rates).items():
-        row[f"{name} (steps/s)"] = rate
-    row["ratio"] = median_ratio(rates["ours"], rates["one car"])
-    return [{**row, "rounds": rates}]
+    row = {f"{name} (steps/s)": rate for name, rate in medians(rates).items()}
+    ratio = median_ratio(rates["ours"], rates["one car"])
+    return [{"cars": args.compare_cars, **row, "ratio": ratio, "rounds": rates}]
 
 
 def one_car(args: Namespace) -> Work:

@@ -58,18 +58,16 @@ def main(cars: int, steps: int, device: str, threads: int) -> Row:
     built = time.perf_counter()
     reset_peak()  # building the maps of the tracks needs more memory than a few cars
     with torch.no_grad():
-        state = env.rand_step(env.reset())
-    float(state["next", "reward"].sum())  # waits for the device
+        after = env.rand_step(env.reset())
+    float(after["next", "reward"].sum())  # waits for the device
     stepped = time.perf_counter()
     if steps:
         learner = PPO(env, ["observation", "guide_action"], epochs=1)
         learner.update(Rollout(env, learner.policy, steps, learner.keys).collect())
     else:
         env.rollout(5, break_when_any_done=False)
-    state_bytes = 0
-    for buffer in env.base_env.buffers():
-        if cars in buffer.shape:
-            state_bytes += buffer.numel() * buffer.element_size()
+    state = [each for each in env.base_env.buffers() if cars in each.shape]
+    state_bytes = sum(each.numel() * each.element_size() for each in state)
     on_gpu = device.startswith("cuda")
     return {
         "import (s)": imported - start,
@@ -87,11 +85,9 @@ def peak_memory() -> float | None:
     The peak of `getrusage` would include the parent process.
     """
     status = Path("/proc/self/status")
-    if status.exists():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1e3
-    return None
+    lines = status.read_text().splitlines() if status.exists() else []
+    peaks = [int(line.split()[1]) / 1e3 for line in lines if line.startswith("VmHWM:")]
+    return peaks[0] if peaks else None
 
 
 def reset_peak() -> None:

@@ -24,6 +24,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,8 @@ from coil_rl.files import write_text
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.configurations import differing
 from coil_rl.report.curves import points
-from coil_rl.report.runs import GUIDE, RETURN, Run, read_runs
+from coil_rl.report.guides import is_guide
+from coil_rl.report.runs import RETURN, Run, read_runs
 from coil_rl.report.statistics import difference
 
 PPO, ALONE, INTACT, RANDOM = "ppo", "alone", "intact", "random"
@@ -83,16 +85,12 @@ class Arm:
     def guide(self) -> float:
         """Mean reward of the guide alone, of the best one of several; NaN without one."""
         runs = list(self.runs.values())
-        names = {name for run in runs for name in run.evaluation["driver"] if _is_guide(name)}
+        drivers = [run.evaluation["driver"][is_guide(run.evaluation)] for run in runs]
+        names = dict.fromkeys(chain.from_iterable(drivers))
         return max(
             (float(np.mean([mean_reward(run, name) for run in runs])) for name in names),
             default=math.nan,
         )
-
-
-def _is_guide(driver: str) -> bool:
-    """Return whether a driver of an evaluation is the guide, or one of several."""
-    return driver == GUIDE or driver.startswith(f"{GUIDE} ")
 
 
 def plain_episodes(run: Run, driver: str) -> pd.DataFrame:
@@ -288,8 +286,8 @@ def rows_of_runs(name: str, arms: Mapping[Key, Arm]) -> list[dict[str, object]]:
             frames = run.curve[-1]["frames"] if run.curve else math.nan
             row = {"task": name, "method": method, "arm": kind, "seed": seed, "frames": frames}
             row |= {"seconds": run.seconds, "guide": arm.guide, "end": arm.reward(seed)}
-            row |= {"handed_over": run.handed_over, "fingerprint": fingerprint(run.settings)}
-            rows.append(row)
+            more = {"handed_over": run.handed_over, "fingerprint": fingerprint(run.settings)}
+            rows.append(row | more)
     return rows
 
 

@@ -5,7 +5,6 @@ this machine, writes the card, and adds the checksums. `python -m benchmarks.shi
 an older policy of that name.
 """
 
-import csv
 import hashlib
 import json
 import shlex
@@ -16,14 +15,14 @@ from typing import Any
 
 from coil_rl.config.folder import CARD, CHECKSUMS, LARGEST
 from coil_rl.files import write_text
-from coil_rl.plain_yaml import read_yaml, yaml_of
-from coil_rl.record import COMMAND, DELIVERY, SECONDS, VERSIONS
+from coil_rl.measures import MEAN_CASE
+from coil_rl.plain_yaml import leaves, read_yaml, yaml_of
+from coil_rl.record import COMMAND, DELIVERY, EVALUATION, SECONDS, VERSIONS
 from coil_rl.report.table import markdown_table
 from coil_rl.run.folder import CONFIG, HANDED_OVER, weights_file
 from coil_rl.run.reasons import handed_over
 
 PLACE = Path(__file__).parents[1] / "coil_rl" / "policies"
-EVALUATION = "evaluation.csv"
 COLUMNS = {
     "driver": ("driver", ""),
     "actions": ("actions", ""),
@@ -45,12 +44,14 @@ def ship(run: Path, name: str) -> Path:
     """
     settings = read_yaml(run / CONFIG)
     settings["run_dir"], settings["logger"] = "pretrained", None
-    _check_paths(settings, CONFIG)
+    for key, value in leaves(settings).items():
+        if isinstance(value, str) and value.startswith(("/", "~")):
+            raise SystemExit(f"{CONFIG}.{key}={value} is a place on this machine")
     tested = settings["delivery"] == "tested"
     folder = PLACE / name
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / CONFIG, yaml_of(settings))
-    files = [weights_file(run, HANDED_OVER if tested else "last").name, EVALUATION]
+    files = [weights_file(run, HANDED_OVER if tested else "last").name, EVALUATION.name]
     files += [DELIVERY.name] if tested else []
     for file in files:
         (folder / file).write_bytes((run / file).read_bytes())
@@ -60,15 +61,6 @@ def ship(run: Path, name: str) -> Path:
             raise SystemExit(f"{path} has more than {LARGEST} bytes")
     _add_checksums(name, folder)
     return folder
-
-
-def _check_paths(node: Any, key: str) -> None:
-    """End the program if a configuration contains a path of this machine."""
-    if isinstance(node, Mapping):
-        for name, value in node.items():
-            _check_paths(value, f"{key}.{name}")
-    elif isinstance(node, str) and node.startswith(("/", "~")):
-        raise SystemExit(f"{key}={node} is a place on this machine")
 
 
 def _add_checksums(name: str, folder: Path) -> None:
@@ -84,11 +76,10 @@ def _add_checksums(name: str, folder: Path) -> None:
 
 def card(run: Path, name: str, settings: Mapping[str, Any]) -> str:
     """Return the card of a policy."""
-    rows = list(csv.DictReader((run / EVALUATION).read_text().splitlines()))
-    means = [row for row in rows if row["case"] == "mean"]
+    rows = EVALUATION.need(run)
+    means = [row for row in rows if row["case"] == MEAN_CASE]
     cases = len({row["case"] for row in rows}) - 1
     columns = {key: column for key, column in COLUMNS.items() if key in means[0]}
-    numbers = [{key: _number(row[key]) for key in columns} for row in means]
     guides = ", ".join(settings["guide"]) or "none"
     env = settings["env"]
     title = env.get("id") or env["_target_"].rpartition(".")[2]
@@ -106,7 +97,7 @@ def card(run: Path, name: str, settings: Mapping[str, Any]) -> str:
         f"- {made}",
         f"Means of {cases} cases that the training never saw; one episode a case with "
         f"deterministic actions, sampled ones {settings['evaluation']['repeats']} a case:",
-        markdown_table(numbers, columns),
+        markdown_table(means, columns),
     ]
     parts += handed_over(run)
     parts.append(
@@ -121,13 +112,6 @@ def _command(run: Path) -> str:
     words = COMMAND.need(run)
     kept = [word for word in words if not word.startswith(("hydra.run.dir=", "logger="))]
     return shlex.join(kept)
-
-
-def _number(text: str) -> Any:
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def main(arguments: Sequence[str]) -> None:

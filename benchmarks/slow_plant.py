@@ -58,9 +58,8 @@ def measure_workers(args: Namespace) -> list[Row]:
         rates = measure(args, {"one process": alone[name], "spread": spread[name]})
         row: Row = {"subject": name, "rows": ROWS, "processes": cores}
         row |= {f"{each} (frames/s)": rate for each, rate in medians(rates).items()}
-        row["ratio"] = median_ratio(rates["spread"], rates["one process"])
-        row["ratio / cores"] = row["ratio"] / cores
-        rows.append(row)
+        ratio = median_ratio(rates["spread"], rates["one process"])
+        rows.append({**row, "ratio": ratio, "ratio / cores": ratio / cores})
     return rows
 
 

@@ -45,7 +45,6 @@ class Training:
         cars: number of cars.
         steps: length of a rollout.
         compile: whether the update is compiled.
-        lean: whether collection and update take their lean forms, where they have some.
     """
 
     def __init__(
@@ -56,7 +55,6 @@ class Training:
         steps: int,
         *,
         compile: bool = False,
-        lean: bool = True,
     ) -> None:
         config = train_config(args, method, *(["learner.compile=true"] if compile else []))
         env = env_maker(config)(cars)
@@ -65,8 +63,6 @@ class Training:
         learner = build_learner(config, env)
         keys = [*learner.keys, *watched_keys(env, {})]
         rollout = Rollout(env, learner.policy, steps, keys, config.training.noise_correlation)
-        if not lean:
-            without_lean_forms(rollout, learner)
         self.folder = tempfile.TemporaryDirectory()  # for the best policy
         self.experiment = Experiment(learner, rollout, 1, Path(self.folder.name))
         while isinstance(learner, OffPolicy) and len(learner.buffer) < learner.starts:
@@ -88,11 +84,6 @@ class Training:
                 stopwatch.wrap(transform, "_reset", "guide")
         stopwatch.wrap(learner.policy, "forward", "policy")
         stopwatch.wrap(learner, "update", "update")
-
-
-def without_lean_forms(rollout: Rollout, learner: Any) -> None:
-    """Let a rollout and a learner take TorchRL's steps and losses, as before there were others."""
-    rollout.lean = learner.lean = None
 
 
 def has_yardstick(args: Namespace) -> bool:
@@ -128,7 +119,7 @@ def measure_training(args: Namespace) -> list[Row]:
         if by_hand_too:
             row["floor, ppo"] = floor_rate(args, cars * steps)
         row["cost of a frame, coil / ppo"] = median_ratio(rates["ppo"], rates["coil"])
-        for kind in ("", " by TorchRL's steps", " compiled"):
+        for kind in ("", " compiled"):
             for method in METHODS:
                 name, yardstick = f"{method}{kind}", f"{method} by hand"
                 if name in rates and yardstick in rates:
@@ -142,8 +133,6 @@ def _trainings(args: Namespace, cars: int, steps: int, by_hand_too: bool) -> dic
     subjects: dict[str, Work] = {}
     for method in METHODS:
         subjects[method] = Training(args, method, cars, steps)
-        plain = f"{method} by TorchRL's steps"
-        subjects[plain] = Training(args, method, cars, steps, lean=False)
     if args.compile_updates:
         for method in METHODS:
             subjects[f"{method} compiled"] = Training(args, method, cars, steps, compile=True)
@@ -235,10 +224,13 @@ def measure_sb3(args: Namespace) -> list[Row]:
     median = medians(rates)
     rows = []
     for envs in SB3_ENVS:
-        row = {"envs": envs, "frames/s": median[str(envs)]}
-        row[f"ours, {cars} x {steps}"] = median["ours"]
-        row["ratio"] = median_ratio(rates["ours"], rates[str(envs)])
-        rows.append({**row, "rounds": rates})
+        row = {
+            "envs": envs,
+            "frames/s": median[str(envs)],
+            f"ours, {cars} x {steps}": median["ours"],
+        }
+        ratio = median_ratio(rates["ours"], rates[str(envs)])
+        rows.append({**row, "ratio": ratio, "rounds": rates})
     return rows
 
 

@@ -60,14 +60,11 @@ def _index(config: DictConfig, folder: Path) -> str:
     """Return RESULTS.md, which has the pages of all results that were made, also earlier."""
     from coil_paper.reproduce import pages
 
-    texts, commands = {}, {}
-    for name in map(str, config.results):
-        path = folder / f"{name}.md"
-        texts[name] = path.read_text(encoding="utf-8") if path.exists() else None
-        commands[name] = command(config, _key(name), name)
+    names = list(map(str, config.results))
+    files = {name: folder / f"{name}.md" for name in names}
     return pages.all_results(
-        texts,
-        commands,
+        {name: file.read_text("utf-8") if file.exists() else None for name, file in files.items()},
+        {name: command(config, _key(name), name) for name in names},
         command(config, "all=true"),
         config.budgets[config.budget].note,
         config.known_problems,
@@ -105,11 +102,9 @@ def requested(config: DictConfig) -> list[str]:
     names: list[str] = []
     for kind in KINDS:
         values = config[kind] if isinstance(config[kind], ListConfig) else [config[kind]]
-        for value in values:
-            if value is not None:
-                key = f"{kind}={value}"
-                _check_key(config, key, available)
-                names.append(available[key])
+        for key in (f"{kind}={value}" for value in values if value is not None):
+            _check_key(config, key, available)
+            names.append(available[key])
     if not names:
         raise UserError(
             f"nothing is requested; give one of {', '.join(available)}, or several, or all=true"
@@ -142,9 +137,8 @@ def command(config: DictConfig, key: str, name: str = "") -> str:
     options = []
     for word in HydraConfig.get().overrides.task:
         option = word.lstrip("+~")  # Hydra's signs for adding and deleting a key
-        if not word.startswith(requests) and (
-            not option.startswith("results.") or option.startswith(own)
-        ):
+        is_of_other = option.startswith("results.") and not option.startswith(own)
+        if not word.startswith(requests) and not is_of_other:
             options.append(word)
     return shlex.join(["coil-reproduce", key, f"budget={config.budget}", *options])
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.guide_benchmark.pages import draw_curves, write_all, write_task
-from benchmarks.guide_benchmark.rows import benchmark_rows, check_row, numbers_of, read_rows
+from benchmarks.guide_benchmark.rows import benchmark_rows, check_row, read_rows
 from benchmarks.promise import runs_of, with_ppo
 from coil_rl.errors import UserError
 from coil_rl.report import write_csv
@@ -37,7 +37,7 @@ def added(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         check_row({name: "" if value is None else str(value) for name, value in row.items()})
     if not file.exists():
         return list(rows)
-    known: list[dict[str, Any]] = [numbers_of(row) for row in read_rows(file)]
+    known = read_rows(file)
     new = {tuple(row[name] for name in SAME) for row in rows}
     return [row for row in known if tuple(row[name] for name in SAME) not in new] + list(rows)
 

@@ -30,7 +30,7 @@ from coil_rl.comparison.entry import IDLE
 from coil_rl.files import write_text
 from coil_rl.report import markdown_table, write_csv
 
-Row = Mapping[str, str]
+Row = Mapping[str, Any]
 DETUNED = "detuned"
 ARMS = tuple(arm for arm in picture.ARMS if arm != "shuffled")  # one placebo is enough
 RULES = (GUIDE, PPO, ANCHORED)  # that say the same everywhere, to compare with
@@ -51,15 +51,11 @@ COLUMNS = {
 
 def ends(rows: Sequence[Row], task: str, arm: str) -> dict[str, float]:
     """Return what whole trainings with a guide gave, by method; plain PPO and the guide too."""
-    found: dict[str, float] = {}
-    guides: list[float] = []
-    for row in rows:
-        if row["task"] != task or row["method"] == TUNE:  # the comparisons have no numbers to tune
-            continue
-        if row["arm"] == arm:
-            guides.append(float(row["guide"]))
-        if row["arm"] == arm or (row["method"], row["arm"]) == (PPO, ALONE):
-            found[row["method"]] = float(row["end"])
+    # The comparisons have no numbers to tune.
+    own = [row for row in rows if row["task"] == task and row["method"] != TUNE]
+    guides = [float(row["guide"]) for row in own if row["arm"] == arm]
+    kept = [row for row in own if row["arm"] == arm or (row["method"], row["arm"]) == (PPO, ALONE)]
+    found = {row["method"]: float(row["end"]) for row in kept}
     return found | {GUIDE: float(np.mean(guides))}
 
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from benchmarks.guide_benchmark.picture import ARMS, LIMIT, draw
 from benchmarks.guide_benchmark.rows import references
-from benchmarks.promise import ALONE, GUIDE, INTACT, PPO, arms_of, counted_verdicts
+from benchmarks.promise import ALONE, INTACT, PPO, arms_of, counted_verdicts
 from coil_rl.files import write_text
 from coil_rl.report import draw_learning_curves, markdown_table
 from coil_rl.report.page import some_of
-from coil_rl.report.runs import Run
+from coil_rl.report.runs import GUIDE, Run
 
 Row = dict[str, Any]
 LADDER = {
@@ -183,29 +183,29 @@ def _table(rows: Sequence[Row], columns: Mapping[str, Sequence[str]]) -> str:
 
 def summarised(rows: Sequence[Row]) -> list[Row]:
     """Return a row for each arm and method over all tasks, in the order of the arms."""
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        if row["arm"] in ARMS:
-            groups.setdefault((row["arm"], row["method"]), []).append(row)
+    groups = _grouped(rows, "arm", "method")
     return [
         _summary(arm, method, groups[arm, method])
         for arm, method in sorted(groups, key=lambda key: (ARMS.index(key[0]), key[1]))
     ]
 
 
-def by_method(rows: Sequence[Row]) -> list[Row]:
-    """Return a row for each method over all tasks and guides, with the fewest losses first."""
-    groups: dict[str, list[Row]] = {}
+def _grouped(rows: Sequence[Row], *names: str) -> dict[tuple[str, ...], list[Row]]:
+    """Return the rows with a guide by their values of some columns."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         if row["arm"] in ARMS:
-            groups.setdefault(row["method"], []).append(row)
+            groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return groups
+
+
+def by_method(rows: Sequence[Row]) -> list[Row]:
+    """Return a row for each method over all tasks and guides, with the fewest losses first."""
     found = []
-    for method, own in groups.items():
+    for (method,), own in _grouped(rows, "method").items():
         worst = own[int(np.argmin([row["difference"] for row in own]))]
-        found.append(
-            _summary("", method, own)
-            | {"pairs": len(own), "where": f"{worst['task']}, {worst['arm']}"}
-        )
+        where = f"{worst['task']}, {worst['arm']}"
+        found.append(_summary("", method, own) | {"pairs": len(own), "where": where})
     return sorted(found, key=lambda row: (row["loss"] / row["pairs"], -row["difference"]))
 
 

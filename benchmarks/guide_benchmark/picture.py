@@ -29,11 +29,9 @@ def draw(rows: Rows, path: Path) -> None:
     methods = list(dict.fromkeys(str(row["method"]) for row in compared))
     strokes = style.strong_strokes(methods)
     handles = [
-        Line2D([], [], color=strokes[method].colour, marker=_marker(strokes[method]), lw=0)
-        for method in methods
+        Line2D([], [], color=stroke.colour, marker=_marker(stroke), lw=0, label=method)
+        for method, stroke in strokes.items()
     ]
-    for handle, method in zip(handles, methods, strict=True):
-        handle.set_label(method)
     height = 0.8 + len(arms) * max(0.5, 0.14 * len(methods))
     title = "Guide benchmark: is a method at least as good as the better of guide and PPO?"
     with style.picture(path, title, handles, height, add_header=True) as figure:

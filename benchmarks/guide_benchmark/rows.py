@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from benchmarks.promise import (
     ALONE,
@@ -140,15 +141,9 @@ def _row(
 
 def _versions(runs: Sequence[Run]) -> dict[str, str]:
     """Return the versions of the libraries of runs; different ones are joined by a slash."""
-    found = []
-    for run in runs:
-        own = record.VERSIONS.need(run.folder)
-        found.append([own.get(name, "") for name in VERSIONS])
-    columns = zip(*found, strict=True)
-    return {
-        name: " / ".join(dict.fromkeys(filter(None, column)))
-        for name, column in zip(VERSIONS, columns, strict=True)
-    }
+    found = [record.VERSIONS.need(run.folder) for run in runs]
+    columns = {name: dict.fromkeys(each.get(name, "") for each in found) for name in VERSIONS}
+    return {name: " / ".join(filter(None, column)) for name, column in columns.items()}
 
 
 def score(value: float, row: Mapping[str, Any]) -> float:
@@ -163,15 +158,11 @@ def score(value: float, row: Mapping[str, Any]) -> float:
 
 def _learning(runs: Sequence[Run]) -> dict[str, float | None]:
     """Return the means over seeds of what learning curves and tables say."""
-    measured = [_of_run(run) for run in runs]
-    result: dict[str, float | None] = {
-        name: _mean([each[name] for each in measured]) for name in measured[0]
-    }
-    lowest = [each["lowest"] for each in measured if not math.isnan(each["lowest"])]
-    result["lowest"] = min(lowest, default=math.nan)
+    measured = pd.DataFrame([_of_run(run) for run in runs])
+    result: dict[str, float | None] = {**measured.mean(), "lowest": measured["lowest"].min()}
     result[REACHED] = None
-    if lowest:  # so curves and guides are known
-        result[REACHED] = sum(not math.isnan(each["frames_to_guide"]) for each in measured)
+    if measured["lowest"].notna().any():  # so curves and guides are known
+        result[REACHED] = int(measured["frames_to_guide"].count())
     return result
 
 
@@ -192,14 +183,8 @@ def _of_run(run: Run) -> dict[str, float]:
     }
 
 
-def _mean(values: Sequence[float]) -> float:
-    """Return a mean over the seeds that have a value."""
-    known = [float(value) for value in values if not math.isnan(value)]
-    return float(np.mean(known)) if known else math.nan
-
-
-def check_row(row: Mapping[str, str]) -> None:
-    """Check a row of the table, as it is in the file.
+def check_row(row: Mapping[str, str]) -> dict[str, Any]:
+    """Return a row of the table, as it is in the file, with numbers in place of their text.
 
     Args:
         row: its cells by column; `reached` may be missing, as in older tables.
@@ -217,7 +202,9 @@ def check_row(row: Mapping[str, str]) -> None:
     if row["task"] not in known:
         raise ValueError(f"{place}: no such task; add it to {REFERENCES.name}")
     try:
-        numbers, seeds, reached = _numbers(row), int(row["seeds"]), _reached(row)
+        numbers = {name: float(row[name]) for name in NUMBERS}
+        seeds, cell = int(row["seeds"]), row.get(REACHED)
+        reached = int(cell) if cell else None  # None if it was not counted
     except ValueError as error:
         raise ValueError(f"{place}: a number is expected ({error})") from error
     unknown = [name for name in KNOWN if not math.isfinite(numbers[name])]
@@ -236,37 +223,19 @@ def check_row(row: Mapping[str, str]) -> None:
         raise ValueError(f"{place}: fingerprint={row['fingerprint']} is not ten hexadecimal digits")
     if missing := [name for name in VERSIONS if not row[name]]:
         raise ValueError(f"{place}: the versions of {', '.join(missing)} are missing")
+    numbered = {**row, **numbers, "seeds": seeds, REACHED: reached}
+    return {name: numbered[name] for name in COLUMNS}
 
 
-def read_rows(file: Path) -> list[dict[str, str]]:
-    """Return the checked rows of a table.
+def read_rows(file: Path) -> list[dict[str, Any]]:
+    """Return the checked rows of a table, with numbers in place of their text.
 
     Raises:
         OSError: if it cannot be read.
         ValueError: if a row is not valid.
     """
     with file.open(encoding="utf-8", newline="") as table:
-        rows = list(csv.DictReader(table))
-    for row in rows:
-        check_row(row)
-    return rows
-
-
-def numbers_of(row: Mapping[str, str]) -> dict[str, Any]:
-    """Return a checked row of a table with numbers in place of their text."""
-    numbers = {**row, **_numbers(row), "seeds": int(row["seeds"]), REACHED: _reached(row)}
-    return {name: numbers[name] for name in COLUMNS}
-
-
-def _numbers(row: Mapping[str, str]) -> dict[str, float]:
-    """Return the numbers of a row by column."""
-    return {name: float(row[name]) for name in NUMBERS}
-
-
-def _reached(row: Mapping[str, str]) -> int | None:
-    """Return how many seeds reached the guide; None if that was not counted."""
-    cell = row.get(REACHED)
-    return int(cell) if cell else None
+        return [check_row(row) for row in csv.DictReader(table)]
 
 
 def _check_numbers(

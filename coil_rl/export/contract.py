@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, Field, model_validator
 
 from coil_rl.errors import UserError, file_of_a_run
-from coil_rl.files import read_file, read_text
+from coil_rl.files import read_file
+from coil_rl.record import json_file
 
 FORMAT, VERSION = "coil-rl policy", 1
 CONTRACT, ONNX, TORCH, DRIVER = "contract.json", "policy.onnx", "policy.pt2", "drive.py"
@@ -63,10 +64,11 @@ def read_contract(file: Path) -> tuple[dict[str, Any], bytes]:
                 f"it; {REMEDY}"
             )
     with file_of_a_run(path, REMEDY):
-        contract = json.loads(read_text(path, LARGEST_CONTRACT))
+        text = read_file(path, LARGEST_CONTRACT)
+        contract = json.loads(text)
         found = contract["format"], contract["version"]
         digest = str(contract["files"][ONNX]["sha256"])
-        _check(contract)
+        json_file(CONTRACT, _Contract, REMEDY).parse(text)
     if found != (FORMAT, VERSION):
         raise UserError(
             f"{path} has the format {found[0]!r} in version {found[1]}, but this program reads "
@@ -149,12 +151,3 @@ class _Contract(BaseModel):
     outputs: Annotated[list[_Output], Field(min_length=1)]
     guide: _Guide
     env: _Env
-
-
-def _check(contract: Any) -> None:
-    """Raise a `ValueError` for the first part of a contract that is missing or of another type."""
-    try:
-        _Contract.model_validate(contract)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from importlib import metadata
 from typing import Any
 
+import numpy as np
 import torch
 from gymnasium import spaces
-from torch import Tensor
 from torchrl.data import Bounded
 
 from coil_rl import record
@@ -132,12 +132,10 @@ def _rate(plant: Any) -> dict[str, Any] | None:
     return None if math.isnan(rate) else {"value": rate, "unit": "steps per second"}
 
 
-def _numbers(values: Tensor) -> Any:
+def _numbers(values: Any) -> Any:
     """Return numbers as nested lists, None for those that are not finite."""
-    if values.ndim:
-        return [_numbers(each) for each in values]
-    number = values.item()
-    return number if math.isfinite(number) else None
+    numbers = np.asarray(values)
+    return np.where(np.isfinite(numbers), numbers, None).tolist()  # type: ignore[call-overload]
 
 
 def _bounds(spec: Any, batch_dims: int) -> dict[str, Any] | None:
@@ -152,70 +150,61 @@ def _input(
 ) -> dict[str, Any]:
     key = [entry.key] if isinstance(entry.key, str) else list(entry.key)
     about: dict[str, Any] = {"name": entry.name, "key": key, "shape": list(entry.shape)}
-    about["dtype"] = _name(entry)
+    about["dtype"] = _name(entry.dtype)
     if entry.key == ADVICE:
-        action = known.get("action", {})
-        numbers = _numbering(step) if step.space.choices else {}
+        unit = known.get("action", {}).get("unit", AS_GIVEN)
         return about | {
-            "unit": action.get("unit", AS_GIVEN) if step.space.continuous else "number of a choice",
+            "unit": unit if step.space.continuous else "number of a choice",
             "meaning": "the actions of the guides, in the unit and numbering of the env, in this "
             f"order: {', '.join(step.guides)}",
-            **numbers,
+            **_numbering(step),
         }
-    spec = plant.observation_spec[entry.key]
-    meant = {"unit": AS_GIVEN, "meaning": AS_GIVEN} | dict(known.get(entry.name, {}))
-    about |= {"bounds": _bounds(spec, plant.batch_dims)}
+    about["bounds"] = _bounds(plant.observation_spec[entry.key], plant.batch_dims)
     if isinstance(plant, GymnasiumEnv):
         about |= _source(plant, key)
-    return about | meant
+    return about | {"unit": AS_GIVEN, "meaning": AS_GIVEN} | dict(known.get(entry.name, {}))
 
 
 def _source(plant: GymnasiumEnv, key: list[str]) -> dict[str, Any]:
     """Return where an input is in the observation of a Gymnasium env."""
-    for entry in plant.codec.entries:
-        if list(entry.key) == key:
-            start = torch.as_tensor(entry.start).reshape(-1)
-            start = start.expand(len(entry.choices)) if entry.choices else start[:0]
-            source = {"path": list(entry.path), "choices": entry.choices, "start": start.tolist()}
-            about: dict[str, Any] = {"from": source}
-            if entry.choices:
-                about["encoding"] = "one-hot vectors of the choices side by side"
-            elif isinstance(entry.space, spaces.Box) and entry.space.is_bounded():
-                low, high = (
-                    torch.as_tensor(bound) for bound in (entry.space.low, entry.space.high)
-                )
-                about["bounds"] = {"low": _numbers(low), "high": _numbers(high)}
-            return about
-    return {}
+    found = [entry for entry in plant.codec.entries if list(entry.key) == key]
+    about: dict[str, Any] = {}
+    for entry in found[:1]:
+        start = torch.as_tensor(entry.start).reshape(-1)
+        start = start.expand(len(entry.choices)) if entry.choices else start[:0]
+        source = {"path": list(entry.path), "choices": entry.choices, "start": start.tolist()}
+        about["from"] = source
+        if entry.choices:
+            about["encoding"] = "one-hot vectors of the choices side by side"
+        elif isinstance(entry.space, spaces.Box) and entry.space.is_bounded():
+            low, high = _numbers(entry.space.low), _numbers(entry.space.high)
+            about["bounds"] = {"low": low, "high": high}
+    return about
 
 
-def _name(entry: Entry) -> str:
-    return str(entry.dtype).removeprefix("torch.")
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
 
 
 def _action(plant: Any, step: PolicyStep, known: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
     """Return what the output is."""
     spec = plant.full_action_spec[plant.action_key]
-    shape = list(spec.shape[plant.batch_dims :])
-    dtype = str(spec.dtype).removeprefix("torch.")
-    meant = {"unit": AS_GIVEN, "meaning": "the action that the env executes"}
-    if step.space.choices:
-        meant["unit"] = "number of a choice"
-    space = {"shape": shape, "dtype": dtype}
+    about = {"shape": list(spec.shape[plant.batch_dims :]), "dtype": _name(spec.dtype)}
+    space = about
     if isinstance(plant, GymnasiumEnv):
-        space = {
-            "shape": list(plant.codec.actions.space.shape or ()),
-            "dtype": str(plant.codec.actions.space.dtype),
-        }
-    numbers = (
-        _numbering(step) if step.space.choices else {"bounds": _bounds(spec, plant.batch_dims)}
-    )
+        own = plant.codec.actions.space
+        space = {"shape": list(own.shape or ()), "dtype": str(own.dtype)}
+    numbers = _numbering(step) or {"bounds": _bounds(spec, plant.batch_dims)}
+    unit = "number of a choice" if step.space.choices else AS_GIVEN
+    meant = {"unit": unit, "meaning": "the action that the env executes"}
     meant |= known.get("action", {})
-    return {"name": "action", "shape": shape, "dtype": dtype, **meant, **numbers, "space": space}
+    return {"name": "action", **about, **meant, **numbers, "space": space}
 
 
 def _numbering(step: PolicyStep) -> dict[str, Any]:
-    """Return the numbers of choices, and the lowest number of each."""
+    """Return the numbers of choices, and the lowest number of each; nothing without choices."""
+    if not step.space.choices:
+        return {}
     first = step.space.first
     lowest = [0] * len(step.space.choices) if first is None else first.reshape(-1).tolist()
     return {"choices": step.space.choices, "lowest": lowest}
@@ -229,7 +218,7 @@ def _state(entry: Entry) -> dict[str, Any]:
         "input": f"state.{entry.name}",
         "output": f"next.{entry.name}",
         "shape": list(entry.shape),
-        "dtype": _name(entry),
+        "dtype": _name(entry.dtype),
         "first": first.reshape(-1)[0].item() if one else first.tolist(),
     }
 
@@ -270,10 +259,8 @@ def results_of(run: Run) -> list[dict[str, Any]]:
     cases = len({row["case"] for row in rows} - {MEAN_CASE})
     results = []
     for row in rows:
-        if row["case"] != MEAN_CASE:
-            continue
-        driver = {name: row[name] for name in record.DRIVER if name != "case"}
-        numbers = {name: row[name] for name in row if name not in record.DRIVER}
-        known = {name: each if math.isfinite(each) else None for name, each in numbers.items()}
-        results.append(driver | {"cases": cases} | known)
+        if row["case"] == MEAN_CASE:
+            said = {name: row[name] for name in ("driver", "advice", "actions")} | {"cases": cases}
+            numbers = {name: row[name] for name in row if name not in record.DRIVER}
+            results.append(said | {name: _numbers(each) for name, each in numbers.items()})
     return results

@@ -105,9 +105,8 @@ def _range(action: Mapping[str, Any]) -> ActionRange:
     if action.get("choices"):
         low = np.array(action["lowest"])
         return ActionRange(low, low + np.array(action["choices"]) - 1, whole=True)
-    infinite, bounds = np.full(action["shape"], np.inf), action.get("bounds") or {}
-    sides = []
-    for side, otherwise in (("low", -infinite), ("high", infinite)):
-        given = np.array(bounds.get(side, otherwise), dtype=float)  # None becomes NaN
-        sides.append(np.where(np.isnan(given), otherwise, given))
-    return ActionRange(*sides, whole=False)
+    bounds, unknown = action.get("bounds") or {}, np.full(action["shape"], np.nan)
+    # None becomes NaN.
+    low, high = (np.array(bounds.get(side, unknown), dtype=float) for side in ("low", "high"))
+    low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+    return ActionRange(low, high, whole=False)

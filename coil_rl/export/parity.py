@@ -101,7 +101,7 @@ def _called(
     for number in range(len(recording)):
         if recording.first[number]:
             state = {f"state.{entry.name}": entry.rows(1).numpy() for entry in step.state}
-        inputs = {entry.name: recording.value(number, entry.key).numpy() for entry in step.inputs}
+        inputs = {entry.name: recording.entries[number][entry.key].numpy() for entry in step.inputs}
         given.append(inputs | state)
         action, *after = session(given[-1])
         state = dict(zip(state, after, strict=True))

@@ -10,10 +10,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from coil_rl.export.step import ADVICE
@@ -31,31 +32,20 @@ class Recording:
     """Steps of a controller.
 
     Attributes:
-        entries: of the env, [1] each.
+        entries: of the env, [1] each; with guides also `guide_action`, [1, n_guides, ...], what
+            they advised, see `PolicyStep`.
         first: whether the step begins an episode.
         actions: of the controller, as entries of the env, [1, *A] each.
-        advice: actions of its guides, [1, n_guides, ...] each, see `PolicyStep`; empty without.
         seconds: that the controller took.
     """
 
     entries: list[TensorDictBase] = field(default_factory=list)
     first: list[bool] = field(default_factory=list)
     actions: list[Tensor] = field(default_factory=list)
-    advice: list[Tensor] = field(default_factory=list)
     seconds: float = 0.0
 
     def __len__(self) -> int:
         return len(self.entries)
-
-    def value(self, step: int, key: NestedKey) -> Tensor:
-        """Return what an input is in a step, [1, ...].
-
-        Args:
-            step: number of the step.
-            key: of an entry, or `guide_action`.
-        """
-        value: Tensor = self.advice[step] if key == ADVICE else self.entries[step][key]
-        return value
 
 
 @torch.no_grad()
@@ -80,31 +70,31 @@ def record(
     recording, heard = Recording(), Heard(controller)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        episode, steps = -1, 0
-        carrier = None
-        while len(recording) < count:
-            if carrier is None:
-                episode, steps, carrier = episode + 1, 0, env.reset()
-                controller.reset()
-            entries = carrier.select(*keys)
-            copied, before = entries.clone(), time.process_time()
-            action = controller.act_on(copied)
-            recording.seconds += time.process_time() - before
-            recording.entries.append(entries)
-            recording.first.append(steps == 0)
-            recording.actions.append(action.clone())
-            if heard.guides is not None:
-                recording.advice.append(heard.advice())
-            executed = carrier.set(env.action_key, action)
-            if episode % 2 and float(torch.rand(())) < DRAWN:
-                executed = random_action(env, carrier)
-            step = env.step(executed)
-            carrier, steps = env.step_mdp(step), steps + 1
-            if steps == LONGEST or bool(step["next", "done"].any()):
-                carrier = None
-            tick()
-    heard.close()
-    return recording
+        episode = -1
+        while True:
+            episode, carrier = episode + 1, env.reset()
+            controller.reset()
+            for step in range(LONGEST):
+                if len(recording) == count:
+                    heard.close()
+                    return recording
+                entries = carrier.select(*keys)
+                copied, before = entries.clone(), time.process_time()
+                action = controller.act_on(copied)
+                recording.seconds += time.process_time() - before
+                if heard.guides is not None:
+                    entries[ADVICE] = heard.advice()
+                recording.entries.append(entries)
+                recording.first.append(step == 0)
+                recording.actions.append(action.clone())
+                executed = carrier.set(env.action_key, action)
+                if episode % 2 and float(torch.rand(())) < DRAWN:
+                    executed = random_action(env, carrier)
+                after = env.step(executed)
+                carrier = env.step_mdp(after)
+                tick()
+                if after["next", "done"].any():
+                    break
 
 
 class Heard:
@@ -117,29 +107,24 @@ class Heard:
     def __init__(self, controller: Controller) -> None:
         self.guides = controller.guides
         self.actions: dict[str, Tensor] = {}
-        self.hooks: list[Any] = []
-        if self.guides is None:
-            return
-        for name, guide in self.guides.guides.guides.items():
-            self.hooks.append(guide.register_forward_hook(self._listener(name)))
+        guides = {} if self.guides is None else self.guides.guides.guides
+        self.hooks = [
+            guide.register_forward_hook(partial(self._listen, name))
+            for name, guide in guides.items()
+        ]
 
-    def _listener(self, name: str) -> Callable[..., None]:
-        def listen(module: Any, arguments: Any, written: TensorDictBase) -> None:
-            if self.guides is not None:
-                self.actions[name] = written[self.guides.action_key].clone()
-
-        return listen
+    def _listen(self, name: str, module: Any, arguments: Any, written: TensorDictBase) -> None:
+        if self.guides is not None:
+            self.actions[name] = written[self.guides.action_key].clone()
 
     def advice(self) -> Tensor:
         """Return the last actions of all guides in the unit and numbering of the env."""
         if self.guides is None:
             return torch.empty(0)
         space: ActionSpace = self.guides.guide_space
-        rows = []
-        for name in self.guides.names:
-            action = self.actions[name]
-            rows.append(numbered(space, space.advice(action, action.shape[:1])))
-        return torch.stack(rows, -2)
+        own = [self.actions[name] for name in self.guides.names]
+        vectors = [space.advice(action, action.shape[:1]) for action in own]
+        return torch.stack([numbered(space, each) for each in vectors], -2)
 
     def close(self) -> None:
         """Listen no longer."""

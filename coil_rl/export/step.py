@@ -136,7 +136,10 @@ class PolicyStep(nn.Module):
                 links = [given if each is guides else each for each in links]
         self.guides = [] if guides is None else guides.names
         self.chain = Chain(controller.env, policy, links)
-        self.inputs = [_input(plant, key) for key in self.chain.reads]
+        self.inputs = []
+        for key in self.chain.reads:
+            spec = plant.observation_spec[key]
+            self.inputs.append(Entry(key, tuple(spec.shape[plant.batch_dims :]), spec.dtype))
         if given is not None:
             self.inputs.append(given.entry)
         self.space = space_of(plant, plant.action_key)
@@ -195,8 +198,3 @@ def exportable(controller: Controller) -> list[Link]:
             name = type(link.transform).__name__
             raise NotExportableError(f"{name} remembers earlier steps in a way of its own")
     return links
-
-
-def _input(plant: Any, key: NestedKey) -> Entry:
-    spec = plant.observation_spec[key]
-    return Entry(key, tuple(spec.shape[plant.batch_dims :]), spec.dtype)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -64,25 +63,16 @@ def export_policy(
     controller = run.controller(which)
     try:
         exportable(controller)
+        say(f"export: {observations:,} observations of {run.label} in its env ...")
+        with progress(
+            total=observations, unit="step", desc="export", leave=False, mininterval=0.5
+        ) as bar:
+            recording = record(run, controller, observations, seed, bar.update)
+        step, contents, parity, outside = _possible(run, controller, recording)
     except NotExportableError as error:
-        raise UserError(_impossible(run, str(error))) from error
-    recording = _recorded(run, controller, observations, seed)
-    outside = _cause(controller)
-    step, contents, parity = None, dict[str, bytes](), None
-    if outside is None:
-        try:
-            step, contents, parity = _written(controller, recording, inside=True)
-        except NotExportableError as error:
-            outside = str(error)
-            _check_possible(run, controller, outside)
-    if step is None or parity is None:
-        _check_possible(run, controller, str(outside))
-        try:
-            step, contents, parity = _written(controller, recording, inside=False)
-        except NotExportableError as error:
-            raise UserError(_impossible(run, str(error))) from error
-        if step.guides:
-            say(f"export: the guide stays outside, its action is an input: {outside}")
+        raise UserError(
+            f"run {run.folder}: its policy cannot be exported: {error}; use run.controller()"
+        ) from error
     contract = describe(
         run,
         controller,
@@ -99,33 +89,40 @@ def export_policy(
     }
     _save(Path(folder), contents, contract | {"files": files})
     say(f"export: {parity}")
-    if run.make_learner is not None:
-        _say_if_not_learned(contract["policy"]["acts"], outside)
+    acts = contract["policy"]["acts"]
+    if run.make_learner is not None and acts != LEARNED:
+        passed = ""
+        if outside is not None and acts.startswith("guide "):
+            passed = ", and its file only passes guide_action on"
+        say(
+            f"export: what the run handed over is {acts}{passed}; policy=last exports the last "
+            'learned policy, which="last" in Python'
+        )
     return ExportedPolicy(folder)
 
 
-def _say_if_not_learned(acts: str, outside: str | None) -> None:
-    """Say that what is exported is a guide, or a policy that has learned nothing.
+def _possible(
+    run: Run, controller: Controller, recording: Recording
+) -> tuple[PolicyStep, dict[str, bytes], Parity, str | None]:
+    """Return what `_written` does, with the guides inside where that is possible.
 
-    Args:
-        acts: what is exported, as in the contract.
-        outside: why the guides are outside; None if they are not.
+    The last one is why they are outside; None if they are not.
+
+    Raises:
+        NotExportableError: if the policy cannot be exported.
     """
-    if acts == LEARNED:
-        return
-    passed = ""
-    if outside is not None and acts.startswith("guide "):
-        passed = ", and its file only passes guide_action on"
-    say(
-        f"export: what the run handed over is {acts}{passed}; policy=last exports the last learned "
-        'policy, which="last" in Python'
-    )
-
-
-def _recorded(run: Run, controller: Controller, count: int, seed: int) -> Recording:
-    say(f"export: {count:,} observations of {run.label} in its env ...")
-    with progress(total=count, unit="step", desc="export", leave=False, mininterval=0.5) as bar:
-        return record(run, controller, count, seed, bar.update)
+    outside = _cause(controller)
+    if outside is None:
+        try:
+            return *_written(controller, recording, inside=True), None
+        except NotExportableError as error:
+            outside = str(error)
+    if controller.guides is None or run.make_learner is None:  # nothing is left without the guide
+        raise NotExportableError(outside)
+    step, contents, parity = _written(controller, recording, inside=False)
+    if step.guides:
+        say(f"export: the guide stays outside, its action is an input: {outside}")
+    return step, contents, parity, outside
 
 
 def _written(
@@ -164,28 +161,11 @@ def _cause(controller: Controller) -> str | None:
     return None
 
 
-def _check_possible(run: Run, controller: Controller, reason: str) -> None:
-    """Raise a `UserError` if nothing is left without the guide."""
-    if controller.guides is None or run.make_learner is None:
-        raise UserError(_impossible(run, reason))
-
-
-def _impossible(run: Run, reason: str) -> str:
-    return f"run {run.folder}: its policy cannot be exported: {reason}; use run.controller()"
-
-
 def _save(folder: Path, contents: Mapping[str, bytes], contract: Mapping[str, Any]) -> None:
-    """Write all files, the contract as the last one."""
+    """Write all files, the contract as the last one; none if one cannot be written."""
     driver = (resources.files("coil_rl.export") / DRIVER).read_bytes()
     text = json.dumps(contract, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    with _whole_folder(folder) as unfinished:
-        for name, content in {**contents, DRIVER: driver, CONTRACT: text.encode()}.items():
-            (unfinished / name).write_bytes(content)
-
-
-@contextmanager
-def _whole_folder(folder: Path) -> Iterator[Path]:
-    """Yield a new folder whose files are moved into `folder` at the end of the block."""
+    files = {**contents, DRIVER: driver, CONTRACT: text.encode()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
@@ -196,8 +176,9 @@ def _whole_folder(folder: Path) -> Iterator[Path]:
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir()
     try:
-        yield unfinished
-        for path in sorted(unfinished.iterdir(), key=lambda path: path.name == CONTRACT):
-            path.replace(folder / path.name)
+        for name, content in files.items():
+            (unfinished / name).write_bytes(content)
+        for name in files:
+            (unfinished / name).replace(folder / name)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)

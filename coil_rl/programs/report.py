@@ -120,6 +120,7 @@ def report(config: DictConfig) -> None:
     from coil_rl.report import page, style, write_csv
     from coil_rl.report.html import Section, html_page
     from coil_rl.report.runs import failed_jobs, read_runs
+    from coil_rl.report.sentences import REPORT
     from coil_rl.run.stopping import resume_command
 
     folders = _folders(config)
@@ -147,11 +148,12 @@ def report(config: DictConfig) -> None:
             "",
             [
                 *page.notes(against, sampled="sampled" in ACTIONS[config.actions]),
-                *page.progress(
-                    len(finished),
-                    len(runs),
-                    failed_jobs(folders),
-                    unstarted_jobs(folders, [run.folder for run in runs]),
+                *REPORT.said(
+                    "progress",
+                    finished=len(finished),
+                    started=len(runs),
+                    refused=failed_jobs(folders),
+                    unstarted=unstarted_jobs(folders, [run.folder for run in runs]),
                 ),
             ],
         )

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from coil_rl.errors import UserError
-from coil_rl.measures import Measure
+from coil_rl.measures import Measure, with_denominators
 from coil_rl.record import DRIVER
 from coil_rl.report.guides import is_guide, shared_guides
 from coil_rl.report.runs import FALLBACK, GUIDE, Run
@@ -140,8 +140,8 @@ class Group:
         Args:
             case: the only case to count; None for all of them.
         """
-        counts: dict[str, int] = _of_case(self.episodes, case).sum().astype(int).to_dict()
-        return counts
+        known = _of_case(self.episodes, case).sum().astype(int)
+        return dict.fromkeys(("episodes", *self.measures), 0) | known.to_dict()
 
     @property
     def rank(self) -> tuple[bool, float, float]:
@@ -255,7 +255,6 @@ class Comparison:
                     "low_of_cases": group.reward_of_cases.low,
                     "high_of_cases": group.reward_of_cases.high,
                     **means,
-                    **self._partial(group),
                     "difference": difference.mean,
                     "difference_low": difference.low,
                     "difference_high": difference.high,
@@ -267,36 +266,17 @@ class Comparison:
             )
         for row, p in zip(rows, holm([row["p"] for row in rows]), strict=True):
             row["p"] = float(p)
-        return rows
-
-    @cached_property
-    def _unknown(self) -> list[str]:
-        """The measures that are not known in all episodes."""
-        found = [each.counts() for each in self.groups]
-        return [name for each in found for name in each if 0 < each[name] < each["episodes"]]
-
-    def _partial(self, group: Group, case: str | None = None) -> dict[str, int]:
-        """Return in how many episodes each measure is known, unless it is in all episodes.
-
-        With such a measure the number of all episodes is among them.
-
-        Args:
-            case: the only case to count; None for all of them.
-        """
-        if not self._unknown:
-            return {}
-        counts = group.counts(case)
-        known = {f"{name}{EPISODES}": counts.get(name, 0) for name in self._unknown}
-        return {"episodes": counts["episodes"]} | known
+        return with_denominators(rows, [group.counts() for group in self.groups])
 
     def case_table(self) -> list[dict[str, Any]]:
         """Return one row per policy and case."""
-        rows = []
+        rows, counts = [], []
         for group in self.groups:
             about = {"driver": group.name, "advice": group.advice, "seeds": group.seeds}
             for case in group.cases:
-                rows.append(about | {"case": case} | group.means(case) | self._partial(group, case))
-        return rows
+                rows.append(about | {"case": case} | group.means(case))
+                counts.append(group.counts(case))
+        return with_denominators(rows, counts)
 
     def unpaired(self, against: str | None) -> list[str]:
         """Return the agents without a seed in common with what they are compared with.

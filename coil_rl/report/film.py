@@ -57,11 +57,7 @@ class Film(Picture):
         self.images: dict[str, list[Image.Image]] = {}  # of each policy
         self.steps: dict[str, int] = {}  # of the env so far
         self.whole = True  # whether no frame is missing
-
-    @property
-    def watches(self) -> bool:
-        """Whether the film is made."""
-        return self.active
+        self.watches = self.active
 
     def watch(
         self,

@@ -55,11 +55,6 @@ class Figure:
     image: Markup | str
     caption: str = ""
 
-    @property
-    def inline(self) -> bool:
-        """Whether the picture is an SVG."""
-        return isinstance(self.image, Markup)
-
 
 @dataclass(frozen=True)
 class Section:
@@ -84,7 +79,6 @@ def html_page(title: str, sections: Sequence[Section]) -> str:
     return environment.from_string(text).render(
         title=title,
         sections=sections,
-        tables=lambda block: isinstance(block, Table),
         script=Markup(SCRIPT),
         digest=digest,
     )

@@ -41,13 +41,10 @@ class InTime(Picture):
     seconds if the env says its rate, else in steps.
     """
 
+    watches = True
+
     def __init__(self) -> None:
         self.traces: dict[str, Trace] = {}
-
-    @property
-    def watches(self) -> bool:
-        """Whether it needs to see the env: it does."""
-        return True
 
     def watch(
         self,

@@ -236,18 +236,6 @@ def begun(runs: Sequence[Run]) -> list[str]:
     return REPORT.said("begun", labels=sources)
 
 
-def progress(finished: int, started: int, refused: int, unstarted: int) -> list[str]:
-    """Return the sentences on the runs that the tables leave out.
-
-    Args:
-        refused: number of jobs of sweeps that were refused or failed.
-        unstarted: number of jobs of sweeps that have not begun.
-    """
-    return REPORT.said(
-        "progress", finished=finished, started=started, refused=refused, unstarted=unstarted
-    )
-
-
 def _trained(runs: Sequence[Run]) -> Iterator[tuple[str, list[Run]]]:
     """Yield each label with its runs that have a learning curve."""
     for label in dict.fromkeys(run.label for run in runs if run.curve):

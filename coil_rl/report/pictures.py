@@ -25,14 +25,11 @@ class Picture:
 
     Attributes:
         record: entries of every step that the picture needs, by name.
+        watches: whether the picture needs to see the env, by `watch`.
     """
 
     record: ClassVar[Mapping[str, NestedKey]] = {}
-
-    @property
-    def watches(self) -> bool:
-        """Whether the picture needs to see the env, by `watch`."""
-        return False
+    watches = False
 
     def watch(
         self,

@@ -16,9 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
@@ -157,10 +155,7 @@ def draw(
 ) -> None:
     """Draw all tracks and drives."""
     strokes = style.strokes(drives)
-    handles: list[Artist] = [
-        Line2D([], [], color=s.colour, ls=s.linestyle, lw=1.8, label=name)
-        for name, s in strokes.items()
-    ]
+    handles = style.handles(strokes, lw=1.8)
     cones = zip(SIDES, (style.LEFT_CONE, style.RIGHT_CONE), strict=True)
     handles += [
         marker("o", f"{side} cones", 5, mfc=colour, mec=style.INK) for side, colour in cones

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,18 +26,6 @@ PAGE = PAGES["figure_25"]
 PAPER_ACCURACY = cones.share_of(*PAGE["paper"])
 DRAW_EVERY = 4  # scans
 ARROW_LENGTH = 2.2  # of a standard deviation of a feature, on the axes of the plot
-
-
-class Clusters(NamedTuple):
-    """Clusters of the points of a scan, [N].
-
-    Attributes:
-        features: [N, 3], see `coil_rl.envs.robot.FEATURES`.
-        thick: [N], whether the cluster is a thick cone.
-    """
-
-    features: Array
-    thick: NDArray[np.bool_]
 
 
 @dataclass(eq=False)
@@ -100,18 +88,21 @@ class Figure25(Result):
         thin, thick = self._scans("left"), self._scans("right")
         training = cones.train_on_drives(thin, thick)
         cones.save_classifier(training.classifier, stem.with_name("cones.json"))
-        if self.test_drives:
-            labelled = cones.label_clusters(self.test_drives)
-            kind, clusters = "test", _drawn_clusters(labelled)
+        labelled = cones.label_clusters(self.test_drives) if self.test_drives else None
+        if labelled is not None:
+            kind, drawn = "test", labelled.scan % DRAW_EVERY == 0
+            features, is_thick = labelled.features[drawn], labelled.thick[drawn]
         else:
-            labelled = None
-            kind, clusters = "training", _training_clusters(thin, thick)
+            kind = "training"
+            sides = [cones.clusters_in_range(side, DRAW_EVERY)[0] for side in (thin, thick)]
+            features = np.concatenate(sides)
+            is_thick = np.arange(len(features)) >= len(sides[0])
         suffix = " (simulated)" if self._simulated() else ""
         draw_cone_features(
-            clusters.features,
-            clusters.thick,
+            features,
+            is_thick,
             stem.with_suffix(".png"),
-            wrong=training.classifier.classify(clusters.features) != clusters.thick,
+            wrong=training.classifier.classify(features) != is_thick,
             title=f"Figure 25: clusters of the classifier's {kind} drives{suffix}",
         )
         rows = self._shares(training, labelled)
@@ -156,23 +147,10 @@ class Figure25(Result):
                 shares[f"recall of {kind} cones"] = of_kind
         rows = []
         for measure, of_measure in shares.items():
-            for of, share in of_measure.items():
-                rows.append({"measure": measure, "of": of, **share._asdict()})
+            rows += [
+                {"measure": measure, "of": of, **of_measure[of]._asdict()} for of in of_measure
+            ]
         return rows
-
-
-def _drawn_clusters(labelled: cones.LabelledClusters) -> Clusters:
-    """Return the clusters to draw of the drives past both sides."""
-    drawn = labelled.scan % DRAW_EVERY == 0
-    return Clusters(labelled.features[drawn], labelled.thick[drawn])
-
-
-def _training_clusters(thin: Sequence[cones.Scans], thick: Sequence[cones.Scans]) -> Clusters:
-    """Return the clusters to draw of the drives past one side."""
-    thin_features, _ = cones.clusters_in_range(thin, DRAW_EVERY)
-    thick_features, _ = cones.clusters_in_range(thick, DRAW_EVERY)
-    features = np.concatenate([thin_features, thick_features])
-    return Clusters(features, np.arange(len(features)) >= len(thin_features))
 
 
 def principal_components(features: ArrayLike) -> tuple[Array, Array, Array]:

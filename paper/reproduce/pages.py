@@ -10,12 +10,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jinja2 import Environment, StrictUndefined
+
 from coil_paper.reproduce.result import PAGES
 from coil_rl.report import SIGN_FLIP_SEEDS, Estimate, Run, holm, markdown_table, p_text
 
 CLAIMS_HEADING = "### What held up"
 SIGNIFICANT = 0.05
 FOOTER = "<sub>"  # begins the origin of a page
+RESULTS = Environment(
+    undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+).from_string(PAGES["results"])
 
 
 class Claim(NamedTuple):
@@ -115,7 +120,8 @@ def page(text: str, name: str, note: str | None, origin: str) -> str:
     """
     heading, _, rest = text.partition("\n")
     picture = f"![{heading.lstrip('# ')}]({name}.png)"
-    parts = [heading, *_warning(note), picture, rest.strip(), f"{FOOTER}{origin}</sub>"]
+    warning = [f"> **{note}**"] if note else []
+    parts = [heading, *warning, picture, rest.strip(), f"{FOOTER}{origin}</sub>"]
     return "\n\n".join(parts) + "\n"
 
 
@@ -158,27 +164,17 @@ def all_results(
         known_problems: sentences on the paper's numbers.
     """
     split = [_split_claims(text) for text in pages.values() if text is not None]
-    claims = []
-    for text, table in split:
-        if table:
-            heading = text.splitlines()[0].lstrip("# ")
-            claims.append(f"**{heading}**\n\n{table}")
-    missing = [f"- `{commands[name]}`" for name, text in pages.items() if text is None]
-
-    parts = ["# Results", *_warning(note), PAGES["results"]["introduction"].format(command=command)]
-    if claims:
-        verdicts = PAGES["results"]["verdicts"].format(seeds=SIGN_FLIP_SEEDS)
-        parts += ["## What held up, and what did not", verdicts, *claims]
-    parts += [text.replace(f"> **{note}**\n\n", "").strip() for text, _ in split]
-    if missing:
-        parts += ["## Not made yet", "\n".join(missing)]
-    parts += ["## What is known about the paper's numbers", _bullets(known_problems)]
-    parts += ["## What cannot be shown here", _bullets(not_reproduced)]
-    return "\n\n".join(parts) + "\n"
-
-
-def _bullets(sentences: Iterable[str]) -> str:
-    return "\n".join(f"- {' '.join(sentence.split())}" for sentence in sentences)
+    claims = {text.splitlines()[0].lstrip("# "): table for text, table in split if table}
+    return RESULTS.render(
+        note=note,
+        command=command,
+        seeds=SIGN_FLIP_SEEDS,
+        claims=claims,
+        texts=[text.replace(f"> **{note}**\n\n", "").strip() for text, _ in split],
+        missing=[commands[name] for name, text in pages.items() if text is None],
+        known_problems=known_problems,
+        not_reproduced=not_reproduced,
+    )
 
 
 def _split_claims(text: str) -> tuple[str, str]:
@@ -188,10 +184,6 @@ def _split_claims(text: str) -> tuple[str, str]:
     if not claims:
         return text, ""
     return f"{before}{FOOTER}{origin}", claims.strip()
-
-
-def _warning(note: str | None) -> list[str]:
-    return [f"> **{note}**"] if note else []
 
 
 def _commit(described: str) -> str:

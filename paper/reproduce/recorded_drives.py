@@ -175,10 +175,8 @@ def means(rows: Sequence[Row]) -> dict[str, Any]:
     for key in ("smoothness", "off_centre"):
         together[key] = float(np.mean([row[key] for row in rows]))
     for key in ("lap_time", "corner_cut"):
-        together[key] = np.nan
-        if counts:
-            values = [row[key] for row in completed]
-            together[key] = float(np.average(values, weights=counts))
+        values = [row[key] for row in completed]
+        together[key] = float(np.average(values, weights=counts)) if counts else np.nan
     return together
 
 
@@ -193,14 +191,12 @@ def draw_drives(drives: Sequence[RecordedDrive], path: Path, title: str) -> None
     for drive in drives:
         panels.setdefault((drive.row["world"], drive.method), []).append(drive)
     strokes = style.strokes(dict.fromkeys(method for _, method in panels))
-    handles: list[Line2D] = []
-    if any(drive.track is not None for drive in drives):
-        handles += [
-            _dot("o", style.LEFT_CONE, "thin cones"),
-            _dot("o", style.RIGHT_CONE, "thick cones"),
-        ]
-    if any(drive.row["crashed"] for drive in drives):
-        handles.append(_dot("X", style.INK, "crash"))
+    dots = {
+        ("o", style.LEFT_CONE, "thin cones"): any(drive.track is not None for drive in drives),
+        ("o", style.RIGHT_CONE, "thick cones"): any(drive.track is not None for drive in drives),
+        ("X", style.INK, "crash"): any(drive.row["crashed"] for drive in drives),
+    }
+    handles = [_dot(*dot) for dot, is_shown in dots.items() if is_shown]
     rows = -(-len(panels) // 2)
     with style.picture(path, title, handles, 0.7 + 2.5 * rows) as figure:
         axes = list(figure.subplots(rows, 2, squeeze=False).flat)

@@ -106,8 +106,7 @@ class Table6(Result):
         by_name = self.recordings if isinstance(self.recordings, Mapping) else {"": self.recordings}
         files = []
         for name, paths in by_name.items():
-            for path in paths:
-                files += [(name, file) for file in _files(Path(path))]
+            files += [(name, file) for path in paths for file in _files(Path(path))]
         return files
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
@@ -115,10 +114,10 @@ class Table6(Result):
         if self.experiments or self.own:
             self.read = self._record(self._driving(runs), stem.with_name(f"{stem.name}_drives"))
             self.drives = [measure(recording) for recording in self.read]
-        rows = []
-        for drive, recording in zip(self.drives, self.read, strict=True):
-            own = smoothness(recording, self.car_length, self.max_steering)
-            rows.append({**drive.row, "smoothness": own})
+        rows = [
+            {**drive.row, "smoothness": smoothness(own, self.car_length, self.max_steering)}
+            for drive, own in zip(self.drives, self.read, strict=True)
+        ]
         write_csv(rows, stem.with_suffix(".csv"))
         suffix = " (simulated)" if any(recording.simulated for recording in self.read) else ""
         draw_drives(self.drives, stem.with_suffix(".png"), f"The driven lines{suffix}")
@@ -199,10 +198,8 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
     for world, by_method in by_world.items():
         table = [_line(method, by_seed) for method, by_seed in by_method.items()]
         parts += [*pages.world_heading(world), markdown_table(table, PAGE["columns"])]
-        parts += [
-            f"### Table 7, measured{suffix}",
-            markdown_table(table, PAGE["columns_of_table_7"]),
-        ]
+        parts.append(f"### Table 7, measured{suffix}")
+        parts.append(markdown_table(table, PAGE["columns_of_table_7"]))
         claims += [{"world": world, **row} for row in _claims(table, by_method)]
     notes = PAGE["notes"].format(max_steering=max_steering)
     if not claims:
@@ -218,9 +215,7 @@ def _line(method: str, by_seed: Mapping[str | None, Sequence[Row]]) -> Row:
     line = means(list(chain.from_iterable(by_seed.values())))
     line |= {"method": method, "seeds": None if None in by_seed else len(by_seed)}
     paper = PAPER_ROBOT.get(method, dict.fromkeys(PAPER_ROBOT["guide"]))
-    for key, value in paper.items():
-        line[f"paper {key}"] = value
-    return line
+    return line | {f"paper {key}": value for key, value in paper.items()}
 
 
 def _claims(
@@ -235,11 +230,8 @@ def _claims(
         method: {seed: means(rows) for seed, rows in by_seed.items()}
         for method, by_seed in drives.items()
     }
-    claims: list[Row] = []
-    for claim, *about in PAGE["claims"]:
-        row = _claim(of_seeds, claim, *about)
-        if row is not None:
-            claims.append(row)
+    found = [_claim(of_seeds, claim, *about) for claim, *about in PAGE["claims"]]
+    claims: list[Row] = [row for row in found if row is not None]
     crashes = [
         line for line in table if line["method"] in PAPER_ROBOT and line["crashes"] is not None
     ]
@@ -273,12 +265,9 @@ def _claim(
     if policy not in by_method or other not in by_method:
         return None
     # A policy without seeds, such as the guide, is compared with every seed.
-    without_seed = by_method[other].get(None)
-    both = []
-    for seed, row in by_method[policy].items():
-        reference = by_method[other].get(seed, without_seed)
-        if reference is not None:
-            both.append((row, reference))
+    theirs, without_seed = by_method[other], by_method[other].get(None)
+    pairs = [(row, theirs.get(seed, without_seed)) for seed, row in by_method[policy].items()]
+    both = [(row, reference) for row, reference in pairs if reference is not None]
     if not both:
         return None
     # A drive without a complete lap has not steered through every turn.
@@ -290,12 +279,10 @@ def _claim(
         "claim": claim,
         "seeds": f"{len(differences)} of {len(both)}",
         "paper": None,
-        "ours": None,
+        "ours": pages.Claim(estimate(differences), spec, sign),
     }
     if key in ("smoothness", "lap_time"):
         line["paper"] = f"{PAPER_ROBOT[policy][key] - PAPER_ROBOT[other][key]:{spec}}"
-    if len(differences):
-        line["ours"] = pages.Claim(estimate(differences), spec, sign)
     return line
 
 

@@ -5,6 +5,7 @@ exactly, so that every case is a yes or a no; next to it Q-learning without advi
 observes the state, or only its class out of a few; the guide always observes the state.
 """
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -88,9 +89,8 @@ class TabularCoil(Result):
         seeds = tqdm(range(self.worlds), unit="world", desc=stem.name, leave=False, mininterval=0.5)
         rows = [row for seed in seeds for row in self._world(seed)]
         write_csv(rows, stem.with_suffix(".csv"))
-        groups = []
-        for view in ("state", "class"):
-            groups += [self._group(rows, view, guide) for guide in self.guides]
+        pairs = itertools.product(("state", "class"), self.guides)
+        groups = [self._group(rows, view, guide) for view, guide in pairs]
         _draw(groups, self.steps, stem.with_suffix(".png"))
         table = markdown_table(groups, self._columns())
         reached, cases = sum(group["reached"] for group in groups), self.worlds * len(groups)

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -36,20 +37,19 @@ class Table1(Result):
         """Make the result, see `Result`."""
         mdp = toymaker()
         Q = value_iteration(mdp, self.tolerance).Q
-        rows = []
-        for s, a in np.ndindex(Q.shape):
-            rows.append(
-                {
-                    "state": mdp.states[s],
-                    "action": mdp.actions[a],
-                    "ours": Q[s, a],
-                    "paper": PAPER_Q[s, a],
-                    "difference": Q[s, a] - PAPER_Q[s, a],
-                }
-            )
-        write_csv(rows, stem.with_suffix(".csv"))
         difference = (Q - PAPER_Q).flatten()
-        names = [f"{row['state']}, {row['action']}" for row in rows]
+        names = [f"{state}, {action}" for state in mdp.states for action in mdp.actions]
+        frame = pd.DataFrame(
+            {
+                "state": np.repeat(mdp.states, len(mdp.actions)),
+                "action": np.tile(mdp.actions, len(mdp.states)),
+                "ours": Q.flatten(),
+                "paper": PAPER_Q.flatten(),
+                "difference": difference,
+            }
+        )
+        rows = frame.to_dict("records")
+        write_csv(rows, stem.with_suffix(".csv"))
         _draw_differences(names, difference, stem.with_suffix(".png"))
         columns = {
             "state": ("state", ""),
@@ -67,7 +67,21 @@ class Table1(Result):
             "everywhere; no such shortfall rounds to more than "
             f"{most_explained(difference)} of the printed values."
         )
-        claims = [_claim_on_advertising(Q), _claim_on_rounding(difference)]
+        gain, equal = Q[:, 1] - Q[:, 0], _equal(difference)
+        gains = "by " + " and ".join(f"{of_state:.4f}" for of_state in gain)
+        details = (
+            f"{equal} of {len(difference)} values, off by {np.abs(difference).max():.4f} at most"
+        )
+        claims = [
+            {
+                "claim": "Advertising is worth more in both states",
+                "ours": pages.certain_verdict(bool((gain > 0).all()), gains),
+            },
+            {
+                "claim": "Q to two decimals",
+                "ours": pages.certain_verdict(equal == len(difference), details),
+            },
+        ]
         section = pages.claims_section(claims, {"ours": "ours"})
         return f"## Table 1: the toymaker's Q\n\n{table}\n\n{notes}\n\n{section}"
 
@@ -75,22 +89,6 @@ class Table1(Result):
 def _equal(differences: Array) -> int:
     """Return the number of values that round to the printed ones."""
     return int((np.abs(differences) <= ROUNDING).sum())
-
-
-def _claim_on_advertising(Q: Array) -> dict[str, str]:
-    """Return the verdict on the claim that advertising is worth more, given Q [S, A]."""
-    gain = Q[:, 1] - Q[:, 0]
-    gains = "by " + " and ".join(f"{of_state:.4f}" for of_state in gain)
-    ours = pages.certain_verdict(bool((gain > 0).all()), gains)
-    return {"claim": "Advertising is worth more in both states", "ours": ours}
-
-
-def _claim_on_rounding(differences: Array) -> dict[str, str]:
-    """Return the verdict on the claim that the printed values are right."""
-    equal, largest = _equal(differences), np.abs(differences).max()
-    details = f"{equal} of {len(differences)} values, off by {largest:.4f} at most"
-    ours = pages.certain_verdict(equal == len(differences), details)
-    return {"claim": "Q to two decimals", "ours": ours}
 
 
 @checked
@@ -109,12 +107,11 @@ class Figure6(Result):
         mdp = toymaker()
         limit, history = policy_iteration(mdp).V, value_iteration(mdp).history
         error = (np.abs(history - limit) / np.abs(limit)).max(axis=1)
-        rows = []
-        for k, V in enumerate(history[: self.iterations + 1]):
-            values = dict(zip(mdp.states, V, strict=True))
-            rows.append({"iteration": k, **values, "short": error[k]})
-        write_csv(rows, stem.with_suffix(".csv"))
-        _draw_convergence(mdp.states, history[: len(rows)], limit, stem.with_suffix(".png"))
+        shown = history[: self.iterations + 1]
+        table = pd.DataFrame(shown, columns=list(mdp.states)).rename_axis("iteration")
+        table["short"] = error[: len(shown)]
+        write_csv(table.reset_index().to_dict("records"), stem.with_suffix(".csv"))
+        _draw_convergence(mdp.states, shown, limit, stem.with_suffix(".png"))
         after = history[min(PAPER_ITERATIONS, len(history) - 1)]
         reached = ", ".join(
             f"{value:.2f} of {final:.2f}" for value, final in zip(after, limit, strict=True)
@@ -136,9 +133,9 @@ def _convergence_table(error: Array) -> str:
         error: [K + 1], the largest relative error of V after each of the K iterations.
     """
     paper = f"about {PAPER_ITERATIONS}"
-    rows = []
-    for share in SHARES:
-        rows.append({"short": share, "ours": int((error > share).sum()), "paper": paper})
+    rows = [
+        {"short": share, "ours": int((error > share).sum()), "paper": paper} for share in SHARES
+    ]
     columns = {
         "short": ("short of its limit by", ".1%"),
         "ours": ("iterations", "d"),

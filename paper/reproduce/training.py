@@ -42,9 +42,7 @@ class Table4(WorldsResult):
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
         rows = {world: _returns(names, runs) for world, names in self.worlds.items()}
-        every_row = []
-        for world, of_world in rows.items():
-            every_row += [{"world": world, **row} for row in of_world]
+        every_row = [{"world": world, **row} for world, each in rows.items() for row in each]
         write_csv(every_row, stem.with_suffix(".csv"))
         tables = {world: self._table(of_world) for world, of_world in rows.items()}
         _draw_returns(rows[""], tables[""], self.against, stem.with_suffix(".png"))
@@ -84,41 +82,26 @@ class Table4(WorldsResult):
                 line[key] = estimate(values)
                 line[f"{key} cell"] = line[key].cell("+.1f" if key == "difference" else ".1f")
             table.append(line)
-        return sorted(table, key=_rank)
+        # The best first, a label without a number last.
+        return sorted(table, key=lambda line: -np.nan_to_num(line["best"].mean, nan=-np.inf))
 
     def _claims(self, tables: Mapping[str, Sequence[Row]]) -> list[Row]:
         """Return the verdicts on the claim of the paper, which is about PPO, in all worlds."""
         claims: list[Row] = []
-        if self.against != "ppo":
-            return claims
         paper = f"{PAPER_RETURNS['coil'] - PAPER_RETURNS['ppo']:+.1f}"
+        claim = "COIL's best return is above PPO's"
         for world, table in tables.items():
             for line in table:
-                if line["label"] == "coil":
-                    claims.append(
-                        {
-                            "world": world,
-                            "claim": "COIL's best return is above PPO's",
-                            "paper": paper,
-                            "ours": pages.Claim(line["difference"], "+.1f"),
-                        }
-                    )
+                if line["label"] == "coil" and self.against == "ppo":
+                    ours = pages.Claim(line["difference"], "+.1f")
+                    claims.append({"world": world, "claim": claim, "paper": paper, "ours": ours})
         return claims
 
 
 def _returns(experiments: Sequence[str], runs: Runs) -> list[Row]:
     """Return the numbers of the evaluation curve of each run of some experiments."""
-    rows: list[Row] = []
-    for run in chain.from_iterable(runs[experiment] for experiment in experiments):
-        if run.curve:
-            rows.append({"label": run.label, "seed": run.seed} | learning(run))
-    return rows
-
-
-def _rank(line: Row) -> float:
-    """Return the sort key of a label: the best mean first, a label without a number last."""
-    mean = line["best"].mean
-    return -mean if math.isfinite(mean) else math.inf
+    own = chain.from_iterable(runs[experiment] for experiment in experiments)
+    return [{"label": run.label, "seed": run.seed} | learning(run) for run in own if run.curve]
 
 
 class Figure22(WorldsResult):
@@ -150,10 +133,13 @@ class Figure22(WorldsResult):
         parts, rows, claims = ["## Figure 22: learning curves"], list[Row](), list[Row]()
         for number, (world, experiments) in enumerate(self.worlds.items(), start=1):
             of_world = list(chain.from_iterable(learned[experiment] for experiment in experiments))
-            curves = _Curves(world, self._by_label(of_world))
-            name = f"{stem.name}_{number}.png" if world else f"{stem.name}.png"
-            curves.draw(stem.with_name(name))
-            parts += curves.page(name)
+            by_label = {
+                name: [run for run in of_world if run.label == name] for name in self.labels
+            }
+            curves = _Curves(world, {name: own for name, own in by_label.items() if own})
+            picture = f"{stem.name}_{number}.png" if world else f"{stem.name}.png"
+            curves.draw(stem.with_name(picture))
+            parts += curves.page(picture)
             rows += curves.rows()
             claims += curves.claims()
         write_csv(rows, stem.with_suffix(".csv"))
@@ -161,15 +147,6 @@ class Figure22(WorldsResult):
         if claims:
             parts.append(pages.claims_section(claims, {"ours": "ours (95 %)"}))
         return "\n\n".join(parts)
-
-    def _by_label(self, runs: Sequence[Run]) -> dict[str, list[Run]]:
-        """Return the runs of each label that has some."""
-        by_label = {}
-        for label in self.labels:
-            of_label = [run for run in runs if run.label == label]
-            if of_label:
-                by_label[label] = of_label
-        return by_label
 
 
 class _Curves:
@@ -202,9 +179,9 @@ class _Curves:
         """Return the points of the mean curves."""
         rows: list[Row] = []
         for label, curve in self.means.items():
-            for point in zip(*curve, strict=True):
-                values = dict(zip(POINT, point, strict=True))
-                rows.append({"world": self.world, "label": label, **values})
+            about = {"world": self.world, "label": label}
+            points_of_curve = zip(*curve, strict=True)
+            rows += [about | dict(zip(POINT, each, strict=True)) for each in points_of_curve]
         return rows
 
     def page(self, picture: str) -> list[str]:
@@ -290,15 +267,11 @@ def _paper_table(table: Sequence[Row]) -> str:
     by_label = {line["label"]: line for line in table}
     rows: list[dict[str, Any]] = [{"source": "paper, best", **PAPER_RETURNS}]
     for key in ("best", "final"):
-        row: dict[str, Any] = {"source": f"ours, {key}"}
-        for label in PAPER_RETURNS:
-            row[label] = by_label[label][key].mean if label in by_label else None
-        rows.append(row)
+        means = {label: by_label[label][key].mean for label in PAPER_RETURNS if label in by_label}
+        rows.append({"source": f"ours, {key}", **means})
     for row in rows:
-        coil, ppo = row["coil"], row["ppo"]
-        row["ratio"] = None
-        if coil is not None and ppo is not None and ppo > 0:
-            row["ratio"] = coil / ppo - 1
+        coil, ppo = row.get("coil"), row.get("ppo")
+        row["ratio"] = coil / ppo - 1 if coil is not None and ppo is not None and ppo > 0 else None
     columns = {
         "source": ("mean over runs", ""),
         "coil": ("COIL", ".1f"),
@@ -311,10 +284,8 @@ def _paper_table(table: Sequence[Row]) -> str:
 def _draw_returns(rows: Sequence[Row], table: Sequence[Row], against: str, path: Path) -> None:
     """Draw the returns of the best and of the last policies, one row per label."""
     # One guide for all: guides with placebo advice would only stretch the axis.
-    guide = None
-    for line in table:
-        if line["label"] == against and math.isfinite(line["guide"]):
-            guide = line["guide"]
+    guides = [line["guide"] for line in table if line["label"] == against]
+    guide = guides[0] if guides and math.isfinite(guides[0]) else None
     panels: dict[str, list[Interval]] = {"best": [], "final": []}
     for key, panel in panels.items():
         for line in table:

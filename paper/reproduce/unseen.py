@@ -77,10 +77,8 @@ class Table5(WorldsResult):
         for group in (*compared.agents, *deterministic.agents):
             if not group.advice:
                 agents.setdefault(group.name, group)
-        guide = agents[self.against].guide if self.against in agents else None
-        if guide is None:
-            guide = compared.guides[0]
-        guide = replace(guide, name=GUIDE)
+        own = agents[self.against].guide if self.against in agents else None
+        guide = replace(own or compared.guides[0], name=GUIDE)
         ranked = sorted(agents.values(), key=lambda group: group.rank)
         return Comparison((guide,), tuple(replace(agent, guide=guide) for agent in ranked))
 
@@ -129,12 +127,9 @@ def _rounded(value: object) -> object:
 
 def _draw(compared: Mapping[str, Comparison], path: Path) -> None:
     """Draw the scores of the agents, a panel for each kind of actions."""
-    panels = {
-        f"{actions} actions": driver_intervals(compared[actions].agents) for actions in ACTIONS
-    }
+    panels = {f"{kind} actions": driver_intervals(compared[kind].agents) for kind in ACTIONS}
     reward = HEADING if is_relative(compared[ACTIONS[0]]) else "reward"
-    measure = f"{reward} (mean)"
-    draw_intervals(panels, path, measure=measure, title="Table 5: unseen tracks")
+    draw_intervals(panels, path, measure=f"{reward} (mean)", title="Table 5: unseen tracks")
 
 
 def _claims(worlds: Mapping[str, Mapping[str, Comparison]]) -> str:
@@ -202,18 +197,13 @@ def _paper_table(rows: Mapping[str, Sequence[Row]]) -> str:
         learned = policy in ("ppo", "coil")  # the others always act deterministically
         for actions in ACTIONS if learned else ACTIONS[:1]:
             by_name = {row["driver"]: row for row in rows[actions]}
-            if policy in by_name:
-                row = by_name[policy]
-                line = {
-                    **row,
-                    "actions": actions if learned else "the same",
-                    "ratio": row["reward"] / by_name[GUIDE]["reward"],
-                    "paper ratio": paper["reward"] / PAPER_UNSEEN[GUIDE]["reward"],
-                    "paper crashed": 0.0,
-                }
-                for measure, value in paper.items():
-                    line[f"paper {measure}"] = value
-                table.append(line)
+            if policy not in by_name:
+                continue
+            line = {**by_name[policy], **{f"paper {name}": value for name, value in paper.items()}}
+            line["actions"] = actions if learned else "the same"
+            line["ratio"] = line["reward"] / by_name[GUIDE]["reward"]
+            line["paper ratio"] = paper["reward"] / PAPER_UNSEEN[GUIDE]["reward"]
+            table.append(line | {"paper crashed": 0.0})
     columns = {"driver": ("driver", ""), "actions": ("actions", "")}
     ratio = {"ratio": ("reward / guide's", ".3f"), "crashed": ("crashed", ".0%")}
     for key, (heading, spec) in {**MEASURE_COLUMNS, **ratio}.items():

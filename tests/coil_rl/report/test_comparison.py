@@ -96,54 +96,33 @@ def test_labels_are_appended_to_guides_of_the_same_name(tmp_path):
     assert rows["guide (e)", ""]["reward"] == pytest.approx(450)
 
 
-@pytest.mark.parametrize("unit", [1e-9, 1e-4, 1.0, 1e6])
-def test_guides_are_told_apart_in_any_unit_of_the_reward(unit, tmp_path):
-    small = {"a": 3.0 * unit, "b": -0.0}
-    others = {"b": {"a": 4.0 * unit, "b": 0.0}, "c": {"a": 3.0 * unit * (1 + 1e-9), "b": 0.0}}
-    for index, label in enumerate("abc"):
-        guide = driven("guide", others.get(label, small))
-        make_run(tmp_path / str(index), label, 0, guide + driven(label, small))
-    guides = [name for name, _ in table(tmp_path) if name.startswith("guide")]
-    assert sorted(guides) == ["guide (a, c)", "guide (b)"]
-
-
-@pytest.mark.parametrize("centre", [0.0, 1e6])
-def test_one_guide_whose_returns_differ_by_rounding_is_one_guide(centre, tmp_path):
-    cases = {"a": centre + 500.00049, "b": centre - 100.0}
-    for index, label in enumerate("abc"):
+def guides_of_labels():
+    """Yield returns of the guides of some labels by case, and the names of the different guides."""
+    for unit in (1e-9, 1e-4, 1.0, 1e6):
+        of_a, of_b, of_c = 3.0 * unit, 4.0 * unit, 3.0 * unit * (1 + 1e-9)
+        yield [{"a": of_a, "b": -0.0}, {"a": of_b, "b": 0.0}, {"a": of_c, "b": 0.0}], ["a, c", "b"]
+    for centre in (0.0, 1e6):
         # On both sides of any limit of a rounded number; b is another guide by a thousandth.
-        rounded = {"a": cases["a"] + (0.6 if label == "b" else 1e-3 * index), "b": cases["b"]}
-        guide = driven("guide", rounded)
-        make_run(tmp_path / str(index), label, 0, guide + driven(label, cases))
-    guides = [name for name, _ in table(tmp_path) if name.startswith("guide")]
-    assert sorted(guides) == ["guide (a, c)", "guide (b)"]
+        yield (
+            [{"a": centre + 500.00049 + more, "b": centre - 100.0} for more in (0.0, 0.6, 2e-3)],
+            ["a, c", "b"],
+        )
+    yield [{"a": -100.0, "b": -110.0}, {"a": -130.0, "b": -110.0}], ["a", "b"]
+    diverged = [{"a": each, "b": -110.0} for each in (-100.0, -130.0, -5e6)]
+    yield diverged, ["a", "b", "c"]
+    yield [{"x": 600.0}, {"x": 601.0}, {"x": 600.001}], ["a, c", "b"]
+    yield [{"a": 500.0, "b": math.nan}] * 2, [None]
 
 
-@pytest.mark.parametrize("driver", ["guide", "c"])
-def test_guides_are_told_apart_beside_a_policy_that_diverged(driver, tmp_path):
-    for index, label in enumerate("abc"):
-        rows = {"guide": {"a": -100.0 - 30 * index, "b": -110.0}, label: {"a": -90.0, "b": -95.0}}
-        if label == "c":
-            rows[driver]["a"] = -5e6
-        drivers = [row for name, rewards in rows.items() for row in driven(name, rewards)]
-        make_run(tmp_path / label, label, 0, drivers)
-    guides = [name for name, _ in table(tmp_path) if name.startswith("guide")]
-    assert sorted(guides) == ["guide (a)", "guide (b)", "guide (c)"]
-
-
-def test_guide_of_a_single_case_is_one_guide_too(tmp_path):
-    for label, reward in {"a": 600.0, "b": 601.0, "c": 600.001}.items():
-        rows = driven("guide", {"x": reward}) + driven(label, {"x": 700.0})
-        make_run(tmp_path / label, label, 0, rows)
-    guides = [name for name, _ in table(tmp_path) if name.startswith("guide")]
-    assert sorted(guides) == ["guide (a, c)", "guide (b)"]
-
-
-def test_guide_without_a_number_in_a_case_is_one_guide(tmp_path):
-    for index, label in enumerate("ab"):
-        guide = driven("guide", {"a": 500.0, "b": math.nan})
-        make_run(tmp_path / str(index), label, 0, guide + driven(label, CASES))
-    assert [group.title for group in compare(read_runs([tmp_path])).guides] == ["guide"]
+@pytest.mark.parametrize(("guides", "expected"), guides_of_labels())
+@pytest.mark.parametrize("last", [1.0, -5e6], ids=["", "beside a policy that diverged"])
+def test_guides_are_told_apart_by_their_returns(guides, expected, last, tmp_path):
+    for label, cases in zip("abc", guides, strict=False):
+        returns = dict.fromkeys(cases, last if label == "c" else 1.0)
+        make_run(tmp_path / label, label, 0, driven("guide", cases) + driven(label, returns))
+    found = [group.title for group in compare(read_runs([tmp_path])).guides]
+    names = [f"guide ({labels})" if labels else "guide" for labels in expected]
+    assert sorted(found) == names
 
 
 def test_guide_with_random_actions_has_an_interval_over_its_different_evaluations(tmp_path):
