@@ -100,18 +100,19 @@ Shape = Annotated[list[int], AfterValidator(_shape)]
 NumberType = Annotated[str, AfterValidator(_number_type)]
 
 
-class _Input(BaseModel):
+class _Numbers(BaseModel):
+    shape: Shape
+    dtype: NumberType
+
+
+class _Input(_Numbers):
     name: str
     key: Annotated[list[str], Field(min_length=1)]
-    shape: Shape
-    dtype: NumberType
 
 
-class _State(BaseModel):
+class _State(_Numbers):
     input: str
     output: str
-    shape: Shape
-    dtype: NumberType
     first: float | list[Any]
 
     @model_validator(mode="after")
@@ -120,14 +121,9 @@ class _State(BaseModel):
         return self
 
 
-class _Space(BaseModel):
-    shape: Shape
-    dtype: NumberType
-
-
 class _Output(BaseModel):
     shape: Shape
-    space: _Space
+    space: _Numbers
     choices: list[int] = []
     lowest: list[int] = []
     bounds: dict[str, Any] | None = None

@@ -140,17 +140,17 @@ def _is_run(config: Path, folder: Path) -> bool:
 
 def _read_run(folder: Path) -> Run:
     """Return the run in a folder; without an evaluation only what its configuration says."""
-    run, measures = _read_config(folder / "config.yaml")
+    run = _read_config(folder / "config.yaml")
     rows = record.EVALUATION.read(folder)
     if rows is None:
         return run
     with file_of_a_run(folder / record.EVALUATION.name, RESTORE):
-        evaluation = _cases_of(rows, [name for name in measures if measures[name].title])
+        shown = [name for name, measure in run.measures.items() if measure.title]
+        evaluation = _cases_of(rows, shown)
     delivery = record.DELIVERY.read(folder)
     return replace(
         run,
         evaluation=evaluation,
-        measures=measures,
         curve=record.METRICS.read(folder) or [],
         guide_returns=record.GUIDE_RETURNS.read(folder) or {},
         seconds=(record.SECONDS.read(folder) or {}).get("seconds"),
@@ -159,15 +159,20 @@ def _read_run(folder: Path) -> Run:
     )
 
 
-def _read_config(path: Path) -> tuple[Run, dict[str, Measure]]:
-    """Return what the configuration of a run says: the run, and the definitions of its measures."""
+def _read_config(path: Path) -> Run:
+    """Return what the configuration of a run says."""
     try:
         config = read_yaml(path)
         if not isinstance(config, dict):
             raise ValueError("a list")
-        label, seed = str(config["label"]), int(config["seed"])
-        run = Run(path.parent, label, seed, config["method"]["needs_guide"], settings=config)
-        measures = measures_of((config.get("evaluation") or {}).get("measures") or {})
+        return Run(
+            path.parent,
+            str(config["label"]),
+            int(config["seed"]),
+            config["method"]["needs_guide"],
+            measures=measures_of((config.get("evaluation") or {}).get("measures") or {}),
+            settings=config,
+        )
     except (yaml.YAMLError, AttributeError, ValueError, TypeError, KeyError) as error:
         problem = " ".join(str(error).split())
         if isinstance(error, KeyError):
@@ -176,7 +181,6 @@ def _read_config(path: Path) -> tuple[Run, dict[str, Measure]]:
             f"{path} has no valid label, seed and method.needs_guide ({problem}); "
             "restore the file that coil-train wrote, or remove the run from the folder"
         ) from error
-    return run, measures
 
 
 def _cases_of(rows: Sequence[record.Row], shown: Iterable[str]) -> pd.DataFrame:
