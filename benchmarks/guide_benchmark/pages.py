@@ -12,7 +12,7 @@ from benchmarks.guide_benchmark.picture import ARMS, LIMIT, draw
 from benchmarks.guide_benchmark.rows import references
 from benchmarks.promise import ALONE, INTACT, PPO, arms_of, counted_verdicts
 from coil_rl.files import write_text
-from coil_rl.report import draw_learning_curves, markdown_table
+from coil_rl.report import draw_learning_curves, guide_return, markdown_table
 from coil_rl.report.page import some_of
 from coil_rl.report.runs import GUIDE, Run
 
@@ -78,11 +78,11 @@ def draw_curves(folder: Path, task: str, runs: Sequence[Run]) -> None:
         for (method, name), arm in arms.items()
         if name == INTACT or (method, name) == (PPO, ALONE)
     }
-    guide = float(np.mean([max(run.guide_returns.values()) for run in _guided(arms)] or [np.nan]))
+    intact = [run for (_, arm), each in arms.items() if arm == INTACT for run in each.runs.values()]
     draw_learning_curves(
         {method: seeds for method, seeds in curves.items() if seeds},
         folder / f"{task}.webp",
-        guides={GUIDE: guide},
+        guides={GUIDE: guide_return(intact)},
         title=f"{task}: with its intact guide",
     )
 
@@ -141,12 +141,6 @@ def _frames_to_guide(row: Row) -> float | str:
     if math.isnan(frames) or row["reached"] is None:
         return frames
     return f"{frames:.0f}{some_of(row['reached'], row['seeds'])}"
-
-
-def _guided(arms: Mapping[tuple[str, str], Any]) -> list[Run]:
-    """Return the runs with the intact guide whose return in the curve's cases is known."""
-    runs = [run for (_, arm), each in arms.items() if arm == INTACT for run in each.runs.values()]
-    return [run for run in runs if run.guide_returns]
 
 
 def write_all(folder: Path, rows: Sequence[Row]) -> str:

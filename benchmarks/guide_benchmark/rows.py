@@ -34,7 +34,7 @@ from benchmarks.promise import (
     verdict,
 )
 from coil_rl import record
-from coil_rl.report.curves import frames_until, points
+from coil_rl.report.curves import learning, points
 from coil_rl.report.runs import RETURN, Run
 
 REFERENCES = Path(__file__).parent / "references.csv"
@@ -168,16 +168,14 @@ def _learning(runs: Sequence[Run]) -> dict[str, float | None]:
 
 def _of_run(run: Run) -> dict[str, float]:
     """Return the numbers of one run; returns of the curve's cases relative to its guide."""
-    curve = points(run.curve, RETURN) if run.curve else np.zeros((0, 2))
-    guide = max(run.guide_returns.values(), default=math.nan)
-    last = run.curve[-1] if run.curve else {}
+    found, returns = learning(run), points(run.curve, RETURN)[:, 1].tolist()
     crashed = plain_episodes(run, run.label).get("crashed")
     return {
-        "frames": last.get("frames", math.nan),
-        "guide_calls": last.get("guide/calls", math.nan),
-        "first": curve[0, 1] - guide if len(curve) else math.nan,
-        "lowest": curve[:, 1].min() - guide if len(curve) else math.nan,
-        "frames_to_guide": frames_until(curve[:, 0], curve[:, 1], guide),
+        "frames": found["frames"],
+        "guide_calls": run.curve[-1].get("guide/calls", math.nan) if run.curve else math.nan,
+        "first": found["first"] - found["guide"],
+        "lowest": min(returns, default=math.nan) - found["guide"],
+        "frames_to_guide": found["until_guide"],
         "failures": math.nan if crashed is None else float(crashed.mean()),
         "seconds": math.nan if run.seconds is None else run.seconds,
     }

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from coil_rl.report.curves import draw_learning_curves as draw_learning_curves
     from coil_rl.report.curves import draw_phases as draw_phases
     from coil_rl.report.curves import frames_until as frames_until
+    from coil_rl.report.curves import guide_return as guide_return
     from coil_rl.report.curves import learning as learning
     from coil_rl.report.curves import mean_curve as mean_curve
     from coil_rl.report.curves import points as points

@@ -312,7 +312,7 @@ def learning(run: Run) -> dict[str, float]:
     curve, choice = points(run.curve, RETURN), points(run.curve, CHOICE)
     names = ("frames", "guide", "first", "final", "best", "best_at", "area", "until_guide")
     found = dict.fromkeys(names, math.nan)
-    found["guide"] = max(run.guide_returns.values(), default=math.nan)
+    found["guide"] = guide_return([run])
     if run.curve:
         found["frames"] = run.curve[-1]["frames"]
     if not len(curve):
@@ -325,6 +325,16 @@ def learning(run: Run) -> dict[str, float]:
         found["best_at"], found["best"] = curve[choice[:, 1].argmax()]
     found["until_guide"] = frames_until(at, values, found["guide"])
     return found
+
+
+def guide_return(runs: Iterable[Run]) -> float:
+    """Return the mean over runs of the return of their best guide; NaN without a guide.
+
+    Args:
+        runs: of which those count that know it, in the cases of their curves.
+    """
+    returns = [max(run.guide_returns.values()) for run in runs if run.guide_returns]
+    return float(np.mean(returns)) if returns else math.nan
 
 
 def frames_until(

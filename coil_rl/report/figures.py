@@ -5,14 +5,13 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import read_file
 from coil_rl.report import style
 from coil_rl.report.beside import BESIDE, beside_guides, draw_beside_guides
 from coil_rl.report.comparison import Comparison
-from coil_rl.report.curves import draw_curve_grid, draw_learning_curves
+from coil_rl.report.curves import draw_curve_grid, draw_learning_curves, guide_return
 from coil_rl.report.guide_use import draw_guide_use, guide_use
 from coil_rl.report.html import Figure, embedded, svg
 from coil_rl.report.intervals import draw_intervals, driver_intervals
@@ -79,15 +78,10 @@ def draw_report(
 
 def _learning_curves(runs: Sequence[Run], strokes: Mapping[str, style.Stroke]) -> Draw:
     """Return the function that draws the learning curves in the order of the table."""
-    curves: dict[str, list[Any]] = {}
-    guides: dict[str, float] = {}
-    for label in strokes:
-        trained = [run for run in runs if run.label == label]
-        returns = [max(run.guide_returns.values()) for run in trained if run.guide_returns]
-        if trained:
-            curves[label] = [run.curve for run in trained]
-        if returns:
-            guides[label] = sum(returns) / len(returns)
+    labels = {label: [run for run in runs if run.label == label] for label in strokes}
+    curves = {label: [run.curve for run in own] for label, own in labels.items() if own}
+    guides = {label: guide_return(labels[label]) for label in curves}
+    guides = {label: line for label, line in guides.items() if not math.isnan(line)}
     lines = list(guides.values())
     several_guides = not all(math.isclose(line, lines[0], rel_tol=SAME_LINE) for line in lines)
     if several_guides or len(curves) > MAX_CURVES:

@@ -20,6 +20,7 @@ from coil_rl.report import (
     draw_learning_curves,
     estimate,
     frames_until,
+    guide_return,
     learning,
     markdown_table,
     mean_curve,
@@ -163,7 +164,7 @@ class _Curves:
             label: mean_curve([run.curve for run in of_label], RETURN)
             for label, of_label in runs.items()
         }
-        self.guide = _guide_return(next(iter(runs.values())))
+        self.guide = guide_return(next(iter(runs.values())))
         self.reached = {label: _frames_to(self.guide, of_label) for label, of_label in runs.items()}
         self.title = "Figure 22: the return of the trained policies"
         if world:
@@ -241,12 +242,6 @@ class _Curves:
         seeds = sorted(ours.keys() & theirs.keys())
         more = [ours[seed] - theirs[seed] for seed in seeds]
         return pages.Claim(estimate(more), "+,.0f", -1)
-
-
-def _guide_return(runs: Sequence[Run]) -> float:
-    """Return the mean over runs of the return of their best guide; NaN without guides."""
-    returns = [max(run.guide_returns.values()) for run in runs if run.guide_returns]
-    return float(np.mean(returns)) if returns else math.nan
 
 
 def _frames_to(level: float, runs: Sequence[Run]) -> dict[int, float]:

@@ -61,6 +61,7 @@ def test_override_that_fits_only_some_runs_is_refused_before_the_first_run():
         planned("methods", overrides)
 
 
+@pytest.mark.slow
 def test_lists_are_values_of_a_sweep():
     names = [folder.name for folder in planned("paper_placebo", seeds=[3]).all_folders]
     assert [name.rpartition("_seed3")[0] for name in names] == [

@@ -114,7 +114,7 @@ def guides_of_labels():
     yield [{"a": 500.0, "b": math.nan}] * 2, [None]
 
 
-@pytest.mark.parametrize(("guides", "expected"), guides_of_labels())
+@pytest.mark.parametrize(("guides", "expected"), list(guides_of_labels()))
 @pytest.mark.parametrize("last", [1.0, -5e6], ids=["", "beside a policy that diverged"])
 def test_guides_are_told_apart_by_their_returns(guides, expected, last, tmp_path):
     for label, cases in zip("abc", guides, strict=False):
