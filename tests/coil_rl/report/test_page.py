@@ -1,6 +1,7 @@
 import math
 from pathlib import Path
 
+import pytest
 from run_folders import driven, make_run, make_sweep
 
 from coil_rl.record import UNTESTED
@@ -74,33 +75,28 @@ def test_policies_without_a_common_seed_are_said(tmp_path):
         assert page.unpaired(against, {"deterministic": comparison}) == []
 
 
-def test_terms_of_the_reward_are_beside_the_sum(tmp_path):
-    rows = driven("guide", {"a": 1.0}, reward_cone=2.0, reward_smooth=-1.0)
-    make_run(
-        tmp_path / "run",
-        "coil",
-        0,
-        rows + driven("coil", {"a": 2.5}, reward_cone=2.75, reward_smooth=-0.25),
-    )
-    terms = cells(section(tmp_path)[1])
-    assert terms == [
-        ["term of the reward", "cone", "smooth"],
-        ["guide", "2.00", "-1.00"],
-        ["coil", "2.75", "-0.25"],
-    ]
-
-
-def test_tasks_have_their_own_table(tmp_path):
-    for seed, left in enumerate((0.5, 1.0)):
-        rows = driven("guide", {"a": 1.0}, per_step_left=0.25, per_step_right=float("nan"))
-        rows += driven("coil", {"a": 2.0}, per_step_left=left, per_step_right=-0.125)
+@pytest.mark.parametrize(
+    ("prefix", "guide", "shown"),
+    [
+        (
+            "reward_",
+            (2.0, -1.0),
+            ["term of the reward left right", "guide 2.00 -1.00", "coil 0.62 -0.12"],
+        ),
+        (
+            "per_step_",
+            (0.25, math.nan),
+            ["reward of a step left right", "guide 0.250 -", "coil 0.625 -0.125"],
+        ),
+    ],
+)
+def test_parts_of_the_reward_have_their_own_table(prefix, guide, shown, tmp_path):
+    names = [f"{prefix}left", f"{prefix}right"]
+    for seed, agent in enumerate([(0.5, -0.125), (0.75, -0.125)]):
+        rows = driven("guide", {"a": 1.0}, **dict(zip(names, guide, strict=True)))
+        rows += driven("coil", {"a": 2.0}, **dict(zip(names, agent, strict=True)))
         make_run(tmp_path / f"run_{seed}", "coil", seed, rows)
-    tasks = cells(section(tmp_path)[1])
-    assert tasks == [
-        ["reward of a step", "left", "right"],
-        ["guide", "0.250", "-"],
-        ["coil", "0.750", "-0.125"],
-    ]
+    assert [" ".join(row) for row in cells(section(tmp_path)[1])] == shown
 
 
 def test_returns_of_trained_guides_are_shown_before_and_after(tmp_path):
