@@ -56,13 +56,16 @@ def describe(
     """
     plant = controller.plant
     known = meanings_of(plant)
+    rate: dict[str, Any] | None = None
+    if not math.isnan(getattr(plant, "rate", math.nan)):
+        rate = {"value": float(plant.rate), "unit": "steps per second"}
     for name, value in meanings.items():
         known[name] = known.get(name, {}) | meaning(name, value)
     return {
         "format": FORMAT,
         "version": VERSION,
         "policy": _policy(run, which, guide_itself(controller, step)),
-        "env": {"title": title_of(plant), "control_rate": _rate(plant)},
+        "env": {"title": title_of(plant), "control_rate": rate},
         "batch": "any number of rows; the first dimension of every input and output",
         "inputs": [_input(entry, plant, step, known) for entry in step.inputs],
         "outputs": [_action(plant, step, known)],
@@ -125,11 +128,6 @@ def _policy(run: Run, which: str, guide: str | None) -> dict[str, Any]:
         "acts": acts,
         "actions": "deterministic",
     }
-
-
-def _rate(plant: Any) -> dict[str, Any] | None:
-    rate = float(getattr(plant, "rate", math.nan))
-    return None if math.isnan(rate) else {"value": rate, "unit": "steps per second"}
 
 
 def _numbers(values: Any) -> Any:

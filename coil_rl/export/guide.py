@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.envs import TensorDictPrimer
 
@@ -45,7 +45,9 @@ class ExportedGuide(ToldGuide):
                 f"({contract['guide']['reason']}); take the run itself: guide=learned "
                 "guide.learned.run=RUN"
             )
-        self.read: list[NestedKey] = [_key(entry["key"]) for entry in contract["inputs"]]
+        self.read: list[NestedKey] = [
+            unravel_key(tuple(entry["key"])) for entry in contract["inputs"]
+        ]
         self.memory = {f"exported_{entry['input']}": entry for entry in contract["state"]}
         self.in_keys = [*self.read, *self.memory]
         self.out_keys: list[NestedKey] = ["action", *(("next", name) for name in self.memory)]
@@ -90,10 +92,6 @@ class ExportedGuide(ToldGuide):
             f"{self.exported.file} is a policy for {title}, which this env is not: {problem}; give "
             "the env that its contract.json names"
         )
-
-
-def _key(parts: list[str]) -> NestedKey:
-    return parts[0] if len(parts) == 1 else tuple(parts)
 
 
 def _array(tensor: Tensor, dtype: str) -> NDArray[Any]:

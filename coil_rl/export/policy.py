@@ -209,7 +209,8 @@ def _row(value: Any, entry: Mapping[str, Any]) -> NDArray[Any]:
     """Return the value of an input with the batch dimension, [1, ...]."""
     shape = tuple(entry["shape"])
     given = np.asarray(value)
-    if given.size != np.prod(shape, dtype=int) or not _fits(given.shape, shape):
+    # Dimensions of 1 may be left out.
+    if [n for n in given.shape if n != 1] != [n for n in shape if n != 1]:
         raise ValueError(
             f"{entry['name']} has the shape {list(given.shape)}, but must have {list(shape)}"
         )
@@ -250,8 +251,3 @@ def _chosen(
             f"{list(lowest)} on"
         )
     return places.astype(np.int64)
-
-
-def _fits(given: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Return whether two shapes are the same but for dimensions of 1."""
-    return [n for n in given if n != 1] == [n for n in shape if n != 1]

@@ -238,7 +238,8 @@ class Comparison:
         """
         rows: list[dict[str, Any]] = []
         for group in self.groups:
-            means, pairs = group.means(), self._pairs(group, against)
+            means, other = group.means(), self._other(group, against)
+            pairs = None if other is None else paired(group, other)
             difference = pairs.difference if pairs else Estimate(np.nan)
             rows.append(
                 {
@@ -290,11 +291,6 @@ class Comparison:
             if other is not None and not group.advice and not group.beside(other)[0]:
                 names.append(group.name)
         return names
-
-    def _pairs(self, group: Group, against: str | None) -> Paired | None:
-        """Return the comparison of a policy with `against`; None if they cannot be compared."""
-        other = self._other(group, against)
-        return None if other is None else paired(group, other)
 
     def _other(self, group: Group, against: str | None) -> Group | None:
         """Return the policy that a group is compared with; None if there is none."""

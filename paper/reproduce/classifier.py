@@ -97,7 +97,8 @@ class Figure25(Result):
             sides = [cones.clusters_in_range(side, DRAW_EVERY)[0] for side in (thin, thick)]
             features = np.concatenate(sides)
             is_thick = np.arange(len(features)) >= len(sides[0])
-        suffix = " (simulated)" if self._simulated() else ""
+        recordings = chain.from_iterable(self.recordings.values())
+        suffix = " (simulated)" if any(each.simulated for each in recordings) else ""
         draw_cone_features(
             features,
             is_thick,
@@ -119,11 +120,6 @@ class Figure25(Result):
         ) as bar:
             made = record_labelling_drives(folder, self.pairs, self.tests, bar.update)
         self._read(made["left"], made["right"], made["both"])
-
-    def _simulated(self) -> bool:
-        """Return whether any recording is of a simulated robot."""
-        recordings = chain.from_iterable(self.recordings.values())
-        return any(recording.simulated for recording in recordings)
 
     def _scans(self, side: str) -> list[cones.Scans]:
         """Return ranges and angles of the scans of each drive past one side."""

@@ -112,7 +112,10 @@ class Table6(Result):
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
         if self.experiments or self.own:
-            self.read = self._record(self._driving(runs), stem.with_name(f"{stem.name}_drives"))
+            trained = {experiment: runs[experiment] for experiment in self.experiments}
+            found = {} if self.own else runs_by_label(self.labels, trained)
+            driving = self.own or list(chain.from_iterable(found.values()))
+            self.read = self._record(driving, stem.with_name(f"{stem.name}_drives"))
             self.drives = [measure(recording) for recording in self.read]
         rows = [
             {**drive.row, "smoothness": smoothness(own, self.car_length, self.max_steering)}
@@ -122,13 +125,6 @@ class Table6(Result):
         suffix = " (simulated)" if any(recording.simulated for recording in self.read) else ""
         draw_drives(self.drives, stem.with_suffix(".png"), f"The driven lines{suffix}")
         return robot_page(rows, suffix, self.max_steering)
-
-    def _driving(self, runs: Runs) -> list[Run]:
-        """Return the runs whose agents drive: the given ones, or those with the labels."""
-        if self.own:
-            return self.own
-        trained = {experiment: runs[experiment] for experiment in self.experiments}
-        return list(chain.from_iterable(runs_by_label(self.labels, trained).values()))
 
     def _record(self, runs: Sequence[Run], folder: Path) -> list[Recording]:
         """Record the drives of the guide and of all agents in all worlds."""
