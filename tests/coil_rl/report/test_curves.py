@@ -101,16 +101,6 @@ def test_runs_are_averaged_over_their_common_frames():
     )
 
 
-def test_interval_of_the_mean_has_its_coverage():
-    hits = 0
-    for values in np.random.default_rng(0).normal(size=(100, 20)):
-        _, _, low, high = mean_curve(
-            [[{"frames": 1, RETURN: float(value)}] for value in values], RETURN
-        )
-        hits += bool(low[0] <= 0 <= high[0])
-    assert 0.88 < hits / 100 < 0.98
-
-
 def test_frames_until_a_level_are_interpolated():
     frames, returns = [0, 100, 200, 300], [0.0, 50.0, 40.0, 90.0]
     assert [frames_until(frames, returns, level) for level in (50, 65, -1)] == [100, 250, 0]
