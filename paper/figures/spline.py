@@ -15,7 +15,7 @@ import torch
 from matplotlib.lines import Line2D
 from scipy.interpolate import make_smoothing_spline
 
-from coil_paper.figures.ego_view import Array, marker, output_folder
+from coil_paper.figures.ego_view import marker, output_folder, rows
 from coil_rl.envs import shipped_track, smoothing_spline
 from coil_rl.report import markdown_table, style
 
@@ -40,7 +40,7 @@ def main() -> None:
         marker("o", "noisy cone", 7, mfc="none", mec=style.INK, mew=0.9),
         marker("+", "true cone", 6, color=style.QUIET),
     ]
-    rows = []
+    fits = []
     with style.picture(
         path, "The smoothing spline for several λ, and SciPy's", handles, height=6.2
     ) as figure:
@@ -56,7 +56,7 @@ def main() -> None:
             u = spline.knots[:, 0].numpy()
             reference = make_smoothing_spline(u, points, lam=smoothing)
             curve, expected = (
-                _rows(spline.equidistant(CURVE_POINTS)),
+                rows(spline.equidistant(CURVE_POINTS)[..., 0]),
                 reference(np.linspace(0, u[-1], CURVE_POINTS)),
             )
             plane.plot(*curve.T, zorder=3, **line)
@@ -65,12 +65,12 @@ def main() -> None:
             bends.plot(
                 u, np.hypot(*reference.derivative(2)(u).T), ".", ms=3, color=style.INK, zorder=4
             )
-            rows.append(
+            fits.append(
                 {
                     "smoothing": smoothing,
                     "difference": np.hypot(*(curve - expected).T).max(),
-                    "residual": ((_rows(spline.values) - points) ** 2).sum(),
-                    "error": np.sqrt(((_rows(spline.values) - cones) ** 2).sum(1).mean()),
+                    "residual": ((rows(spline.values[..., 0]) - points) ** 2).sum(),
+                    "error": np.sqrt(((rows(spline.values[..., 0]) - cones) ** 2).sum(1).mean()),
                 }
             )
         bends.set(
@@ -85,12 +85,7 @@ def main() -> None:
         "residual": ("residual sum (m²)", ".4f"),
         "error": ("RMS distance from the true cones (m)", ".3f"),
     }
-    print(f"{markdown_table(rows, columns)}\n{path}")
-
-
-def _rows(points: torch.Tensor) -> Array:
-    """Return points [2, N, 1] as [N, 2]."""
-    return points[..., 0].t().numpy()
+    print(f"{markdown_table(fits, columns)}\n{path}")
 
 
 if __name__ == "__main__":
