@@ -17,7 +17,6 @@ from coil_rl.files import read_text
 LARGEST_FILE = 200_000  # bytes; the configuration of a run has about 5,000
 DEEPEST = 32  # levels
 FLOAT = re.compile(r"([-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)([eE][-+]?\d+)?|[-+]?\.(inf|Inf|INF))$")
-TEXT = "tag:yaml.org,2002:str"
 
 
 class _Loader(yaml.SafeLoader):
@@ -40,19 +39,12 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-_Loader.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, list("-+0123456789."))
-
-
 class _Dumper(yaml.SafeDumper):
     """Writes texts that could be read as numbers, such as 1e3, in quotes."""
 
 
-def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
-    style = "'" if FLOAT.fullmatch(text) else None
-    return dumper.represent_scalar(TEXT, text, style=style)
-
-
-_Dumper.add_representer(str, _represent_text)
+for each in (_Loader, _Dumper):
+    each.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, list("-+0123456789."))
 
 
 def read_yaml(path: Path) -> Any:

@@ -117,9 +117,8 @@ def draw(outcome: Outcome, cases: int | None, path: Path) -> None:
     known = [run.guide_returns for runs in outcome.runs.values() for run in runs]
     guides = next(filter(None, known), {})
     curves = {name: [run.curve for run in runs] for name, runs in outcome.runs.items()}
-    if curves:
-        least = lowest_shown(outcome.entries)
-        draw_learning_curves(curves, path, guides=guides, cases=cases, least=least)
+    least = lowest_shown(outcome.entries)
+    draw_learning_curves(curves, path, guides=guides, cases=cases, least=least)
 
 
 def lowest_shown(entries: Mapping[str, Entry]) -> float | None:

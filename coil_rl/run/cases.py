@@ -14,7 +14,7 @@ from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, totals_of
-from coil_rl.run.exploration import Exploring, noise_of
+from coil_rl.run.exploration import exploring
 from coil_rl.run.parts import SOME_ROWS
 from coil_rl.run.policy_batch import Acting, OnRows, memory_keys, traced
 from coil_rl.transforms import GuideActions
@@ -154,8 +154,7 @@ class TrainingCases:
             samples: whether it samples its actions.
             parts: number of equal parts of the rows, on one of which it acts.
         """
-        noise = noise_of(env, self.noise_correlation, parts) if samples else None
-        return policy if noise is None else Exploring(policy, noise)
+        return exploring(policy, env, self.noise_correlation, parts) if samples else policy
 
     def _can_act_beside(self, policies: Sequence[TensorDictModuleBase]) -> bool:
         """Return whether policies can act side by side in one env."""

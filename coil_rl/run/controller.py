@@ -58,6 +58,8 @@ class Controller:
             raise ValueError(f"a controller needs an env of one row, not {list(env.batch_size)}")
         self.env, self.policy = env.eval(), policy
         self.plant, self.folder, self.which = env.base_env, folder, which
+        plants = self.plant.held.plants if isinstance(self.plant, GymnasiumEnv) else []
+        self.beside = [name for plant in plants[:1] for name in plant.controllers]
         rest_guides(policy, self.env, ())
         self.chain = Chain(self.env, policy)
         # Those that demonstrated are left out.
@@ -73,7 +75,7 @@ class Controller:
 
         The env that only converts is the same.
         """
-        if isinstance(self.plant, GymnasiumEnv) and self.plant.held.plants[0].controllers:
+        if self.beside:
             raise ValueError("a policy that reads a controller beside its env cannot be copied")
         outer = {id(self.env): None, id(self.plant): None}
         env = TransformedEnv(self.plant, copy.deepcopy(self.env.transform, outer))
@@ -139,11 +141,10 @@ class Controller:
                     f"{'/'.join(key)} is read by the policy or its guide, but is no part of an "
                     "observation"
                 )
-        if isinstance(self.plant, GymnasiumEnv) and self.plant.held.plants[0].controllers:
-            names = ", ".join(self.plant.held.plants[0].controllers)
+        if self.beside:
             warnings.warn(
-                f"the controller {names} belongs to an env of its own, in which nothing happens: "
-                "its advice is right only if it reads nothing but the observation",
+                f"the controller {', '.join(self.beside)} belongs to an env of its own, in which "
+                "nothing happens: its advice is right only if it reads nothing but the observation",
                 stacklevel=3,
             )
 

@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.errors import UserError
 from coil_rl.foreign.batch import optional_entries
-from coil_rl.run.exploration import noise_of
+from coil_rl.run.exploration import Exploring, exploring
 from coil_rl.run.lean_steps import LeanSteps
 from coil_rl.transforms.guide_transform import set_progress
 
@@ -28,7 +28,7 @@ class Rollout:
         steps: T, length of a batch.
         keys: entries to keep, those after a step as `("next", ...)`; all by default.
         noise_correlation: of the noise of continuous actions in consecutive steps, at most 1. Each
-            action alone has the distribution that the policy gives, see `CorrelatedNoise`.
+            action alone has the distribution that the policy gives, see `Exploring`.
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -54,7 +54,7 @@ class Rollout:
         self.lean: LeanSteps | None = None
         if self.keys is not None and LeanSteps.covers(env, policy, self.keys):
             self.lean = LeanSteps(env, policy, self.keys)
-        self.noise = noise_of(env, noise_correlation)
+        self.acts = exploring(policy, env, noise_correlation)
         self.carrier: TensorDictBase | None = None
         self.taken = 0  # steps of each row
 
@@ -103,8 +103,8 @@ class Rollout:
         carrier = acting = self.acting if lean is None else lean.carry(self.acting)
         try:
             for _ in range(self.steps):
-                acting = self._with_noise(carrier)
-                acting = self.policy(acting)
+                acting = carrier
+                acting = self.acts(acting)
                 step, carrier = take(acting)
                 for key in self.keys or step.keys(True, True):
                     columns.setdefault(key, []).append(step[key])
@@ -112,10 +112,6 @@ class Rollout:
             self.acting = acting if lean is None else lean.data(acting)
             raise
         return carrier if lean is None else lean.data(carrier)
-
-    def _with_noise(self, carrier: Any) -> Any:
-        """Write the exploration noise of the next step, where it is correlated."""
-        return carrier if self.noise is None else self.noise.write(carrier)
 
     def _stacked(self, columns: Mapping[NestedKey, list[Tensor]]) -> TensorDictBase:
         time = len(self.env.batch_size)
@@ -131,7 +127,7 @@ class Rollout:
             "env": self.base_env.state_dict(),
             "transforms": self.env.state_dict() if self.base_env is not self.env else {},
             "carrier": None if self.carrier is None else self.carrier.to_dict(),
-            "noise": None if self.noise is None else self.noise.last,
+            "noise": self.acts.last if isinstance(self.acts, Exploring) else None,
             "taken": self.taken,
         }
 
@@ -157,8 +153,8 @@ class Rollout:
             self.carrier = TensorDict.from_dict(
                 carrier, batch_size=self.env.batch_size, device=self.env.device
             )
-        if self.noise is not None and state["noise"] is not None:
-            self.noise.last = state["noise"].to(self.env.device)
+        if isinstance(self.acts, Exploring) and state["noise"] is not None:
+            self.acts.last = state["noise"].to(self.env.device)
         self.taken = state["taken"]
 
 
