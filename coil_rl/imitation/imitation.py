@@ -116,6 +116,7 @@ class Imitation(Learner):
         if self.kept_key is not None:
             self.keys.append(self.kept_key)
         self.validate, self.seed, self.device = validate, seed, env.device
+        self.validates_groups = validate and self.group_key is not None
         self.dataset: TensorDictBase | None = None
         if dataset is not None:
             self.dataset = self._load(Path(dataset), env)
@@ -160,11 +161,6 @@ class Imitation(Learner):
         self.regressor.fit(x, y)
         with torch.no_grad():
             return metrics | scores([self.regressor(x)], [y], "training")
-
-    @property
-    def validates_groups(self) -> bool:  # type: ignore[override]
-        """Whether an update validates on tracks that it leaves out."""
-        return self.validate and self.group_key is not None
 
     def export(self, folder: Path) -> None:
         """Save the data set as `dataset.pt` in the folder of a run."""

@@ -135,10 +135,6 @@ class ShownAdvice(TensorDictModuleBase):
         super().__init__()
         self.hold = hold
 
-    def reads(self, keys: Sequence[NestedKey]) -> list[NestedKey]:
-        """Return the keys that a network reads in place of `keys`."""
-        return [self.out_keys[0] if key == self.in_keys[0] else key for key in keys]
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the shown advice."""
         advice = tensordict[self.in_keys[0]]
@@ -169,12 +165,6 @@ class AnchoredInputs(TensorDictModuleBase):
         hold: Hold = self.parts[-1].hold  # type: ignore[assignment]
         return hold
 
-    def reads(self, keys: Sequence[NestedKey]) -> list[NestedKey]:
-        """Return the keys that a network reads in place of `keys`."""
-        for part in self.parts:
-            keys = part.reads(keys)  # type: ignore[operator]
-        return list(keys)
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the entries."""
         for part in self.parts:
@@ -197,13 +187,8 @@ class AnchoredSample(Sample):
 
     def __init__(self, sample: Sample, hold: Hold, anchor: Anchor, action_key: NestedKey) -> None:
         kind, options = sample.distribution_class, sample.distribution_kwargs
-        super().__init__(sample.in_keys, UNCLIPPED, kind, options)
-        self.hold, self.anchor, self.action_key = hold, anchor, action_key
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Keys of the entries that `forward` writes."""
-        return [*super().out_keys, self.action_key]
+        super().__init__(sample.in_keys, UNCLIPPED, kind, options, action_key)
+        self.hold, self.anchor = hold, anchor
 
     def write_action(self, entries: Any) -> None:
         """Write the action of the own part and the advice in some entries [*batch]."""

@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.learners.encoders import ACTIVATIONS, ConcatObservations, Mlp
 from coil_rl.learners.networks import Inputs, action_shape
+from coil_rl.learners.policy import read_through
 
 Norm = Literal["none", "layer", "batch"]
 
@@ -116,7 +117,7 @@ class Critics(TensorDictModuleBase):
         inputs: Inputs | None = None,
     ) -> None:
         keys: list[NestedKey] = [*in_keys, "action"]
-        self.in_keys = keys if inputs is None else inputs.reads(keys)
+        self.in_keys = read_through(inputs, keys)
         self.out_keys: list[NestedKey] = [("next", "uncertainty")]
         super().__init__()
         self.count, self.dropout = count, dropout

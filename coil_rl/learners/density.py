@@ -18,7 +18,9 @@ LOG_ROOT = math.log(math.sqrt(2 * math.pi))  # of a normal density
 
 
 class Density(ABC):
-    """A distribution of actions for each row of a batch."""
+    """A distribution of actions, of `event_dims` dimensions, for each row of a batch."""
+
+    event_dims: int
 
     @abstractmethod
     def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -45,6 +47,10 @@ class Density(ABC):
     @abstractmethod
     def divergence(self, other: "Density") -> Tensor:
         """Return the divergence KL(self || other) [*batch] from a distribution of this kind."""
+
+    def summed(self, values: Tensor) -> Tensor:
+        """Return the sums over the numbers or choices of an action."""
+        return values.flatten(-self.event_dims).sum(-1) if self.event_dims else values
 
     def rsample_and_log_prob(self, shape: torch.Size = torch.Size()) -> tuple[Tensor, Tensor]:  # noqa: B008
         """Return what `draw` does; TorchRL's losses call it so, with an empty shape."""
@@ -74,25 +80,17 @@ class Normal(Density):
         log_prob = self.summed(-noise.square() / 2 - self.scale.log() - LOG_ROOT)
         return self.loc + noise * self.scale, log_prob
 
-    def density(self, number: Tensor) -> Tensor:
-        """Return the logarithmic normal density [*batch] of numbers."""
-        squares = -(number - self.loc).square() / (2 * self.scale.square())
-        return self.summed(squares - self.scale.log() - LOG_ROOT)
-
-    def summed(self, values: Tensor) -> Tensor:
-        """Return the sums over the numbers of an action."""
-        return values.flatten(-self.event_dims).sum(-1) if self.event_dims else values
-
     def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return a sample and its logarithmic density."""
         if noise is None:
             return self.drawn()
         number = self.loc + noise * self.scale
-        return number, self.density(number)
+        return number, self.log_prob(number)
 
     def log_prob(self, sample: Tensor) -> Tensor:
         """Return the logarithmic density of a sample."""
-        return self.density(sample)
+        squares = -(sample - self.loc).square() / (2 * self.scale.square())
+        return self.summed(squares - self.scale.log() - LOG_ROOT)
 
     def entropy(self) -> Tensor:
         """Return the entropy."""
@@ -139,7 +137,7 @@ class SquashedNormal(Normal):
     def log_prob(self, sample: Tensor) -> Tensor:
         """Return the logarithmic density of a sample."""
         number = self._clamp(self.unit(sample)).atanh()
-        return self.density(number) - self._stretch(number)
+        return super().log_prob(number) - self._stretch(number)
 
     def entropy(self) -> Tensor:
         """Return an estimate of the entropy by one sample."""
@@ -192,23 +190,15 @@ class Choices(Density):
     def __init__(self, logits: Tensor, event_dims: int = 0) -> None:
         self.logits, self.event_dims = logits - logits.logsumexp(-1, keepdim=True), event_dims
 
-    def summed(self, values: Tensor) -> Tensor:
-        """Return the sums over the choices of an action."""
-        return values.flatten(-self.event_dims).sum(-1) if self.event_dims else values
-
     def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return indices and their logarithmic probability; noise is not for choices."""
         rows = self.logits.softmax(-1).reshape(-1, self.logits.shape[-1])
         drawn = torch.multinomial(rows, 1, True).T.reshape(self.logits.shape[:-1])
-        return drawn, self.of_index(drawn)
-
-    def of_index(self, index: Tensor) -> Tensor:
-        """Return the logarithmic probability of indices."""
-        return self.summed(self.logits.gather(-1, index.long().unsqueeze(-1)).squeeze(-1))
+        return drawn, Choices.log_prob(self, drawn)
 
     def log_prob(self, sample: Tensor) -> Tensor:
         """Return the logarithmic probability of a sample."""
-        return self.of_index(sample)
+        return self.summed(self.logits.gather(-1, sample.long().unsqueeze(-1)).squeeze(-1))
 
     def entropy(self) -> Tensor:
         """Return the entropy."""
@@ -247,7 +237,7 @@ class OneHotChoice(Choices):
 
     def log_prob(self, sample: Tensor) -> Tensor:
         """Return the logarithmic probability of a one-hot option."""
-        return self.of_index(sample.argmax(-1))
+        return super().log_prob(sample.argmax(-1))
 
     @property
     def mode(self) -> Tensor:

@@ -23,7 +23,7 @@ from coil_rl.learners.anchor import AnchoredInputs, AnchoredValues, hold_of
 from coil_rl.learners.encoders import Mlp, ObservationNetwork, without_memory
 from coil_rl.learners.n_step import discount
 from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerStep
-from coil_rl.learners.policy import Entries, next_of
+from coil_rl.learners.policy import Entries, next_of, read_through
 from coil_rl.learners.weights import Weights
 from coil_rl.ranges import NonNegative, Positive, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
@@ -99,31 +99,28 @@ class DQN(OffPolicy):
         numbers = ObservationNetwork(
             env, in_keys, network, single.space.n, action_gain, dtype=env.reward_spec.dtype
         )
-        keys = in_keys if self.inputs is None else self.inputs.reads(in_keys)
-        values = networks.FastTensorDictModule(numbers, keys, ["action_value"])
-        self.network = TensorDictSequential(values, QValueModule(spec=single))
+        keys = read_through(self.inputs, in_keys)
+        self.values = networks.FastTensorDictModule(numbers, keys, ["action_value"])
+        self.choice = QValueModule(spec=single)
         first = float(self.epsilon(0))
         if self.anchor is not None:  # of the first batch; whether a guide is held is not known yet
             first = min(first, HELD_EPSILON)
         self.explorer = EGreedyModule(single, eps_init=first, eps_end=0.0, device=env.device)
-        self.policy = self.build_policy(env)
-        self.double, (self.values, _) = double, self.network.module
+        self.policy, self.double = self.build_policy(), double
         self.target = copy.deepcopy(self.values).requires_grad_(False)
         self.of_values, self.of_target = Weights(self.values), Weights(self.target)
         buffers = [*self.values.buffers(), *self.target.buffers()]
         self.set_update([self.of_values.vector], [self.of_target.vector, *buffers])
-        self.extend([])
 
-    def build_policy(self, env: EnvBase) -> TensorDictSequential:
+    def build_policy(self) -> TensorDictSequential:
         """Return the policy: values, perhaps a bonus for the advised action, choice and noise."""
         modules: list[TensorDictModuleBase] = [] if self.inputs is None else [self.inputs]
-        values, choice = self.network.module
-        modules.append(values)
+        modules.append(self.values)
         if self.anchor is not None and isinstance(self.inputs, AnchoredInputs):
             bonus = AnchoredValues(self.inputs.hold, self.anchor.choice_weight)
             keys = [self.anchor.advice_key, "action_value"]
             modules.append(networks.FastTensorDictModule(bonus, keys, ["action_value"]))
-        return TensorDictSequential(*modules, choice, self.explorer)
+        return TensorDictSequential(*modules, self.choice, self.explorer)
 
     @torch.no_grad()
     def after_update(self) -> None:

@@ -8,7 +8,7 @@ shrinks from each phase to the next of its kind.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, astuple, dataclass
-from typing import Annotated, Any, Literal, Unpack
+from typing import Annotated, Any, ClassVar, Literal, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -18,6 +18,7 @@ from torch.func import functional_call
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.encoders import Mlp
+from coil_rl.learners.learner import Stateful
 from coil_rl.learners.policy import Entries, Policy
 from coil_rl.learners.ppo import PPO, PPOSettings
 from coil_rl.ranges import Count, Interval, NonNegative, Seed, checked
@@ -90,7 +91,7 @@ class AtConvergence:
 
 @checked
 @dataclass(eq=False)
-class PhaseSchedule:
+class PhaseSchedule(Stateful):
     """The order of the phases.
 
     Args:
@@ -109,6 +110,8 @@ class PhaseSchedule:
         frames: in the present phase so far.
         rewards: mean reward per step of each update in the present phase.
     """
+
+    parts: ClassVar[tuple[str, ...]] = ("number", "frames", "rewards", "generator")
 
     guides: Count
     _: KW_ONLY
@@ -150,13 +153,11 @@ class PhaseSchedule:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position in the schedule."""
-        position = {"number": self.number, "frames": self.frames, "rewards": list(self.rewards)}
-        return position | {"phase": astuple(self.phase), "generator": self.generator.get_state()}
+        return super().state_dict() | {"phase": astuple(self.phase)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict`; one with other guides is a `ValueError`."""
-        self.number, self.frames = int(state["number"]), int(state["frames"])
-        self.rewards = [float(reward) for reward in state["rewards"]]
+        super().load_state_dict(state)
         agent, guides, earlier = state["phase"]
         if not set(guides) <= set(range(self.guides)):
             raise ValueError(
@@ -164,7 +165,6 @@ class PhaseSchedule:
                 f"{self.guides}"
             )
         self.phase = Phase(bool(agent), tuple(guides), int(earlier))
-        self.generator.set_state(state["generator"])
 
 
 @checked

@@ -49,3 +49,77 @@ class Extension:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state that `state_dict` returned."""
+
+
+class Extensions(Extension):
+    """Several extensions as one; they act one after the other.
+
+    Args:
+        each: in the order in which they act.
+    """
+
+    def __init__(self, each: Sequence[Extension]) -> None:
+        self.each = each
+
+    @property
+    def keys(self) -> Sequence[NestedKey]:
+        """Entries that any of them reads."""
+        return [key for each in self.each for key in each.keys]
+
+    def prepare(self, batch: TensorDictBase) -> None:
+        """Change a batch [B, T] in place."""
+        for extension in self.each:
+            extension.prepare(batch)
+
+    @property
+    def has_losses(self) -> bool:
+        """Whether any of them adds losses."""
+        return any(type(each).losses is not Extension.losses for each in self.each)
+
+    def losses(
+        self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase
+    ) -> dict[str, Tensor]:
+        """Return the losses of all by name, scalars, for a minibatch [N]."""
+        losses: dict[str, Tensor] = {}
+        for extension in self.each:
+            losses |= extension.losses(policy, minibatch)
+        return losses
+
+    def weights(self, weights: dict[str, float], progress: float) -> dict[str, float]:
+        """Return the weights of all losses."""
+        for extension in self.each:
+            weights = extension.weights(weights, progress)
+        return weights
+
+    def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+        """Let all act after an update, and return their metrics by name."""
+        metrics: dict[str, float] = {}
+        for extension in self.each:
+            metrics |= extension.finish(batch, progress)
+        return metrics
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the states of all, by their numbers."""
+        return {str(number): each.state_dict() for number, each in enumerate(self.each)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the states of all."""
+        for number, own in state.items():
+            self.each[int(number)].load_state_dict(own)
+
+
+class SummedRewards(Extension):
+    """The sum of the rewards of several agents, which one policy of a joint action learns from.
+
+    Args:
+        reward_key: entry of a batch with the rewards, [B, T, agents, 1].
+    """
+
+    def __init__(self, reward_key: NestedKey) -> None:
+        self.reward_key = reward_key
+
+    def prepare(self, batch: TensorDictBase) -> None:
+        """Write the sum of the rewards as `("next", "reward")`, [B, T, 1]."""
+        rewards = batch[self.reward_key]
+        agents = tuple(range(batch.ndim, rewards.ndim))
+        batch["next", "reward"] = rewards.sum(agents)[..., None]

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from coil_rl.compiled import Compiled
 from coil_rl.errors import UserError
+from coil_rl.learners.learner import Stateful
 from coil_rl.learners.policy import Entries
-from coil_rl.learners.state import Stateful
 from coil_rl.ranges import checked
 
 ENOUGH = 4_000  # steps of a run, for which compilation pays in the second run of the same sizes
@@ -95,19 +95,16 @@ class GradientStep(Stateful):
         Returns what `losses` returns, detached. If `compile` is true and there is no C++ compiler,
         that is a `UserError`.
         """
+        self.steps += 1
         if self.compile is True:
             try:
-                values = self._compiled(minibatch, weights)
+                return self._compiled(minibatch, weights)
             except UserError as error:
                 if self.required:
                     raise
                 warnings.warn(f"{error}; the update goes on uncompiled", stacklevel=2)
                 self.compile = False
-            else:
-                self.steps += 1
-                return values
         losses = self.losses(minibatch)
-        self.steps += 1
         self.minimise(
             sum(
                 losses[name] if weight == 1 else weight * losses[name]

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
+from coil_rl.learners.critics import Critics
 from coil_rl.learners.density import Choices, Normal, SquashedNormal
 from coil_rl.learners.extension import Extension
 from coil_rl.ranges import Positive, checked
@@ -18,13 +19,6 @@ from coil_rl.schedules import Linear, Schedule, schedule
 # that imitates a bound itself is so far in the flat part of the squashing that nothing is left to
 # explore with, and later gradients are almost zero.
 EDGE = 0.2
-
-
-class ActionValues(Protocol):
-    """Critics of actions."""
-
-    def values(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the values of the entry `action` of steps [N] by each critic, [critics, N]."""
 
 
 @checked
@@ -58,7 +52,7 @@ class KickstartLoss(Extension):
 
     def __post_init__(self) -> None:
         self.coefficient_at = schedule(self.coefficient)
-        self.critics: ActionValues | None = None
+        self.critics: Critics | None = None
 
     @property
     def keys(self) -> Sequence[NestedKey]:
@@ -69,7 +63,7 @@ class KickstartLoss(Extension):
         self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase
     ) -> dict[str, Tensor]:
         """Return the loss of a minibatch [N] by its name."""
-        return {self.LOSS: self(policy, minibatch)}
+        return {self.LOSS: self.each(policy, minibatch).mean()}
 
     def weights(self, weights: dict[str, float], progress: float) -> dict[str, float]:
         """Return the weights of all losses, with the coefficient as that of this one."""
@@ -78,12 +72,6 @@ class KickstartLoss(Extension):
     def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Return the coefficient, as `guide_weight`."""
         return {"guide_weight": self.coefficient_at(progress)}
-
-    def __call__(
-        self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase
-    ) -> Tensor:
-        """Return the loss of a minibatch [N], a scalar."""
-        return self.each(policy, minibatch).mean()
 
     def each(self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase) -> Tensor:
         """Return the loss of each row of a minibatch, [N]; for choices it is the cross-entropy."""

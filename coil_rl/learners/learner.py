@@ -1,11 +1,13 @@
 """What every learner has: the base class `Learner`, and what a run calls between its updates."""
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -69,6 +71,39 @@ class Learner(ABC):
 
     def export(self, folder: Path) -> None:  # noqa: B027  optional
         """Write what others need besides the policy into the folder of a finished run."""
+
+
+class Stateful:
+    """Base class of objects whose saved state is that of the attributes named in `parts`.
+
+    Each is a generator, an object with a state of its own, a plain value, or None, which has an
+    empty state.
+    """
+
+    parts: ClassVar[tuple[str, ...]]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next update depends on, besides its batch."""
+        return {name: _state_of(vars(self)[name]) for name in self.parts}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state that `state_dict` returned."""
+        for name in self.parts:
+            part = vars(self)[name]
+            if isinstance(part, torch.Generator):
+                part.set_state(state[name].cpu())
+            elif hasattr(part, "load_state_dict"):
+                part.load_state_dict(state[name])
+            elif part is not None:
+                setattr(self, name, copy.copy(state[name]))
+
+
+def _state_of(part: Any) -> Any:
+    if isinstance(part, torch.Generator):
+        return part.get_state()
+    if hasattr(part, "state_dict"):
+        return part.state_dict()
+    return {} if part is None else copy.copy(part)
 
 
 class Callback(Protocol):

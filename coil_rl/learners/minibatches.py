@@ -1,4 +1,4 @@
-"""Minibatches: how a batch of rollouts is divided for the steps of the optimiser."""
+"""How a batch of rollouts is divided for the steps of the optimiser, and into who acted."""
 
 from collections.abc import Iterator, Sequence
 from typing import ClassVar
@@ -6,11 +6,14 @@ from typing import ClassVar
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 
+from coil_rl.learners.learner import Stateful
 from coil_rl.learners.networks import REMEMBERED
 from coil_rl.learners.policy import Entries
-from coil_rl.learners.state import Stateful
+
+AGENT_ACTS = "agent_acts"  # entry [*batch, 1]: whether the agent acted in a step
 
 
 class Minibatches(Stateful):
@@ -32,18 +35,19 @@ class Minibatches(Stateful):
         """Return what minibatches are drawn from: entries of the steps of a batch, [B * T]."""
         return Entries({key: batch[key].flatten(0, batch.ndim - 1) for key in keys})
 
-    def draw(self, rows: Entries) -> Iterator[Entries]:
-        """Yield the minibatches [N] of all passes over `rows`.
-
-        Raises:
-            ValueError: if there are too few rows.
-        """
-        advantage = rows["advantage"]
-        size = len(advantage) // self.count
-        if size * advantage.shape[1:].numel() < 2:  # one advantage cannot be standardised
+    def check(self, rows: int, steps: int) -> None:
+        """Raise a `ValueError` if a batch of so many rows with so many steps each is too small."""
+        if rows * steps < 2 * self.count:
             raise ValueError(
-                f"minibatches={self.count} leaves less than 2 of {advantage.numel()} frames to each"
+                f"minibatches={self.count} leaves less than 2 of {rows * steps} frames to each, "
+                "too few to standardise advantages"
             )
+
+    def draw(self, rows: Entries) -> Iterator[Entries]:
+        """Yield the minibatches [N] of all passes over `rows`, which `check` must allow."""
+        advantage = rows["advantage"]
+        self.check(len(advantage), advantage.shape[1:].numel())
+        size = len(advantage) // self.count
         for _ in range(self.epochs):
             order = torch.randperm(len(advantage), generator=self.generator)[: size * self.count]
             for index in order.to(advantage.device).split(size):
@@ -70,22 +74,17 @@ class RowMinibatches(Minibatches):
         return Entries({key: rows[key] for key in keys})
 
     def draw(self, rows: Entries) -> Iterator[Entries]:
-        """Yield the minibatches [N] of all passes over `rows`.
-
-        Raises:
-            ValueError: if there are fewer rows than minibatches, or a minibatch would have less
-                than two steps.
-        """
-        self.check_rows(len(rows["advantage"]))
+        """Yield the minibatches [N] of all passes over `rows`, which `check` must allow."""
         yield from map(self.remember, super().draw(rows))
 
-    def check_rows(self, rows: int) -> None:
-        """Raise a `ValueError` if there are fewer rows than minibatches."""
+    def check(self, rows: int, steps: int) -> None:
+        """Raise a `ValueError` if there are fewer rows than minibatches, or too few steps."""
         if rows < self.count:
             raise ValueError(
                 f"minibatches={self.count} are more than the {rows} envs, but with a memory each "
                 "needs all steps of an env; take fewer minibatches or more envs"
             )
+        super().check(rows, steps)
 
     def remember(self, rows: Entries) -> Entries:
         """Return the steps of whole rows [N, T] with `remembered`, [N * T]."""
@@ -96,10 +95,14 @@ class RowMinibatches(Minibatches):
         return Entries({key: each.flatten(0, 1) for key, each in rows.items()})
 
 
-def minibatches_of(
-    memory: TensorDictModuleBase | None, epochs: int, count: int, seed: int
-) -> Minibatches:
-    """Return the minibatches for a policy, with a memory or without (None); see `Minibatches`."""
-    if memory is None:
-        return Minibatches(epochs, count, seed)
-    return RowMinibatches(epochs, count, seed, memory)
+def guide_may_act(env: EnvBase) -> bool:
+    """Return whether a guide acts in some steps of an env, which then writes `agent_acts`."""
+    return AGENT_ACTS in env.observation_spec
+
+
+def of_agent(steps: Entries) -> Entries:
+    """Return the steps of [N] in which the agent acted; all without the entry `agent_acts`."""
+    if AGENT_ACTS not in steps:
+        return steps
+    acted = steps[AGENT_ACTS].squeeze(-1)
+    return Entries({key: steps[key][acted] for key in steps})

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -28,7 +28,7 @@ from coil_rl.learners.anchor import (
     Hold,
     ShownAdvice,
 )
-from coil_rl.learners.density import Choices, Normal, OneHotChoice, SquashedNormal
+from coil_rl.learners.density import Choices, Density, Normal, OneHotChoice, SquashedNormal
 from coil_rl.learners.encoders import (
     STATE,
     ConcatObservations,
@@ -40,7 +40,7 @@ from coil_rl.learners.encoders import (
 )
 from coil_rl.learners.heads import ChoicesHead, GaussianHead, GlobalScaleHead
 from coil_rl.learners.normaliser import Normaliser
-from coil_rl.learners.policy import ByKey, ClippedSample, Policy, Sample
+from coil_rl.learners.policy import ByKey, ClippedSample, Policy, Sample, read_through
 from coil_rl.transforms.action_space import ActionSpace, choices_of
 from coil_rl.transforms.normalised_action import units_of
 
@@ -151,7 +151,7 @@ def actor(
         KeyError: if the env does not have one of the entries.
     """
     spec = action_spec(env)
-    keys = in_keys if inputs is None else inputs.reads(in_keys)
+    keys = read_through(inputs, in_keys)
     before: list[TensorDictModuleBase] = [] if inputs is None else [inputs]
     if isinstance(network, Gru):
         before += memory(env, in_keys, keys, network, shapes)
@@ -162,16 +162,19 @@ def actor(
         dtype = spec.dtype if spec.dtype.is_floating_point else None
         return ObservationNetwork(env, in_keys, network, outputs, gain, shapes, dtype)
 
-    part = _action_part(env, spec, network_of, scale, state_dependent_scale, squash, clip)
-    head, sample = part.head, part.sample
+    valid: Tensor | None = None
+    if spec.dtype.is_floating_point:
+        head = _normal_head(network_of, action_shape(env), scale, state_dependent_scale)
+        sample = _sample_of_numbers(env, spec, squash, clip)
+    else:
+        head, sample, valid = _choices(env, spec, network_of)
     if anchor is not None and isinstance(inputs, AnchoredInputs):
-        if spec.dtype.is_floating_point:
+        if valid is None:
             sample = AnchoredSample(sample, inputs.hold, anchor, env.action_key)
         else:
-            head = AnchoredHead(head, inputs.hold, part.valid, anchor.choice_weight)
+            head = AnchoredHead(head, inputs.hold, valid, anchor.choice_weight)
             keys = [anchor.advice_key, *keys]
-    module = FastTensorDictModule(head, keys, part.parameters)
-    return Policy(*before, module, sample)
+    return Policy(*before, FastTensorDictModule(head, keys, sample.in_keys), sample)
 
 
 def inputs_of(env: EnvBase, normaliser: Normaliser | None, anchor: Anchor | None) -> Inputs | None:
@@ -195,75 +198,19 @@ def inputs_of(env: EnvBase, normaliser: Normaliser | None, anchor: Anchor | None
 NetworkOf = Callable[[int], ObservationNetwork]  # makes a network with that many outputs
 
 
-@dataclass(frozen=True)
-class _ActionPart:
-    """The part of a policy that depends on the kind of action.
-
-    Attributes:
-        head: gives the parameters of a distribution from what is observed.
-        parameters: their names.
-        sample: samples from the distribution.
-        valid: whether each choice has an option, [*event, n]; empty for numbers.
-    """
-
-    head: nn.Module
-    parameters: list[str]
-    sample: Sample
-    valid: Tensor
-
-
-def _action_part(
-    env: EnvBase,
-    spec: TensorSpec,
-    network_of: NetworkOf,
-    scale: float,
-    state_dependent_scale: bool,
-    squash: bool,
-    clip: bool,
-) -> _ActionPart:
-    """Return the part for the actions of an env; arguments as for `actor`."""
+def _choices(
+    env: EnvBase, spec: TensorSpec, network_of: NetworkOf
+) -> tuple[nn.Module, Sample, Tensor]:
+    """Return head and sample of choices, and whether each has an option, [*event, n]."""
     event = action_shape(env)
     if isinstance(spec, OneHot) or (isinstance(spec, Categorical) and not event):
-        return _one_choice(env, spec, network_of)
-    if not spec.dtype.is_floating_point:
-        return _several_choices(env, spec, network_of, event)
-    head = _normal_head(network_of, event, scale, state_dependent_scale)
-    if not isinstance(spec, Bounded):
-        return _unbounded(env, head, event)
-    first = (0,) * len(env.batch_size)
-    low, high = spec.space.low[first], spec.space.high[first]
-    if squash and bool((high - low).isfinite().all()):
-        return _squashed(env, head, low, high)
-    if clip:
-        return _clipped(env, head, low, high)
-    return _unbounded(env, head, event)
-
-
-def _one_choice(env: EnvBase, spec: TensorSpec, network_of: NetworkOf) -> _ActionPart:
-    """Return the part for one of n options, as an index or one-hot."""
-    is_index = isinstance(spec, Categorical)
-    distribution = Choices if is_index else OneHotChoice
-    valid = torch.ones(spec.space.n, dtype=torch.bool, device=spec.device)
-    return _ActionPart(
-        network_of(spec.space.n),
-        ["logits"],
-        Sample(["logits"], env.action_key, distribution),
-        valid,
-    )
-
-
-def _several_choices(
-    env: EnvBase, spec: TensorSpec, network_of: NetworkOf, event: torch.Size
-) -> _ActionPart:
-    """Return the part for several choices at once, as indices of shape `event`."""
+        kind = Choices if isinstance(spec, Categorical) else OneHotChoice
+        valid = torch.ones(spec.space.n, dtype=torch.bool, device=spec.device)
+        return network_of(spec.space.n), Sample(["logits"], env.action_key, kind), valid
     options = torch.tensor(choices_of(spec), device=spec.device).expand(event)
     head = ChoicesHead(network_of(options.numel() * int(options.max())), event, options)
-    return _ActionPart(
-        head,
-        ["logits"],
-        Sample(["logits"], env.action_key, Choices, {"event_dims": len(event)}),
-        head.valid,
-    )
+    sample = Sample(["logits"], env.action_key, Choices, {"event_dims": len(event)})
+    return head, sample, head.valid
 
 
 def _normal_head(
@@ -276,24 +223,19 @@ def _normal_head(
     return GlobalScaleHead(network_of(size), event, scale)
 
 
-def _unbounded(env: EnvBase, head: nn.Module, event: torch.Size) -> _ActionPart:
-    """Return the part for numbers of shape `event` without bounds."""
-    sample = Sample(["loc", "scale"], env.action_key, Normal, {"event_dims": len(event)})
-    return _ActionPart(head, ["loc", "scale"], sample, torch.empty(0))
-
-
-def _squashed(env: EnvBase, head: nn.Module, low: Tensor, high: Tensor) -> _ActionPart:
-    """Return the part for numbers that tanh squashes to their bounds."""
-    is_unit = bool((low == -1).all() and (high == 1).all())
-    options = {"event_dims": low.ndim, "bounds": None if is_unit else (low, high)}
-    sample = Sample(["loc", "scale"], env.action_key, SquashedNormal, options)
-    return _ActionPart(head, ["loc", "scale"], sample, torch.empty(0))
-
-
-def _clipped(env: EnvBase, head: nn.Module, low: Tensor, high: Tensor) -> _ActionPart:
-    """Return the part for numbers that are clipped to their bounds."""
-    sample = ClippedSample(low, high, env.action_key)
-    return _ActionPart(head, ["loc", "scale"], sample, torch.empty(0))
+def _sample_of_numbers(env: EnvBase, spec: TensorSpec, squash: bool, clip: bool) -> Sample:
+    """Return what samples numbers, squashed or clipped to their bounds; arguments of `actor`."""
+    kind: type[Density] = Normal
+    options: dict[str, Any] = {"event_dims": len(action_shape(env))}
+    if isinstance(spec, Bounded):
+        first = (0,) * len(env.batch_size)
+        low, high = spec.space.low[first], spec.space.high[first]
+        if squash and bool((high - low).isfinite().all()):
+            is_unit = bool((low == -1).all() and (high == 1).all())
+            kind, options["bounds"] = SquashedNormal, None if is_unit else (low, high)
+        elif clip:
+            return ClippedSample(low, high, env.action_key)
+    return Sample(["loc", "scale"], env.action_key, kind, options)
 
 
 def memory(
@@ -328,23 +270,14 @@ def memory(
     return [FastTensorDictModule(entries, read, ["concatenated"]), gru]
 
 
-@dataclass(frozen=True)
-class PolicyParts:
-    """A policy in parts, as an update computes them.
+def parts_of(policy: Policy) -> tuple[Inputs | None, TensorDictSequential | None, Policy]:
+    """Return a policy in parts, as an update computes them, with its own modules.
 
-    Attributes:
-        inputs: change what networks read, once for a batch; None: nothing does.
-        memory: computed for whole episodes; writes `remembered`. None: there is none.
-        head: computed for each minibatch.
+    Returns:
+        What changes the entries that networks read, once for a batch; None: nothing does. The
+        memory, computed for whole episodes, which writes `remembered`; None: there is none. And the
+        head, computed for each minibatch.
     """
-
-    inputs: Inputs | None
-    memory: TensorDictSequential | None
-    head: Policy
-
-
-def parts_of(policy: Policy) -> PolicyParts:
-    """Return the parts of a policy, with its own modules."""
     inputs, modules, memory = None, list(policy.module), None
     if isinstance(modules[0], Inputs):
         inputs = modules.pop(0)
@@ -352,7 +285,7 @@ def parts_of(policy: Policy) -> PolicyParts:
         if isinstance(module, GRUModule):
             memory, modules = TensorDictSequential(*modules[:count]), modules[count:]
             break
-    return PolicyParts(inputs, memory, Policy(*modules))
+    return inputs, memory, Policy(*modules)
 
 
 def values_of(critic: TensorDictModuleBase, inputs: Inputs | None) -> TensorDictModuleBase:
@@ -385,6 +318,5 @@ def critic(
     values = ObservationNetwork(
         env, in_keys, network, 1, gain=1.0, dtype=env.full_reward_spec[env.reward_key].dtype
     )
-    if inputs is None:
-        return FastTensorDictModule(values, in_keys, ["state_value"])
-    return ByKey(inputs, FastTensorDictModule(values, inputs.reads(in_keys), ["state_value"]))
+    module = FastTensorDictModule(values, read_through(inputs, in_keys), ["state_value"])
+    return module if inputs is None else ByKey(inputs, module)

@@ -14,7 +14,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import Categorical, OneHot, TensorSpec
+from torchrl.data import Categorical, OneHot
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.encoders import entry_specs
@@ -30,7 +30,7 @@ ROUNDING = 1e-7  # of the size of an element: smaller deviations are that of flo
 TINIEST = 1e-60  # variance of an element that was always 0, in any unit
 LARGEST = torch.finfo(torch.float64).max  # variance; in place of infinity, which times 0 is NaN
 MOST_SHOWN = 4  # elements in a message
-CHOICES = (OneHot, Categorical)  # specs of choices, of several at once too
+PICTURE = "it is a picture"
 
 
 class Normaliser(TensorDictModuleBase):
@@ -77,11 +77,6 @@ class Normaliser(TensorDictModuleBase):
                 moments.variance.fill_(math.inf)
             self.moments.append(moments)
 
-    def reads(self, keys: Sequence[NestedKey]) -> list[NestedKey]:
-        """Return the keys that a network reads in place of `keys`."""
-        names = dict(zip(self.in_keys, self.out_keys, strict=True))
-        return [names.get(key, key) for key in keys]
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the normalised entries."""
         for key, name, moments in zip(self.in_keys, self.out_keys, self.moments, strict=True):
@@ -97,7 +92,9 @@ class Normaliser(TensorDictModuleBase):
                 wrong = moments.out_of_scale
                 moments.used.fill_(wrong.any())  # type: ignore[operator]
                 if not moments.undecided:
-                    _say(key, moments.described(wrong))  # type: ignore[operator]
+                    found = ", ".join(moments.described(wrong))  # type: ignore[operator]
+                    fate = f"is normalised: {found}" if found else "is in scale and stays as it is"
+                    say(f"normalise: {_name(key)} {fate}", error=True)
 
 
 class RunningStatistics(Extension):
@@ -209,6 +206,26 @@ def advice_keys(env: EnvBase) -> set[NestedKey]:
     return keys
 
 
+def unmeasured(env: EnvBase, keys: Sequence[NestedKey]) -> dict[NestedKey, str]:
+    """Return those of some entries of an env that hold no vectors of measurements, and what else.
+
+    They are advice, choices or images; nothing is said of advice and of whole numbers.
+    """
+    found, advice = {}, advice_keys(env)
+    for key, spec in zip(keys, entry_specs(env, keys), strict=True):
+        if key in advice:
+            found[key] = ""
+        elif spec.dtype == torch.uint8:
+            found[key] = "it holds bytes, which networks divide by 255"
+        elif len(spec.shape) - len(env.batch_size) >= 3:
+            found[key] = PICTURE
+        elif isinstance(spec, OneHot | Categorical):  # of several choices at once too
+            found[key] = "it holds choices"
+        elif not spec.dtype.is_floating_point:
+            found[key] = ""
+    return found
+
+
 def normaliser(
     env: EnvBase,
     in_keys: Sequence[NestedKey],
@@ -221,17 +238,13 @@ def normaliser(
     advice, choices or images; "auto": those of them that are out of scale in the batches with the
     first `enough` rows.
     """
-    if isinstance(normalise, str):
-        if normalise != "auto":
-            raise ValueError(
-                f"normalise={normalise!r} must be auto, true, false or a list of entries"
-            )
-        chosen = vectors_of_measurements(env, in_keys)
-    elif isinstance(normalise, bool):
-        chosen = vectors_of_measurements(env, in_keys) if normalise else []
-        if normalise:
-            _warn_of_others(env, in_keys)
-    else:
+    others = unmeasured(env, in_keys)
+    chosen = [key for key in in_keys if normalise and key not in others]
+    if normalise is True:
+        for key, why in others.items():
+            if why:
+                warnings.warn(f"normalise=true leaves {_name(key)} as it is: {why}", stacklevel=2)
+    elif not isinstance(normalise, (bool, str)):
         chosen = list(normalise)
         if unread := [str(key) for key in chosen if key not in in_keys]:
             raise ValueError(
@@ -243,21 +256,7 @@ def normaliser(
     return Normaliser(env, chosen, enough=enough if normalise == "auto" else None)
 
 
-def _warn_of_others(env: EnvBase, in_keys: Sequence[NestedKey]) -> None:
-    """Say which entries keep their numbers although all are to be normalised."""
-    for key, spec in zip(in_keys, entry_specs(env, in_keys), strict=True):
-        if spec.dtype == torch.uint8:
-            why = "it holds bytes, which networks divide by 255"
-        elif _is_image(env, spec):
-            why = "it is a picture"
-        elif isinstance(spec, CHOICES):
-            why = "it holds choices"
-        else:
-            continue
-        warnings.warn(f"normalise=true leaves {_name(key)} as it is: {why}", stacklevel=3)
-
-
-class RawObservations:
+class RawObservations(Extension):
     """Warns once of each observed entry that is used as it is and out of scale; changes nothing.
 
     Args:
@@ -269,30 +268,26 @@ class RawObservations:
     def __init__(
         self, env: EnvBase, in_keys: Sequence[NestedKey], normaliser: Normaliser | None
     ) -> None:
-        self.each: dict[NestedKey, Moments | None] = {}  # which decide; None: it stays as it is
-        specs = zip(in_keys, entry_specs(env, in_keys), strict=True)
-        self.images = [
-            key for key, spec in specs if _is_image(env, spec) and spec.dtype.is_floating_point
-        ]
-        vectors = [*vectors_of_measurements(env, in_keys), *self.images]
-        moments = {}
+        others = unmeasured(env, in_keys)
+        self.images = [key for key, why in others.items() if why == PICTURE]
+        decide: dict[NestedKey, Any] = {}
         if normaliser is not None:
-            moments = dict(zip(normaliser.in_keys, normaliser.moments, strict=True))
-        for key in vectors:
-            if key not in moments:
-                self.each[key] = None
-            elif moments[key].used is not None:
-                self.each[key] = moments[key]
+            decide = dict(zip(normaliser.in_keys, normaliser.moments, strict=True))
+        self.each: dict[NestedKey, Moments | None] = {}  # which decide; None: it stays as it is
+        for key in in_keys:
+            is_looked_at = key not in decide or decide[key].used is not None
+            if is_looked_at and (key not in others or key in self.images):
+                self.each[key] = decide.get(key)
         self.batch_dims, self.count = len(env.batch_size), 0
 
-    def look(self, batch: TensorDictBase) -> None:
+    def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Look at a batch [*B, T]: at the first one, the second, the fourth and so on.
 
         What is observed may grow while a policy learns.
         """
         self.count += 1
         if self.count & (self.count - 1):
-            return
+            return {}
         for key, decides in list(self.each.items()):
             if decides is not None and (decides.undecided or decides.used):
                 continue
@@ -309,29 +304,8 @@ class RawObservations:
                     f"{', '.join(found)}; {remedy}",
                     stacklevel=2,
                 )
-
-
-def _say(key: NestedKey, found: Sequence[str]) -> None:
-    """Print what was decided about an entry."""
-    if found:
-        say(f"normalise: {_name(key)} is normalised: {', '.join(found)}", error=True)
-    else:
-        say(f"normalise: {_name(key)} is in scale and stays as it is", error=True)
+        return {}
 
 
 def _name(key: NestedKey) -> str:
     return key if isinstance(key, str) else ".".join(map(str, key))
-
-
-def vectors_of_measurements(env: EnvBase, keys: Sequence[NestedKey]) -> list[NestedKey]:
-    """Return those of some entries of an env that are not advice, choices or images."""
-    advice, chosen = advice_keys(env), []
-    for key, spec in zip(keys, entry_specs(env, keys), strict=True):
-        is_choice = isinstance(spec, CHOICES) or not spec.dtype.is_floating_point
-        if not (key in advice or is_choice or _is_image(env, spec)):
-            chosen.append(key)
-    return chosen
-
-
-def _is_image(env: EnvBase, spec: TensorSpec) -> bool:
-    return len(spec.shape) - len(env.batch_size) >= 3

@@ -14,16 +14,14 @@ from torchrl.envs import EnvBase
 from coil_rl import output
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import Anchor, start_tests
-from coil_rl.learners.extension import Extension
-from coil_rl.learners.extensions import Extensions
+from coil_rl.learners.extension import Extension, Extensions
 from coil_rl.learners.gradient import GradientStep, means
-from coil_rl.learners.guided_steps import AGENT_ACTS, guide_may_act
-from coil_rl.learners.learner import Callback, Cases, Learner
+from coil_rl.learners.learner import Callback, Cases, Learner, Stateful
+from coil_rl.learners.minibatches import AGENT_ACTS, guide_may_act
 from coil_rl.learners.n_step import NStep
 from coil_rl.learners.normaliser import RawObservations, normaliser
 from coil_rl.learners.policy import Entries, next_of
 from coil_rl.learners.reward_scale import RewardScale
-from coil_rl.learners.state import Stateful
 from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Seed, Share, checked
 from coil_rl.schedules import Schedule, schedule
 from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
@@ -67,7 +65,7 @@ class OffPolicy(Stateful, Learner):
     Where the agent acts its own action is stored, also a residual, because the sum is a part of the
     env.
 
-    A subclass builds its networks, calls `set_update` and then `extend`, and defines `losses`. It
+    A subclass builds its networks, calls `set_update`, perhaps `extend`, and defines `losses`. It
     names the losses to minimise the sum of (`minimised`) and the values to report (`reported`). A
     value out of range is a `ValueError`, and so is an env in which the effect or the reward of an
     action changes over the run.
@@ -147,7 +145,6 @@ class OffPolicy(Stateful, Learner):
         self.normaliser = normaliser(env, in_keys, normalise, enough=max(starts, 1))
         self.reward_scale = RewardScale(gamma) if scale_rewards else None
         self.inputs = networks.inputs_of(env, self.normaliser, anchor)
-        self.raw = RawObservations(env, in_keys, self.normaliser)
         self.max_grad_norm = max_grad_norm
         self.sums = NStep(n_step, gamma)
         self.guide_may_act = guide_may_act(env)
@@ -179,7 +176,7 @@ class OffPolicy(Stateful, Learner):
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.buffer, self.guide_buffer = self._new_buffer(), self._new_buffer()
         self.prior = round(prior * batch_size)
-        self.extensions = Extensions([], self.raw)
+        self.extensions = Extensions([RawObservations(env, in_keys, self.normaliser)])
 
     def _new_buffer(self) -> ReplayBuffer:
         # TorchRL's OfflineToOnlineReplayBuffer takes no generator, so a resumed run would draw
@@ -223,7 +220,7 @@ class OffPolicy(Stateful, Learner):
 
     def extend(self, extensions: Sequence[Extension]) -> None:
         """Add extensions."""
-        self.extensions = Extensions(extensions, self.raw)
+        self.extensions = Extensions([*extensions, *self.extensions.each])
         self.also_store(*self.extensions.keys)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:

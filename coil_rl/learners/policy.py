@@ -12,6 +12,7 @@ from tensordict import NestedKey
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
     TensorDictSequential,
 )
 from torch import Tensor, nn
@@ -34,6 +35,12 @@ class Entries(dict[NestedKey, Tensor]):
     def copy(self) -> "Entries":
         """Return the same entries, to which others can be added."""
         return Entries(self)
+
+
+def read_through(inputs: TensorDictModuleBase | None, keys: Sequence[NestedKey]) -> list[NestedKey]:
+    """Return the keys that a network reads in place of `keys`, behind `inputs` that change some."""
+    names = {} if inputs is None else dict(zip(inputs.in_keys, inputs.out_keys, strict=True))
+    return [names.get(key, key) for key in keys]
 
 
 def next_of(entries: Entries) -> Entries:
@@ -59,6 +66,7 @@ class Sample(ProbabilisticTensorDictModule):
         key: entry for the sample.
         distribution: its class.
         options: further arguments of the distribution by name; None: there are none.
+        action_key: entry for the action; None: the sample is the action.
     """
 
     by_key: ClassVar[bool] = True
@@ -69,6 +77,7 @@ class Sample(ProbabilisticTensorDictModule):
         key: NestedKey,
         distribution: type[Density],
         options: Mapping[str, Any] | None = None,
+        action_key: NestedKey | None = None,
     ) -> None:
         super().__init__(
             list(parameters),
@@ -78,7 +87,12 @@ class Sample(ProbabilisticTensorDictModule):
             return_log_prob=True,
             log_prob_key="action_log_prob",
         )
-        self.sample_key = key
+        self.sample_key, self.action_key = key, action_key or key
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Keys of the entries that `forward` writes."""
+        return list(dict.fromkeys([*super().out_keys, self.action_key]))
 
     def get_dist(self, tensordict: Any) -> Density:
         """Return the distribution of entries that have its parameters."""
@@ -118,13 +132,9 @@ class ClippedSample(Sample):
     """
 
     def __init__(self, low: Tensor, high: Tensor, action_key: NestedKey = "action") -> None:
-        super().__init__(["loc", "scale"], UNCLIPPED, Normal, {"event_dims": low.ndim})
-        self.low, self.high, self.action_key = low, high, action_key
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Keys of the entries that `forward` writes."""
-        return [*super().out_keys, self.action_key]
+        options = {"event_dims": low.ndim}
+        super().__init__(["loc", "scale"], UNCLIPPED, Normal, options, action_key)
+        self.low, self.high = low, high
 
     def write_action(self, entries: Any) -> None:
         """Write the action, the clipped sample, in some entries [*batch]."""

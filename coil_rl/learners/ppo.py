@@ -23,17 +23,20 @@ from coil_rl.learners import networks
 from coil_rl.learners.advantages import Advantages, standardise
 from coil_rl.learners.anchor import Anchor, start_tests
 from coil_rl.learners.encoders import Mlp, without_memory
-from coil_rl.learners.extension import Extension
-from coil_rl.learners.extensions import extensions_of
+from coil_rl.learners.extension import Extension, Extensions, SummedRewards
 from coil_rl.learners.gradient import GradientStep, means, tensors_of
-from coil_rl.learners.guided_steps import AGENT_ACTS, guide_may_act, of_agent
-from coil_rl.learners.learner import Callback, Cases, Learner
-from coil_rl.learners.minibatches import RowMinibatches, minibatches_of
-from coil_rl.learners.normaliser import normaliser
+from coil_rl.learners.learner import Callback, Cases, Learner, Stateful
+from coil_rl.learners.minibatches import (
+    AGENT_ACTS,
+    Minibatches,
+    RowMinibatches,
+    guide_may_act,
+    of_agent,
+)
+from coil_rl.learners.normaliser import RawObservations, RunningStatistics, normaliser
 from coil_rl.learners.policy import UNCLIPPED, Entries, Policy, by_key
 from coil_rl.learners.ppo_report import OF_POLICY, SEEN, report_of
 from coil_rl.learners.reward_scale import RewardScale
-from coil_rl.learners.state import Stateful
 from coil_rl.ranges import Count, NonNegative, Positive, Seed, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.action_space import nested_key
@@ -111,7 +114,7 @@ class PPO(Stateful, Learner):
 
     Attributes:
         policy: writes `action` and `action_log_prob`.
-        head: the part of the policy that is computed for each minibatch, see `PolicyParts`.
+        head: the part of the policy that is computed for each minibatch, see `parts_of`.
         critic: writes `state_value`.
         keys: entries that a batch must have.
         extensions: what is added to PPO.
@@ -174,17 +177,18 @@ class PPO(Stateful, Learner):
         )
         self.policy = self.build_policy(env, in_keys, network, make_actor)
         self.critic = self.build_critic(env, in_keys, network)
-        self.parts_of_policy = parts = networks.parts_of(self.policy)
-        self.head, self.values = parts.head, networks.values_of(self.critic, parts.inputs)
-        scale = RewardScale(gamma) if scale_rewards else None
-        self.extensions = extensions_of(env, in_keys, scale, self.normaliser, auxiliary)
+        self.first_inputs, memory, self.head = networks.parts_of(self.policy)
+        self.values = networks.values_of(self.critic, self.first_inputs)
+        statistics = [RewardScale(gamma)] if scale_rewards else []
+        self.extensions = self._extensions(env, in_keys, statistics, auxiliary)
 
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
         # As TorchRL, in float32.
         self.clip_bounds = torch.tensor([-clip, clip]).log1p().tolist()
         self.critic_coefficient, self.has_bonus = critic, self.entropy(0) > 0
-        self.epochs, self.minibatches = epochs, minibatches
-        self.sampler = minibatches_of(parts.memory, epochs, minibatches, seed)
+        self.sampler = Minibatches(epochs, minibatches, seed)
+        if memory is not None:
+            self.sampler = RowMinibatches(epochs, minibatches, seed, memory)
         self.gradient = GradientStep(
             self.all_losses,
             self.parameter_groups(),
@@ -193,7 +197,7 @@ class PPO(Stateful, Learner):
             eps=1e-5,
             max_grad_norm=max_grad_norm,
             compile=compile,
-            compilable=self.compilable and parts.memory is None and not guide_may_act(env),
+            compilable=self.compilable and memory is None and not guide_may_act(env),
         )
         self.on_tensors = by_key(self.head) and by_key(self.values)
         self._set_keys(env, in_keys)
@@ -213,6 +217,21 @@ class PPO(Stateful, Learner):
     ) -> TensorDictModuleBase:
         """Return the critic."""
         return networks.critic(env, in_keys, network, self.inputs)
+
+    def _extensions(
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey],
+        of_rewards: Sequence[Extension],
+        auxiliary: Sequence[Extension],
+    ) -> Extensions:
+        """Return what is added to the algorithm, in the order in which it acts."""
+        each = [*of_rewards]
+        if (reward_key := unravel_key(("next", env.reward_key))) != ("next", "reward"):
+            each.insert(0, SummedRewards(reward_key))
+        if self.normaliser is not None:
+            each.append(RunningStatistics(self.normaliser))
+        return Extensions([*each, *auxiliary, RawObservations(env, in_keys, self.normaliser)])
 
     def _set_keys(self, env: EnvBase, in_keys: Sequence[NestedKey]) -> None:
         """Set the entries that batches and minibatches need."""
@@ -262,9 +281,9 @@ class PPO(Stateful, Learner):
         self.advantage(batch)
         rows = self.sampler.rows(batch, self.minibatch_keys)
         rows["action"] = rows.pop(self.sample_key)
-        if self.parts_of_policy.inputs is not None:
+        if self.first_inputs is not None:
             with torch.no_grad():  # they do not depend on weights
-                self.parts_of_policy.inputs(rows)
+                self.first_inputs(rows)
         return rows
 
     def loss_weights(self, progress: float) -> dict[str, float]:
@@ -351,10 +370,4 @@ class PPO(Stateful, Learner):
             rows: B, of the env. With a memory each minibatch has whole rows.
             steps: T, of each row.
         """
-        if isinstance(self.sampler, RowMinibatches):
-            self.sampler.check_rows(rows)
-        if 2 * self.minibatches > rows * steps:
-            raise ValueError(
-                f"minibatches={self.minibatches} leaves less than 2 frames to each minibatch, too "
-                "few to standardise advantages"
-            )
+        self.sampler.check(rows, steps)

@@ -15,12 +15,14 @@ from collections.abc import Sequence
 from typing import Literal, Unpack
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.a2c import A2C
 from coil_rl.learners.encoders import Mlp
+from coil_rl.learners.networks import FastTensorDictModule
 from coil_rl.learners.ppo import OnPolicySettings
 from coil_rl.ranges import NonNegative, checked
 from coil_rl.schedules import Linear, Schedule
@@ -68,25 +70,21 @@ class Reinforce(A2C):
         if self.baseline == "critic":
             return super().build_critic(env, in_keys, network)
         key = in_keys[0]
-        return ZeroCritic(key, len(env.observation_spec[key].shape) - len(env.batch_size))
+        dims = len(env.observation_spec[key].shape) - len(env.batch_size)
+        return FastTensorDictModule(Zero(dims), [key], ["state_value"])
 
 
-class ZeroCritic(TensorDictModuleBase):
-    """A critic that writes 0 as `state_value` [*batch, 1].
+class Zero(nn.Module):
+    """The value 0 of a state.
 
     Args:
-        key: entry that it reads for the size of a batch.
-        dims: number of dimensions of this entry after those of a batch.
+        dims: number of dimensions of the entry that is read, after those of a batch.
     """
 
-    by_key = True
-
-    def __init__(self, key: NestedKey, dims: int) -> None:
-        self.in_keys, self.out_keys, self.dims = [key], ["state_value"], dims
+    def __init__(self, dims: int) -> None:
         super().__init__()
+        self.dims = dims
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the value."""
-        entry = tensordict[self.in_keys[0]]
-        batch = entry.shape[: entry.ndim - self.dims]
-        return tensordict.set("state_value", torch.zeros(*batch, 1, device=entry.device))
+    def forward(self, entry: Tensor) -> Tensor:
+        """Return the value, [*batch, 1]."""
+        return torch.zeros(*entry.shape[: entry.ndim - self.dims], 1, device=entry.device)

@@ -17,7 +17,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.advantages import standardise
-from coil_rl.learners.guided_steps import of_agent
+from coil_rl.learners.minibatches import of_agent
 from coil_rl.learners.policy import Entries
 from coil_rl.learners.ppo import PPO, OnPolicySettings
 from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Share, checked

@@ -1386,7 +1386,7 @@ def kind_12_picture_of_real_numbers_up_to_255_is_named(*_):
     env = GymnasiumEnv(partial(Plant, spaces.Box(0, 255, (8, 8, 3), np.float32)), 2)
     raw = RawObservations(env, ["observation"], None)
     with pytest.warns(UserWarning, match="far out of scale") as caught:
-        raw.look(env.rollout(4))
+        raw.finish(env.rollout(4), 0.0)
     return str(caught[0].message)
 
 

@@ -120,20 +120,19 @@ def test_deterministic_action_is_the_mode_after_ppo_has_learned_the_best_action(
     assert reward > (-0.05 if env.action_spec.dtype.is_floating_point else 0.9)
 
 
-@pytest.mark.parametrize("name", ["bounded", "scalar", "matrix", "float64", "unbounded"])
-def test_sac_updates_with_any_continuous_action(name):
+NUMBERS = ("bounded", "scalar", "matrix", "float64", "unbounded")
+ONE_CHOICE = ("categorical", "one_hot")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [*((SAC, name) for name in NUMBERS), *((DQN, name) for name in ONE_CHOICE)]
+)
+def test_learner_with_replay_updates_with_any_action_of_its_kind(kind, name):
     env = env_with(name)
-    learner = SAC(env, starts=16, batch_size=16, updates_per_step=0.015625)
-    assert learner.target_entropy == -max(ACTIONS[name].shape.numel(), 1)
+    learner = kind(env, starts=16, batch_size=16, updates_per_step=0.015625)
+    if kind is SAC:
+        assert learner.target_entropy == -max(ACTIONS[name].shape.numel(), 1)
     metrics = trained(learner, env)[-1]
-    assert metrics["minibatches"] > 0
-    assert torch.tensor(list(metrics.values())).isfinite().all()
-
-
-@pytest.mark.parametrize("name", ["categorical", "one_hot"])
-def test_dqn_updates_with_one_discrete_action(name):
-    env = env_with(name)
-    metrics = trained(DQN(env, starts=16, batch_size=16, updates_per_step=0.015625), env)[-1]
     assert metrics["minibatches"] > 0
     assert torch.tensor(list(metrics.values())).isfinite().all()
 
@@ -151,8 +150,14 @@ def test_dqn_updates_with_one_discrete_action(name):
         ),
         (lambda: DQN(env_with("multi_categorical")), "DQN needs one discrete action, .* use PPO"),
         (lambda: DQN(env_with("binary")), "DQN needs one discrete action, .* use PPO"),
-        (lambda: DQN(env_with("bounded")), "DQN needs discrete actions"),
-        (lambda: SAC(env_with("multi_categorical")), "SAC needs continuous actions"),
+        (
+            lambda: DQN(env_with("bounded")),
+            r"DQN needs discrete actions, .* around it: action=choices",
+        ),
+        (
+            lambda: SAC(env_with("multi_categorical")),
+            r"SAC needs continuous actions, .* action=continuous, or learner=ppo",
+        ),
         (
             lambda: SAC(AnyEnv(agents=True)),
             r"SAC needs one entry action .* RenameTransform, or use PPO",
@@ -208,6 +213,3 @@ def test_ppo_trains_the_joint_action_of_several_agents_for_the_sum_of_their_rewa
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         data = env.step(learner.policy(env.reset()))
     assert data["next", "agents", "reward"].mean() > -0.1
-    batch = Rollout(env, learner.policy, 4, learner.keys).collect()
-    learner.prepare(batch, 0.0)
-    assert torch.equal(batch["next", "reward"], batch["next", "agents", "reward"].sum(-2))

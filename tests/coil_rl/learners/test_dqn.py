@@ -61,7 +61,7 @@ def test_epsilon_follows_its_schedule():
     for progress in (0.0, 1.0, 1.0):
         batch = rollout.collect()
         with torch.no_grad():
-            best = dqn.network(batch.select("observation"))["action"]
+            best = dqn.choice(dqn.values(batch.select("observation")))["action"]
         shares.append(float((batch["action"] != best).float().mean()))
         assert dqn.update(batch, progress)["epsilon"] == pytest.approx(
             1.0 if progress == 0 else 0.2

@@ -21,12 +21,10 @@ from coil_rl.learners import (
     KickstartLoss,
     Reinforce,
 )
-from coil_rl.learners.extension import Extension
-from coil_rl.learners.extensions import Extensions
+from coil_rl.learners.extension import Extension, Extensions, SummedRewards
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.minibatches import Minibatches
 from coil_rl.learners.policy import Entries
-from coil_rl.learners.several_agents import SummedRewards
 from coil_rl.ranges import settings_of
 from coil_rl.run.rollout import Rollout
 from coil_studies import IBRL, Advisor
@@ -131,7 +129,7 @@ def test_rewards_of_agents_are_summed():
         8, Bounded(-1, 1, (3, 2)), {("agents", "observation"): Unbounded((3, 4))}, agents=True
     )
     learner = PPO(env, [("agents", "observation")])
-    (extension,) = learner.extensions.each
+    extension, _ = learner.extensions.each  # and the look at raw observations
     assert isinstance(extension, SummedRewards)
     batch = Rollout(env, learner.policy, 4, learner.keys).collect()
     extension.prepare(batch)
@@ -154,7 +152,9 @@ def test_batch_must_have_two_frames_for_each_minibatch(frames, fits):
     if fits:
         learner.check_batch(1, frames)
     else:
-        with pytest.raises(ValueError, match="minibatches=4 leaves less than 2 frames to each"):
+        with pytest.raises(
+            ValueError, match="minibatches=4 leaves less than 2 of 7 frames to each"
+        ):
             learner.check_batch(1, frames)
 
 

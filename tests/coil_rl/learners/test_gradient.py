@@ -32,51 +32,24 @@ def cache(tmp_path_factory, monkeypatch):
     )  # one for all tests here
 
 
-CASES = [
-    pytest.param(PPO, (), {"minibatches": 4}, id="ppo", marks=pytest.mark.slow),
-    pytest.param(A2C, (), {"minibatches": 4}, id="a2c", marks=pytest.mark.slow),
-    pytest.param(
-        PPO,
-        (),
-        {"minibatches": 4, "normalise": True, "squash": False},
-        id="clipped",
-        marks=pytest.mark.slow,
-    ),
-    pytest.param(SAC, (), {"starts": 64, "batch_size": 32}, id="sac", marks=pytest.mark.slow),
-    pytest.param(
-        SAC,
-        (),
-        {"starts": 64, "batch_size": 32, "critics": 3, "target_critics": 2},
-        id="redq",
-        marks=pytest.mark.slow,
-    ),
+REPLAY = {"starts": 64, "batch_size": 32}
+CASES = {
+    "ppo": (PPO, (), {"minibatches": 4}),
+    "a2c": (A2C, (), {"minibatches": 4}),
+    "clipped": (PPO, (), {"minibatches": 4, "normalise": True, "squash": False}),
+    "sac": (SAC, (), REPLAY),
+    "redq": (SAC, (), REPLAY | {"critics": 3, "target_critics": 2}),
     # Biases before a normalisation have gradients of rounding alone, which Adam makes steps of.
-    pytest.param(
-        CrossQ,
-        (),
-        {"starts": 64, "batch_size": 32, "learning_rate": 1e-6},
-        id="crossq",
-        marks=pytest.mark.slow,
-    ),
-    pytest.param(
-        TQC,
-        (),
-        {"starts": 64, "batch_size": 32, "quantiles": 5, "n_step": 3},
-        id="tqc",
-        marks=pytest.mark.slow,
-    ),
-    pytest.param(
-        DQN,
-        (partial(DiscreteActions, 5),),
-        {"starts": 64, "batch_size": 32},
-        id="dqn",
-        marks=pytest.mark.slow,
-    ),
-]
+    "crossq": (CrossQ, (), REPLAY | {"learning_rate": 1e-6}),
+    "tqc": (TQC, (), REPLAY | {"quantiles": 5, "n_step": 3}),
+    "dqn": (DQN, (partial(DiscreteActions, 5),), REPLAY),
+}
 
 
-@pytest.mark.parametrize(("learner", "transforms", "options"), CASES)
-def test_compiled_update_is_the_update_and_continues_to_the_bit(learner, transforms, options):
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_compiled_update_is_the_update_and_continues_to_the_bit(case):
+    learner, transforms, options = CASES[case]
     one, rollout = make(learner, False, *transforms, **options)
     other, third = (make(learner, "auto", *transforms, **options)[0] for _ in range(2))
     batches = [rollout.collect() for _ in range(3)]

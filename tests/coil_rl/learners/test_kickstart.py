@@ -26,14 +26,14 @@ def test_likelihood_is_that_of_the_action_of_the_guide():
     minibatch["guide_action"].clamp_(EDGE - 1, 1 - EDGE)
     imitated = minibatch.select("observation").set("action", minibatch["guide_action"][:, 0])
     expected = -policy.log_prob(imitated).mean()
-    torch.testing.assert_close(KickstartLoss()(policy, minibatch), expected)
+    torch.testing.assert_close(KickstartLoss().each(policy, minibatch).mean(), expected)
 
 
 @pytest.mark.parametrize("kind", ["likelihood", "divergence"])
 def test_loss_is_finite_for_actions_at_their_bounds(kind):
     policy, minibatch = make(worlds.cones())
     minibatch["guide_action"].fill_(1.0)
-    loss = KickstartLoss(kind=kind)(policy, minibatch)
+    loss = KickstartLoss(kind=kind).each(policy, minibatch).mean()
     loss.backward()
     assert loss.isfinite()
     assert all(p.grad.isfinite().all() for p in policy.parameters())
@@ -43,7 +43,7 @@ def test_divergence_equals_its_estimate_from_samples():
     policy, minibatch = make(worlds.pendulum(), ["th", "thdot"])
     with torch.no_grad():
         next(p for name, p in policy.named_parameters() if name.endswith("log_scale")).fill_(-1.0)
-        loss = KickstartLoss(kind="divergence", scale=0.3)(policy, minibatch)
+        loss = KickstartLoss(kind="divergence", scale=0.3).each(policy, minibatch).mean()
         distribution = policy.get_dist(minibatch.select(*policy.in_keys))
         base = Normal((minibatch["guide_action"][:, 0] / 2).clamp(EDGE - 1, 1 - EDGE).atanh(), 0.3)
         guide = TransformedDistribution(base, [TanhTransform(), AffineTransform(0.0, 2.0)])
@@ -59,7 +59,9 @@ def test_loss_of_discrete_actions_is_the_cross_entropy(categorical):
     logits = policy.get_dist(minibatch.select("observation")).logits
     expected = torch.nn.functional.cross_entropy(logits, chosen)
     for kind in ("likelihood", "divergence"):
-        torch.testing.assert_close(KickstartLoss(kind=kind)(policy, minibatch), expected)
+        torch.testing.assert_close(
+            KickstartLoss(kind=kind).each(policy, minibatch).mean(), expected
+        )
 
 
 def test_coefficient_of_zero_changes_nothing():
@@ -82,7 +84,7 @@ def test_loss_of_several_choices_is_their_cross_entropy():
     one_hot = torch.cat(
         [F.one_hot(advised[:, index], n) for index, n in enumerate((2, 4))], -1
     ).float()
-    loss = KickstartLoss()(policy, data.set("guide_action", one_hot.unsqueeze(1)))
+    loss = KickstartLoss().each(policy, data.set("guide_action", one_hot.unsqueeze(1))).mean()
     torch.testing.assert_close(loss, -policy.get_dist(data).log_prob(advised).mean())
 
 
@@ -120,7 +122,8 @@ def test_imitation_is_weighted_by_the_opinion_of_the_critics(soft):
     weight = Normal(0.0, 1.0).cdf(gain / spread) if soft else (gain > 0).float()
     assert 0.05 < weight.mean() < 0.95
     torch.testing.assert_close(
-        filtered(sac.actor, data), (weight * KickstartLoss().each(sac.actor, data)).mean()
+        filtered.each(sac.actor, data).mean(),
+        (weight * KickstartLoss().each(sac.actor, data)).mean(),
     )
 
 
@@ -132,7 +135,7 @@ def test_loss_is_added_to_that_of_the_policy_of_sac_by_its_schedule():
         assert weights == dict.fromkeys(sac.minimised, 1.0) | {"loss_guide": coefficient}
         torch.testing.assert_close(
             sac.losses(Entries(data.items(True, True)))["loss_guide"],
-            KickstartLoss()(sac.actor, data),
+            KickstartLoss().each(sac.actor, data).mean(),
         )
     assert sac.update(rollout.collect())["loss_guide"] != 0
 

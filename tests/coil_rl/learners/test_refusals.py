@@ -6,11 +6,10 @@ import pytest
 import worlds
 from cart_poles import CartPoles
 from tensordict.nn import TensorDictModule
-from torchrl.envs import PendulumEnv
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, DynamicCoil, Reinforce
 from coil_rl.learners.encoders import Mlp, ObservationNetwork
-from coil_rl.learners.networks import FastTensorDictModule, actor
+from coil_rl.learners.networks import FastTensorDictModule
 from coil_rl.schedules import Linear
 from coil_rl.transforms import (
     DiscreteActions,
@@ -54,28 +53,6 @@ def test_values_out_of_range_are_refused(kind):
     for name, value in OUT_OF_RANGE[kind].items():
         with pytest.raises(ValueError, match=rf"{name}.*=.* must be"):
             kind(env, ["th"], **{name: value})
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (
-            lambda: DQN(PendulumEnv(), ["th"]),
-            r"DQN needs discrete actions, .* around it: action=choices",
-        ),
-        (
-            lambda: SAC(worlds.pendulum(DiscreteActions(5)), ["th"]),
-            r"SAC needs continuous actions, .* action=continuous, or learner=ppo",
-        ),
-        (
-            lambda: actor(worlds.cones(), ["observation", "advice"]),
-            r"no entry advice to observe; it has .*observation",
-        ),
-    ],
-)
-def test_unknown_choices_and_wrong_kinds_of_env_are_refused(make, message):
-    with pytest.raises((ValueError, KeyError), match=message):
-        make()
 
 
 @pytest.mark.parametrize(
