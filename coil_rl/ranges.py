@@ -20,6 +20,7 @@ from annotated_types import Len as Len
 if TYPE_CHECKING:
     from pydantic import TypeAdapter, ValidationError
 
+Finite = Annotated[float, Interval()]
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Share = Annotated[float, Interval(ge=0, le=1)]

@@ -120,9 +120,8 @@ class ActionSpace:
         self.first = first if self.indexed else None
         self.units = units_of(spec, batch_dims) if self.continuous else None
         self.bounds: tuple[Tensor, Tensor] | None = None
-        if isinstance(spec, Bounded):
-            row = (0,) * batch_dims
-            self.bounds = spec.space.low[row], spec.space.high[row]
+        if self.units is not None and isinstance(spec, Bounded):
+            self.bounds = self.units.bounds
 
     @property
     def range(self) -> ActionRange:

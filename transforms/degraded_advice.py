@@ -16,7 +16,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
-from coil_rl.ranges import Interval, NonNegative, checked
+from coil_rl.ranges import Finite, Interval, NonNegative, checked
 from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.link import Link, State
@@ -111,38 +111,40 @@ class DegradedAdvice(Link):
         return super().transform_observation_spec(observation_spec)
 
 
+@checked
 class BiasedAdvice(DegradedAdvice):
     """Advice with a constant offset.
 
     It is for actions that are numbers: the advice of choices stays the same, with a warning.
 
     Args:
-        offset: in normalised actions, finite.
+        offset: in normalised actions.
     """
 
     numbers_only = "biased"
 
-    def __init__(self, offset: float = 0.2, key: NestedKey = "guide_action") -> None:
+    def __init__(self, offset: Finite = 0.2, key: NestedKey = "guide_action") -> None:
         super().__init__(key)
-        self.offset = _finite("offset", offset)
+        self.offset = offset
 
     def degrade(self, advice: Tensor) -> Tensor:
         """Return advice + offset."""
         return advice + self.offset
 
 
+@checked
 class ScaledAdvice(DegradedAdvice):
     """Advice multiplied by a constant: 0 is the centre of a bounded action.
 
     Args:
-        gain: the constant, finite: 0.5 for an undertuned guide, 0 for neutral advice, -1 for an
+        gain: the constant: 0.5 for an undertuned guide, 0 for neutral advice, -1 for an
             adversary. With a negative one choices are advised in the reverse order; a positive one
             leaves them as they are, with a warning.
     """
 
-    def __init__(self, gain: float, key: NestedKey = "guide_action") -> None:
+    def __init__(self, gain: Finite, key: NestedKey = "guide_action") -> None:
         super().__init__(key)
-        self.gain = _finite("gain", gain)
+        self.gain = gain
         self.numbers_only = "undertuned" if gain > 0 else None
 
     def degrade(self, advice: Tensor) -> Tensor:
@@ -401,10 +403,3 @@ def say_for_numbers(name: str, kind: str) -> None:
         "delayed, noisy, random, shuffled, removed or zeroed",
         stacklevel=2,
     )
-
-
-def _finite(name: str, value: float) -> float:
-    """Return a value; raise a `ValueError` if it is not finite."""
-    if not math.isfinite(value):
-        raise ValueError(f"{name}={value} must be a finite number")
-    return value

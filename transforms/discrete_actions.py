@@ -13,7 +13,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
-from torchrl.data import Bounded, Categorical, Composite, TensorSpec
+from torchrl.data import Categorical, Composite
 
 from coil_rl.transforms.action_space import ActionSpace, ActionTransform
 from coil_rl.transforms.link import State
@@ -68,24 +68,23 @@ class DiscreteActions(ActionTransform):
     @cached_property
     def values(self) -> Tensor:
         """[n], values of the choices in the unit of the agent; RuntimeError outside an env."""
-        spec = self.action_space.spec
-        if not spec.dtype.is_floating_point:
+        space, spec, units = self.action_space, self.action_space.spec, self.given_units
+        if not space.continuous:
             raise ValueError(
                 "DiscreteActions makes choices of one number, but the action of this env is "
                 f"choices already ({type(spec).__name__}); leave it out: action=continuous"
             )
-        size = spec.shape[self.parent.batch_dims :].numel()
-        if size != 1 or not _is_bounded(spec):
+        size, bounds = space.event.numel(), space.bounds
+        if size != 1 or bounds is None or not torch.stack(bounds).isfinite().all():
             found = f"{size} numbers" if size != 1 else type(spec).__name__
             raise ValueError(
                 "DiscreteActions needs an action of one bounded number, but this env's action is "
                 f"{found}"
             )
-        bounds, units = (spec.space.low, spec.space.high), self.given_units
         if isinstance(self.choices, int):
-            low, high = (float(bound.flatten()[0]) for bound in bounds)
+            low, high = map(float, bounds)
             return torch.linspace(low, high, self.choices, dtype=spec.dtype, device=spec.device)
-        low, high = (float(bound.flatten()[0]) for bound in (units.bounds if units else bounds))
+        low, high = map(float, units.bounds if units else bounds)
         if self.choices[0] < low or self.choices[-1] > high:
             raise ValueError(
                 f"choices={list(self.choices)} must lie between the action's bounds {low} and "
@@ -131,10 +130,3 @@ class DiscreteActions(ActionTransform):
         return Categorical(
             len(self.values), self.parent.batch_size, device=self.values.device, dtype=torch.int64
         )
-
-
-def _is_bounded(spec: TensorSpec) -> bool:
-    """Return whether the action has finite bounds."""
-    return isinstance(spec, Bounded) and all(
-        bool(bound.isfinite().all()) for bound in (spec.space.low, spec.space.high)
-    )

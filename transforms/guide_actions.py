@@ -125,14 +125,11 @@ class Guides(TensorDictModuleBase):
                 )
         memories = {name: GuideMemory(name, guide) for name, guide in guides.items()}
         self.memories = {name: memory for name, memory in memories.items() if memory.specs}
-        for name in self.memories:
-            if trainable:
-                raise ValueError(f"guide {name!r} has a memory, and such a guide cannot be trained")
-        self.in_keys: list[NestedKey] = []
-        for guide in guides.values():
-            for key in guide.in_keys:
-                if key not in self.in_keys:
-                    self.in_keys.append(key)
+        if trainable and self.memories:
+            name = next(iter(self.memories))
+            raise ValueError(f"guide {name!r} has a memory, and such a guide cannot be trained")
+        read = (key for guide in guides.values() for key in guide.in_keys)
+        self.in_keys: list[NestedKey] = list(dict.fromkeys(read))
         self.out_keys = [out_key]
         super().__init__()
         self.guides = nn.ModuleDict(guides)
@@ -193,14 +190,15 @@ class Guides(TensorDictModuleBase):
         memory: State | None,
     ) -> Tensor:
         """Return the advice of a guide [*batch, A]; the arguments are those of `advice`."""
+        guide = self.guides[name]
         data = tensordict.select(*self._in_keys_of[name], strict=False)
         if name in self._input_dtype:
             data = data.apply(partial(_converted, dtype=self._input_dtype[name]))
         if memory is not None and name in self.memories:
-            data = self.guides[name](self.memories[name].given_to(data, memory))
+            data = guide(self.memories[name].given_to(data, memory))
             self.memories[name].kept(data, memory)
         else:
-            data = self.guides[name](data)
+            data = guide(data)
         action: Tensor = data[self.action_key]
         return action if convert is None else convert(name, action, tensordict.batch_size)
 

@@ -23,6 +23,12 @@ from coil_rl.transforms.link import Link, State
 
 LARGEST_BOUND = 1e30  # beyond it a bound is none: the largest number of a type stands for infinity
 WIDTH = 2.0  # assumed from the only bound of a coordinate
+# Names of the bounds that a coordinate lacks, by whether it has a lower and an upper one.
+MISSING = {
+    (True, False): "no upper bound",
+    (False, True): "no lower bound",
+    (False, False): "no bounds",
+}
 
 
 class ActionUnits:
@@ -75,16 +81,9 @@ class ActionUnits:
         phrases = []
         rows = zip(self.low.flatten(), self.high.flatten(), self.centre.flatten(), strict=True)
         for index, (low, high, centre) in enumerate(rows):
-            if low.isfinite() and high.isfinite():
-                continue
-            name = f"coordinate {index} has "
-            if low.isfinite():
-                name += "no upper bound"
-            elif high.isfinite():
-                name += "no lower bound"
-            else:
-                name += "no bounds"
-            phrases.append(f"{name}: it counts in units of 1 around {centre:g}")
+            if missing := MISSING.get((bool(low.isfinite()), bool(high.isfinite()))):
+                unit = f"it counts in units of 1 around {centre:g}"
+                phrases.append(f"coordinate {index} has {missing}: {unit}")
         return phrases
 
 

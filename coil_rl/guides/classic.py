@@ -16,10 +16,10 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from coil_rl.ranges import checked
+from coil_rl.transforms.guide_memory import primer_of
 
 
 def lander(observation: Tensor, continuous: bool = False) -> Tensor:
@@ -171,9 +171,7 @@ class Oscillator(TensorDictModuleBase):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare the number of the step as memory."""
-        return TensorDictPrimer(
-            {"swum_steps": Unbounded((1,), dtype=torch.int64)}, expand_specs=True
-        )
+        return primer_of({"swum_steps": torch.zeros(1, dtype=torch.int64)})
 
 
 class Walker:

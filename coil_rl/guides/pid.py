@@ -14,11 +14,11 @@ from typing import Any, Literal, NamedTuple
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from coil_rl.ranges import NonNegative, Positive, checked
 from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key, written_key
+from coil_rl.transforms.guide_memory import primer_of
 from coil_rl.transforms.hosted import ToldGuide
 
 Numbers = float | Sequence[float]
@@ -181,8 +181,7 @@ class PID(ToldGuide):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare integral, filtered rate and last value as memory."""
-        spec = Unbounded((self.count,), dtype=torch.float64)
-        return TensorDictPrimer({name: spec.clone() for name in MEMORY}, expand_specs=True)
+        return primer_of(dict.fromkeys(MEMORY, torch.zeros(self.count, dtype=torch.float64)))
 
     @staticmethod
     def tunable(arguments: Mapping[str, Any]) -> dict[str, list[Any]]:

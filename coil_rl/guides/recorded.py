@@ -7,10 +7,10 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
-from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from coil_rl.files import LARGEST_TABLE, read_text
+from coil_rl.transforms.guide_memory import primer_of
 
 
 class RecordedGuide(TensorDictModuleBase):
@@ -37,9 +37,7 @@ class RecordedGuide(TensorDictModuleBase):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare the number of the step as memory."""
-        return TensorDictPrimer(
-            {"recorded_step": Unbounded((1,), dtype=torch.int64)}, expand_specs=True
-        )
+        return primer_of({"recorded_step": torch.zeros(1, dtype=torch.int64)})
 
 
 def _read_actions(file: str | os.PathLike[str]) -> torch.Tensor:

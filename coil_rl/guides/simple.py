@@ -26,23 +26,6 @@ def _batch_of(tensordict: TensorDictBase, key: NestedKey) -> torch.Size:
     return tensordict[key[:-1]].batch_size
 
 
-class _Uniform(SeededGenerator):
-    """Uniform random numbers [*batch, size] from `low` to `high`, or random actions of a space."""
-
-    def __init__(self, low: float | None, high: float | None, size: int, seed: int) -> None:
-        super().__init__(seed)
-        self.low, self.high, self.size = low, high, size
-        self.space: ActionSpace | None = None
-
-    def forward(self, batch: torch.Size, device: torch.device | None) -> Tensor:
-        if self.space is not None and self.low is None and self.high is None:
-            shape = (*batch, *self.space.agents, self.space.size)
-            return self.space.random(self.sample(torch.rand, shape).to(device, self.space.dtype))
-        low = -1.0 if self.low is None else self.low
-        high = 1.0 if self.high is None else self.high
-        return (low + (high - low) * self.sample(torch.rand, (*batch, self.size))).to(device)
-
-
 class ConstantGuide(TensorDictModuleBase):
     """Guide with a constant action.
 
@@ -67,11 +50,11 @@ class ConstantGuide(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         batch = _batch_of(tensordict, self.in_keys[0])
-        return tensordict.set(self.out_keys[0], self.value.expand(*batch, -1))
+        return tensordict.set(self.out_keys[0], self.value.expand(*batch, *self.value.shape))
 
 
 @checked
-class ZeroGuide(ToldGuide):
+class ZeroGuide(ConstantGuide, ToldGuide):
     """Guide with the neutral action: the centre of a bounded coordinate, the first of some choices.
 
     Args:
@@ -81,23 +64,15 @@ class ZeroGuide(ToldGuide):
             are.
     """
 
-    pure = True
-
     def __init__(
         self, size: Count = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action"
     ) -> None:
-        self.in_keys, self.out_keys = [in_key], [out_key]
-        super().__init__()
+        super().__init__(0.0, in_key, out_key)
         self.value: Tensor = nn.Buffer(torch.zeros(size), persistent=False)
 
     def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Take the neutral action of the env."""
         self.value = space.neutral()
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        batch = _batch_of(tensordict, self.in_keys[0])
-        return tensordict.set(self.out_keys[0], self.value.expand(*batch, *self.value.shape))
 
 
 @checked
@@ -128,16 +103,27 @@ class RandomGuide(ToldGuide):
     ) -> None:
         self.in_keys, self.out_keys = [in_key], [out_key]
         super().__init__()
-        self.module = _Uniform(low, high, size, seed)
+        self.low, self.high, self.size = low, high, size
+        self.module = SeededGenerator(seed)
+        self.space: ActionSpace | None = None
 
     def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Draw from the actions of the env from here on, unless `low` or `high` is given."""
-        self.module.space = space
+        if self.low is None and self.high is None:
+            self.space = space
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        batch = _batch_of(tensordict, self.in_keys[0])
-        return tensordict.set(self.out_keys[0], self.module(batch, tensordict.device))
+        batch, space = _batch_of(tensordict, self.in_keys[0]), self.space
+        size = (self.size,) if space is None else (*space.agents, space.size)
+        draws = self.module.sample(torch.rand, (*batch, *size))
+        if space is not None:
+            action = space.random(draws.to(tensordict.device, space.dtype))
+        else:
+            low = -1.0 if self.low is None else self.low
+            high = 1.0 if self.high is None else self.high
+            action = (low + (high - low) * draws).to(tensordict.device)
+        return tensordict.set(self.out_keys[0], action)
 
 
 class EntryGuide(TensorDictModule):
