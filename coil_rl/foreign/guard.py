@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from typing import Any
@@ -28,12 +28,23 @@ from torch.utils import _device as _torch_device
 WATCHED = 12  # first calls of a row, more than in a trial: does it use the global numbers?
 NUMBERS = "global random numbers"  # key of a saved state
 SEEDS = 2**32  # seeds of NumPy are below
-SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
-LOGGERS = (logging.root, logging.getLogger("coil_rl"))
-# Python's global generator, and its state in place: an index and 624 numbers of four bytes. Its
-# `getstate` takes fifty times as long, because it makes an object of each number.
-_PYTHON: Any = random._inst
-_STATE: Any = (ctypes.c_char * (4 * 625)).from_address(id(_PYTHON) + object.__basicsize__)
+# Those that end a program; not each system has all.
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
+SIGNALS = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
+
+GlobalNumbers = tuple[Any, list[Tensor], bytes, float | None]  # of NumPy, torch and Python
+
+
+def _state_of(generator: Any) -> Any:
+    """Return the state of a generator of Python in place: 624 numbers of four bytes, and an index.
+
+    Its `getstate` takes fifty times as long, because it makes an object of each number.
+    """
+    return (ctypes.c_char * (4 * 625)).from_address(id(generator) + object.__basicsize__)
+
+
+_PYTHON: Any = random._inst  # the global one
+_STATE = _state_of(_PYTHON)
 
 
 def _folder() -> str | None:
@@ -49,17 +60,6 @@ def _go_to(folder: str | None) -> None:
             os.chdir(folder)
 
 
-def _logging() -> tuple[int, ...]:
-    root, own = LOGGERS
-    return root.manager.disable, root.level, own.level
-
-
-def _set_logging(levels: tuple[int, ...]) -> None:
-    logging.disable(levels[0])
-    for logger, level in zip(LOGGERS, levels[1:], strict=True):
-        logger.setLevel(level)
-
-
 def _warnings() -> tuple[Any, ...]:
     return warnings.filters[:], warnings.showwarning, warnings.formatwarning
 
@@ -71,31 +71,6 @@ def _set_warnings(state: tuple[Any, ...]) -> None:
     warnings.filters[:] = filters  # type: ignore[index]
 
 
-def _printing() -> tuple[Any, ...]:
-    return np.get_printoptions(), np.geterr(), vars(tensor_str.PRINT_OPTS).copy()
-
-
-def _set_printing(state: tuple[Any, ...]) -> None:
-    options, errors, of_torch = state
-    np.set_printoptions(**options)
-    np.seterr(**errors)
-    vars(tensor_str.PRINT_OPTS).update(of_torch)
-
-
-def _computing() -> tuple[bool, bool]:
-    return torch.is_grad_enabled(), torch.is_autocast_enabled("cpu")
-
-
-def _set_computing(state: tuple[bool, bool]) -> None:
-    grad, autocast = state
-    torch._C._set_grad_enabled(grad)
-    torch.set_autocast_enabled("cpu", autocast)
-
-
-def _device() -> torch.device | None:
-    return _torch_device.CURRENT_DEVICE  # `torch.get_default_device` takes eighty times as long
-
-
 def _set_path(folders: list[str]) -> None:
     sys.path[:] = folders
 
@@ -105,34 +80,32 @@ def _set_recursion(limit: int) -> None:
         sys.setrecursionlimit(limit)
 
 
-def _set_streams(streams: tuple[Any, ...]) -> None:
-    sys.stdout, sys.stderr = streams
-
-
-def _handlers() -> list[Any]:
-    return [signal.getsignal(getattr(signal, name)) for name in SIGNALS if hasattr(signal, name)]
-
-
-def _set_handlers(handlers: list[Any]) -> None:
-    if threading.current_thread() is not threading.main_thread():
-        return  # other threads cannot
-    numbers = [getattr(signal, name) for name in SIGNALS if hasattr(signal, name)]
-    for number, handler in zip(numbers, handlers, strict=True):
-        if handler is not None:  # one that C code has set
-            signal.signal(number, handler)
+def _set_handler(number: int, handler: Any) -> None:
+    # None is one that C code has set; other threads cannot set any.
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(number, handler)
 
 
 # What reads a setting of the process, and what sets it. The first ones take a microsecond.
 SETTINGS: list[tuple[Callable[[], Any], Callable[[Any], Any]]] = [
     (_folder, _go_to),
     (torch.get_default_dtype, torch.set_default_dtype),
-    (_computing, _set_computing),
+    (torch.is_grad_enabled, torch._C._set_grad_enabled),
+    (partial(torch.is_autocast_enabled, "cpu"), partial(torch.set_autocast_enabled, "cpu")),
     (torch.get_num_threads, torch.set_num_threads),
-    (_logging, _set_logging),
+    (lambda: logging.root.manager.disable, logging.disable),
+    *[
+        (partial(getattr, logger, "level"), logger.setLevel)
+        for logger in (logging.root, logging.getLogger("coil_rl"))
+    ],
     (_warnings, _set_warnings),
-    (_printing, _set_printing),
-    (lambda: (sys.stdout, sys.stderr), _set_streams),
-    (_device, torch.set_default_device),
+    (np.get_printoptions, lambda options: np.set_printoptions(**options)),
+    (np.geterr, lambda errors: np.seterr(**errors)),
+    (vars(tensor_str.PRINT_OPTS).copy, vars(tensor_str.PRINT_OPTS).update),
+    (lambda: sys.stdout, partial(setattr, sys, "stdout")),
+    (lambda: sys.stderr, partial(setattr, sys, "stderr")),
+    # `torch.get_default_device` takes eighty times as long.
+    (lambda: _torch_device.CURRENT_DEVICE, torch.set_default_device),
     (lambda: sys.path[:], _set_path),
     (sys.getrecursionlimit, _set_recursion),
 ]
@@ -140,7 +113,10 @@ QUICK = len(SETTINGS)
 SETTINGS += [
     (torch.are_deterministic_algorithms_enabled, torch.use_deterministic_algorithms),
     (torch.get_float32_matmul_precision, torch.set_float32_matmul_precision),
-    (_handlers, _set_handlers),
+]
+KEPT = len(SETTINGS)  # but of handlers: without ours a Ctrl-C would be missed
+SETTINGS += [
+    (partial(signal.getsignal, number), partial(_set_handler, number)) for number in SIGNALS
 ]
 
 
@@ -180,40 +156,31 @@ class Numbers:
         if not self.active:
             return
         seed %= SEEDS
-        self.bits: Any = np.random.MT19937(seed)
-        self.states = [torch.Generator().manual_seed(seed).get_state()]
-        self.python = random.Random(seed).getstate()
+        states = [torch.Generator().manual_seed(seed).get_state()]
+        python = _state_of(random.Random(seed)).raw
+        self.own: GlobalNumbers = np.random.MT19937(seed), states, python, None
 
     def __enter__(self) -> None:
-        self.before = np.random.mtrand.get_bit_generator(), _of_torch(), random.getstate()
-        self.first = {} if self.used else self.bits.state["state"]
-        np.random.mtrand.set_bit_generator(self.bits)
-        _set_torch(self.states)
-        random.setstate(self.python)
+        self.first = [] if self.used else _plain(self.own)
+        self.before = _numbers()
+        _set_numbers(self.own)
 
     def __exit__(self, *_: object) -> None:
-        states, python = _of_torch(), random.getstate()
+        self.own = self.own[0], *_numbers()[1:]
+        _set_numbers(self.before)
         if not self.used:
             self.watched -= 1
-            key, at = (self.bits.state["state"][name] for name in ("key", "pos"))
-            self.used = not (
-                at == self.first["pos"]
-                and np.array_equal(key, self.first["key"])
-                and _equal(states, self.states)
-                and python == self.python
-            )
-        self.states, self.python = states, python
-        np.random.mtrand.set_bit_generator(self.before[0])
-        _set_torch(self.before[1])
-        random.setstate(self.before[2])
+            self.used = _plain(self.own) != self.first
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the generators as plain values; empty if they are not used."""
         if not self.used:
             return {}
-        numpy = self.bits.state["state"]
+        bits, states, raw, gauss = self.own
+        python, numpy = random.Random(), bits.state["state"]
+        _state_of(python).raw, python.gauss_next = raw, gauss  # type: ignore[attr-defined]
         key, pos = numpy["key"].tolist(), int(numpy["pos"])
-        return {"torch": self.states, "python": self.python, "numpy": [key, pos]}
+        return {"torch": states, "python": python.getstate(), "numpy": [key, pos]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
@@ -221,11 +188,32 @@ class Numbers:
             return
         self.used = True
         version, numbers, gauss = state["python"]
-        self.states, self.python = list(state["torch"]), (version, tuple(numbers), gauss)
+        python, bits = random.Random(), self.own[0]
+        python.setstate((version, tuple(numbers), gauss))
         key, pos = state["numpy"]
         inner = {"key": np.array(key, np.uint32), "pos": pos}
-        self.bits = np.random.MT19937()
-        self.bits.state = {"bit_generator": "MT19937", "state": inner}
+        bits.state = {"bit_generator": "MT19937", "state": inner}
+        self.own = bits, list(state["torch"]), _state_of(python).raw, gauss
+
+
+def _numbers() -> GlobalNumbers:
+    """Return the generator of NumPy, and the states of those of torch and Python."""
+    return np.random.mtrand.get_bit_generator(), _of_torch(), _STATE.raw, _PYTHON.gauss_next
+
+
+def _set_numbers(numbers: GlobalNumbers) -> None:
+    bits, states, _STATE.raw, _PYTHON.gauss_next = numbers
+    np.random.mtrand.set_bit_generator(bits)
+    torch.default_generator.set_state(states[0])
+    for generator, state in zip(torch.cuda.default_generators, states[1:], strict=False):
+        generator.set_state(state)
+
+
+def _plain(numbers: GlobalNumbers) -> list[Any]:
+    """Return what tells states of generators apart."""
+    bits, states, *python = numbers
+    numpy = bits.state["state"]
+    return [numpy["key"].tobytes(), numpy["pos"], *map(_bytes, states), *python]
 
 
 def _of_torch() -> list[Tensor]:
@@ -234,17 +222,6 @@ def _of_torch() -> list[Tensor]:
     if torch.cuda.is_initialized():
         states += [generator.get_state() for generator in torch.cuda.default_generators]
     return states
-
-
-def _set_torch(states: Sequence[Tensor]) -> None:
-    torch.default_generator.set_state(states[0])
-    for generator, state in zip(torch.cuda.default_generators, states[1:], strict=False):
-        generator.set_state(state)
-
-
-def _equal(states: Sequence[Tensor], others: Sequence[Tensor]) -> bool:
-    """Return whether states have the same bytes."""
-    return [_bytes(state) for state in states] == [_bytes(state) for state in others]
 
 
 def _bytes(state: Tensor) -> bytes:
@@ -278,22 +255,20 @@ class Guard:
         self.settings = [get() for get, _ in SETTINGS[: self.count]]
         for place, value in self.theirs.items():
             SETTINGS[place][1](value)
-        self.numbers = np.random.mtrand.get_bit_generator(), _of_torch(), _STATE.raw
-        self.gauss = _PYTHON.gauss_next
+        self.numbers = _numbers()
         np.random.mtrand.set_bit_generator(self.bits)
 
     def __exit__(self, *_: object) -> None:
-        bits, of_torch, python = self.numbers
-        np.random.mtrand.set_bit_generator(bits)
+        bits, states, *python = self.numbers
         # A number that is drawn shows whether others were, in less time than a comparison.
         self.touched = (
             self.bits.random_raw() != self.same_bits.random_raw()
-            or _STATE.raw != python
-            or not _equal(_of_torch(), of_torch)
+            or [_STATE.raw, _PYTHON.gauss_next] != python
+            or list(map(_bytes, _of_torch())) != list(map(_bytes, states))
         )
+        np.random.mtrand.set_bit_generator(bits)
         if self.touched:
-            _STATE.raw, _PYTHON.gauss_next = python, self.gauss
-            _set_torch(of_torch)
+            _set_numbers(self.numbers)
             self.bits, self.same_bits = np.random.MT19937(0), np.random.MT19937(0)
         now = [get() for get, _ in SETTINGS[: len(self.settings)]]
         if now != self.settings:
@@ -304,9 +279,8 @@ class Guard:
         for place, (before, after) in enumerate(zip(self.settings, now, strict=True)):
             if after == before:
                 continue
-            put = SETTINGS[place][1]
-            put(before)
-            if put is not _set_handlers:  # without ours a Ctrl-C would be missed
+            SETTINGS[place][1](before)
+            if place < KEPT:
                 self.theirs[place] = after
 
 
