@@ -16,6 +16,7 @@ from coil_rl.config.nodes import build, build_all, find_target
 from coil_rl.config.own_run import own_run
 from coil_rl.errors import UserError
 from coil_rl.foreign.guard import hold
+from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import MEAN_CASE, measures_of
 from coil_rl.plain_yaml import entries
@@ -101,26 +102,30 @@ def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
         config: of `coil-train`, composed or read from a folder.
         folder: of the run, which may have found other numbers for its guide.
     """
+    seconds: dict[str, float | None] = {}  # of a step of its envs
+
+    def made(
+        rows: int | None, cases: str, count: int | None, without: Collection[str] = ()
+    ) -> EnvBase:
+        env = build_bare_env(config, cases_node(config, rows, cases, count), without)
+        if isinstance(env, GymnasiumEnv):
+            env.seconds = seconds
+        return env
 
     def transforms(advice: str) -> list[Transform]:
         own = None if folder is None else own_run(config)
         found = config if own is None or folder is None else own.found(config, folder)
         return build_transforms(found, advice)
 
-    def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
-        return build_bare_env(config, cases_node(config, rows, cases, count))
-
     def of_agent(rows: int | None, cases: str, count: int | None) -> EnvBase:
-        unread = unread_controllers(config, _all_transforms(config))
-        return build_bare_env(config, cases_node(config, rows, cases, count), unread)
+        return made(rows, cases, count, unread_controllers(config, _all_transforms(config)))
 
     def alone(rows: int | None, cases: str, count: int | None) -> EnvBase:
-        controllers = OmegaConf.select(config, "env.controllers") or ()
-        return build_bare_env(config, cases_node(config, rows, cases, count), set(controllers))
+        return made(rows, cases, count, OmegaConf.select(config, "env.controllers") or ())
 
     curve = config.evaluation.curve
     return EnvMaker(
-        bare,
+        made,
         of_agent=of_agent,
         alone=alone,
         disturb=partial(build_disturbances, config),

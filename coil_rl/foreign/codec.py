@@ -23,7 +23,7 @@ from torchrl.data import (
     Unbounded,
 )
 
-from coil_rl.foreign.faults import ForeignError, largest, plain_array, shown
+from coil_rl.foreign.faults import FaultError, ForeignError, largest, plain_array, shown
 from coil_rl.foreign.makers import Env
 
 MOST_CHOICES = 32  # of a whole number that is an action
@@ -144,14 +144,14 @@ class Entry:
             observation: of one env, as it was returned.
 
         Raises:
-            ForeignError: for an entry that is missing, of another shape than its space has, not of
+            FaultError: for an entry that is missing, of another shape than its space has, not of
                 numbers, not finite, or no choice of its space.
         """
         for part in self.path:
             observation = self._part(observation, part)
         value = plain_array(observation, self.title)
         if value.shape != self.shape and not self._is_single(value):
-            raise ForeignError(
+            raise FaultError(
                 f"{self.title} has the shape {list(value.shape)}, but its space has "
                 f"{list(self.shape)}"
             )
@@ -172,22 +172,19 @@ class Entry:
                 converted = value.astype(self.dtype).reshape(self.given)
         if converted.dtype.kind == "f" and not _are_finite(converted):
             wrong = float(value.reshape(-1)[~np.isfinite(converted.reshape(-1))][0])
-            raise ForeignError(f"{self.title} holds {wrong}, not a finite number of {self.dtype}")
+            raise FaultError(f"{self.title} holds {wrong}, not a finite number of {self.dtype}")
         return converted
 
     @property
-    def bounds(self) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """Declared bounds, of the shape and dtype of `spec`; None for pixels and choices.
+    def bounds(self) -> list[NDArray[Any]]:
+        """Declared bounds, of the shape and dtype of `spec`; empty for choices.
 
         They are not those of `spec`, as some published envs leave them.
         """
-        if not isinstance(self.space, spaces.Box) or not self.spec.dtype.is_floating_point:
-            return None
-        low, high = (
-            torch.from_numpy(bound.astype(self.dtype).reshape(self.given))
-            for bound in (self.space.low, self.space.high)
-        )
-        return low, high
+        if not isinstance(self.space, spaces.Box):
+            return []
+        sides = self.space.low, self.space.high
+        return [bound.astype(self.dtype).reshape(self.given) for bound in sides]
 
     def outside(self, values: NDArray[Any]) -> tuple[int, float, float, float] | None:
         """Return where numbers are farthest outside the bounds of the space; None if nowhere.
@@ -200,10 +197,9 @@ class Entry:
         Returns:
             The index of the number in the entry, its value, and its bounds.
         """
-        if not isinstance(self.space, spaces.Box):
+        if not self.bounds:
             return None
-        bounds = (self.space.low, self.space.high)
-        low, high = (bound.ravel().astype(self.dtype).astype(np.float64) for bound in bounds)
+        low, high = (bound.ravel().astype(np.float64) for bound in self.bounds)
         numbers = values.reshape(len(values), -1).astype(np.float64)
         excess = np.maximum(low - numbers, numbers - high)
         if not excess.size or excess.max() <= 0:
@@ -219,23 +215,23 @@ class Entry:
         """Return a part of an observation by the key of a Dict space or the index of a Tuple."""
         if isinstance(part, int):
             if not isinstance(observation, (tuple, list)) or len(observation) <= part:
-                raise ForeignError(
+                raise FaultError(
                     f"{self.title} is missing: the observation is {shown(observation)}, not the "
                     "tuple of its space"
                 )
         elif not isinstance(observation, Mapping) or part not in observation:
             keys = list(observation) if isinstance(observation, Mapping) else observation
-            raise ForeignError(
+            raise FaultError(
                 f"{self.title} is missing: the observation has {shown(keys)}, but its space has "
                 f"the key {part!r}"
             )
         return observation[part]
 
     def _check(self, value: NDArray[Any], fits: NDArray[np.bool_] | np.bool_) -> None:
-        """Raise a `ForeignError` if a number does not fit the space."""
+        """Raise a `FaultError` if a number does not fit the space."""
         if not np.all(fits):
             wrong = float(value[np.logical_not(fits)].reshape(-1)[0])
-            raise ForeignError(f"{self.title} holds {wrong:g}, which is not in {self.space}")
+            raise FaultError(f"{self.title} holds {wrong:g}, which is not in {self.space}")
 
     def _one_hot(self, value: NDArray[Any]) -> NDArray[Any]:
         """Return choices as one-hot vectors side by side."""

@@ -222,8 +222,7 @@ class ControllerGuide(HostedGuide):
                 f"guide.entry.key=[controller,its] +env.controllers.its={title}"
             )
         keys = None if in_keys is None else [nested_key(key) for key in in_keys]
-        make = _of_class if inspect.isclass(called(thing)) else _of_object
-        guide = make(thing, title, keys, dict(options or {}))
+        guide = _guide_of(thing, title, keys, dict(options or {}))
         self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
         super().__init__()
         self.guide, self.pure = guide, getattr(called(thing), "pure", False)
@@ -253,34 +252,16 @@ class ControllerGuide(HostedGuide):
         return ForeignError(f"the controller {self.title}: its action {problem}")
 
 
-def _of_class(
-    make: Callable[..., Any], title: str, keys: list[NestedKey] | None, options: dict[str, Any]
+def _guide_of(
+    thing: Any, title: str, keys: list[NestedKey] | None, options: dict[str, Any]
 ) -> TensorDictModuleBase:
-    """Return the guide of a class, or of a partial of one, made with `options`."""
-    kind, role = called(make), role_of(make)
-    if not role:
+    """Return the guide of a class, a partial of one, a function, or an object."""
+    role, read, is_class = role_of(thing), keys or ["observation"], inspect.isclass(called(thing))
+    if not role and is_class:
         raise ValueError(
             f"of={title} is a class without act(observation); give it this method, or name a "
             "function"
         )
-    check_call(make, title, [], options)
-    made = partial(make, **options)
-    if role == "predict":
-        with foreign(f"the controller {title}", "the constructor"):
-            return _of_model(made(), title, keys)
-    if issubclass(kind, nn.Module):
-        return _of_module(made(), title, keys)
-    read = keys or ["observation"]
-    bound = isinstance(inspect.getattr_static(kind, "act"), (staticmethod, classmethod))
-    check_call(kind.act, f"{title}.act", read if bound else ["self", *read], {})
-    return PerRow(made, read, title=title)
-
-
-def _of_object(
-    thing: Any, title: str, keys: list[NestedKey] | None, options: dict[str, Any]
-) -> TensorDictModuleBase:
-    """Return the guide of a function, or of an object that is made already."""
-    role, read = role_of(thing), keys or ["observation"]
     if not role:
         raise ValueError(
             f"of={title} is {type(thing).__name__}; name a class, a function, an object with "
@@ -289,12 +270,42 @@ def _of_object(
     if role == "function":
         check_call(thing, title, read, options)
         return FunctionGuide(partial(thing, **options), read, title)
+    if is_class:
+        return _of_class(thing, title, keys, options)
     if options:
         raise ValueError(f"of={title} is an object, which takes no options; leave options out")
+    if isinstance(thing, nn.Module) and role != "predict":
+        thing = _copy_of(thing, title)
+    return _of_object(thing, title, keys)
+
+
+def _of_class(
+    kind: Callable[..., Any], title: str, keys: list[NestedKey] | None, options: dict[str, Any]
+) -> TensorDictModuleBase:
+    """Return the guide of a class, or of a partial of one, made with `options`."""
+    check_call(kind, title, [], options)
+    read, make = keys or ["observation"], partial(kind, **options)
+    act = called(kind).act if role_of(kind) == "act" else None
+    if act is None or issubclass(called(kind), nn.Module):
+        with foreign(f"the controller {title}", "the constructor"):
+            thing = make()
+        return _of_object(thing, title, keys)
+    bound = isinstance(inspect.getattr_static(called(kind), "act"), (staticmethod, classmethod))
+    check_call(act, f"{title}.act", read if bound else ["self", *read], {})
+    return PerRow(make, read, title=title)
+
+
+def _of_object(thing: Any, title: str, keys: list[NestedKey] | None) -> TensorDictModuleBase:
+    """Return the guide of an object; a method `act` is what acts, if its class has one."""
+    role, read = role_of(thing), keys or ["observation"]
     if role == "predict":
         return _of_model(thing, title, keys)
-    if isinstance(thing, nn.Module):
-        return _of_module(_copy_of(thing, title), title, keys)
+    if role == "guide" and keys is not None:
+        raise ValueError(f"of={title} has its own in_keys={thing.in_keys}; leave in_keys out")
+    if role == "guide":
+        return hold(thing)
+    if role == "network":
+        return NetworkGuide(thing, read, title)
     check_call(thing.act, f"{title}.act", read, {})
     return PerRow(maker_of_rows(thing), read, title=title)
 
@@ -309,19 +320,6 @@ def _of_model(model: Any, title: str, keys: list[NestedKey] | None) -> PerRow:
     if keys is None:
         keys = [nested_key(key) for key in parts] if isinstance(parts, Mapping) else ["observation"]
     return PerRow(partial(Predictor, model, keys), keys, title=title)
-
-
-def _of_module(module: nn.Module, title: str, keys: list[NestedKey] | None) -> TensorDictModuleBase:
-    """Return the guide of a module: its `act`, if its class has one, is what acts."""
-    if isinstance(module, TensorDictModuleBase):
-        if keys is not None:
-            raise ValueError(f"of={title} has its own in_keys={module.in_keys}; leave in_keys out")
-        return hold(module)
-    read = keys or ["observation"]
-    if role_of(module) != "act":
-        return NetworkGuide(module, read, title)
-    check_call(module.act, f"{title}.act", read, {})  # type: ignore[arg-type]
-    return PerRow(maker_of_rows(module), read, title=title)
 
 
 def _copy_of(module: nn.Module, title: str) -> nn.Module:

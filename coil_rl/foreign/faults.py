@@ -22,16 +22,22 @@ class ForeignError(ValueError):
     outside: ClassVar[bool] = True  # the cause is not in this program
 
 
+class FaultError(ForeignError):
+    """One without its place, which `foreign` adds."""
+
+
 @contextmanager
 def foreign(name: str, call: str) -> Iterator[None]:
-    """Turn what the code of somebody else raises into a `ForeignError`.
+    """Turn what the code of somebody else raises, and a `FaultError`, into a `ForeignError`.
 
     Args:
-        name: of the env or controller, as in "the env Plant".
+        name: of the env or controller, as in "the env Plant", and where it is.
         call: what it was asked, such as "step".
     """
     try:
         yield
+    except FaultError as error:
+        raise ForeignError(f"{name}: {error}") from error.__cause__
     except (ForeignError, KeyboardInterrupt):
         raise
     except BaseException as error:  # also what a library derives from it
@@ -40,12 +46,7 @@ def foreign(name: str, call: str) -> Iterator[None]:
         raise ForeignError(f"{name}: {call} raised {type(error).__name__}: {text}") from error
 
 
-def shortened(text: str) -> str:
-    """Return a text on one line, of at most 200 characters."""
-    return _cut(text, 200)
-
-
-def _cut(text: str, most: int) -> str:
+def shortened(text: str, most: int = 200) -> str:
     """Return a text on one line, of at most so many characters."""
     line = " ".join(text.split())
     return line if len(line) <= most else f"{line[:most].rstrip()} ..."
@@ -59,7 +60,7 @@ def shown(value: Any) -> str:
         text = repr(value.tolist() if hasattr(value, "tolist") else value)
     except Exception:  # a `__repr__` of other people may fail, too
         text = f"an object of {type(value).__name__}"
-    return _cut(text, 80)
+    return shortened(text, 80)
 
 
 def plain_array(value: Any, what: str) -> NDArray[Any]:
@@ -70,16 +71,16 @@ def plain_array(value: Any, what: str) -> NDArray[Any]:
         what: name of the value, for the message.
 
     Raises:
-        ForeignError: for anything else.
+        FaultError: for anything else.
     """
     if type(value) is np.ndarray and value.dtype.kind in "biuf":
         return value
     try:
         array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
     except Exception as error:
-        raise ForeignError(f"{what} is {shown(value)}, not an array of numbers") from error
+        raise FaultError(f"{what} is {shown(value)}, not an array of numbers") from error
     if array.dtype.kind not in "biuf" or np.ma.is_masked(value):
-        raise ForeignError(f"{what} is {shown(value)}, not an array of numbers")
+        raise FaultError(f"{what} is {shown(value)}, not an array of numbers")
     return array
 
 
@@ -87,7 +88,7 @@ def number(value: Any, what: str, dtype: np.dtype[Any]) -> float:
     """Return one number that is finite in a dtype, see `one_number`."""
     result = one_number(value, what)
     if not abs(result) <= largest(dtype):
-        raise ForeignError(f"{what} is {result}, not a finite number of {dtype}")
+        raise FaultError(f"{what} is {result}, not a finite number of {dtype}")
     return result
 
 
@@ -98,14 +99,14 @@ def one_number(value: Any, what: str) -> float:
         what: name of the number, for the message.
 
     Raises:
-        ForeignError: for None, a text, an array with a dimension, and a complex number.
+        FaultError: for None, a text, an array with a dimension, and a complex number.
     """
     try:
         if not isinstance(value, (str, bytes)) and np.ndim(value) == 0:
             return float(value)
     except Exception as error:
-        raise ForeignError(f"{what} is {shown(value)}, not one number") from error
-    raise ForeignError(f"{what} is {shown(value)}, not one number")
+        raise FaultError(f"{what} is {shown(value)}, not one number") from error
+    raise FaultError(f"{what} is {shown(value)}, not one number")
 
 
 @cache
@@ -121,13 +122,13 @@ def flag(value: Any, what: str) -> bool:
         what: name of the flag, for the message.
 
     Raises:
-        ForeignError: for anything but True, False, 1 and 0.
+        FaultError: for anything but True, False, 1 and 0.
     """
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     single = np.ndim(value) == 0 and not isinstance(value, (str, bytes))
     if not single or value is None or value not in (0, 1):
-        raise ForeignError(f"{what} is {shown(value)}, not True or False")
+        raise FaultError(f"{what} is {shown(value)}, not True or False")
     return bool(value)
 
 
@@ -135,16 +136,16 @@ def action_array(value: Any) -> NDArray[Any]:
     """Return an action of a controller as an array of at least one dimension.
 
     Raises:
-        ForeignError: for what is not numbers, or not finite; also for an action with a state, as
+        FaultError: for what is not numbers, or not finite; also for an action with a state, as
             controllers of some libraries return them.
     """
     if isinstance(value, tuple) and any(np.ndim(part) or part is None for part in value[:2]):
-        raise ForeignError(
+        raise FaultError(
             f"the action is the tuple {shown(value)}; return the action alone, without a state"
         )
     array = np.atleast_1d(plain_array(value, "the action"))
     if array.dtype == np.bool_:
         array = array.astype(np.int64)
     if not np.isfinite(array).all():
-        raise ForeignError(f"the action is {shown(array)}, which is not finite")
+        raise FaultError(f"the action is {shown(array)}, which is not finite")
     return array

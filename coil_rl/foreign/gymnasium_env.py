@@ -9,7 +9,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -33,10 +33,10 @@ from coil_rl.foreign.makers import (
 )
 from coil_rl.foreign.plant import GymnasiumPlant
 from coil_rl.foreign.rows import GymnasiumRows
-from coil_rl.foreign.workers import AUTO, Workers, choose, timed
-from coil_rl.ranges import Count, Seed, checked
+from coil_rl.foreign.workers import Workers, choose, timed
+from coil_rl.ranges import Count, Interval, Seed, checked
 
-MOST_WORKERS = 256
+Processes = Literal["auto"] | Annotated[int, Interval(ge=0, le=256)]
 RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "controller", "next")
 
 
@@ -90,6 +90,7 @@ class GymnasiumEnv(SeededRows):
         observation_bounds: declared bounds of the entries that have any, which they may leave.
         observed_choices: what converts an entry to its choices as the env gives them, by entry.
         optional: entries in which NaN is a number without a value, not a fault: those of `info`.
+        seconds: of a step of one row, by kind of env; the envs of a run share them.
 
     Raises:
         ValueError: if the env cannot be made, has a space that is not supported or an entry with a
@@ -122,11 +123,10 @@ class GymnasiumEnv(SeededRows):
         controllers: Mapping[str, Any] | None = None,
         fresh: bool = False,
         render: bool = False,
-        workers: int | str = 0,
+        workers: Processes = 0,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        _check_workers(workers)
         makers = dict(controllers or {})
         settings = dict(options or {})
         if max_steps is not None:
@@ -146,7 +146,8 @@ class GymnasiumEnv(SeededRows):
             return GymnasiumPlant(made, makers, reset_options, fresh, name, row)
 
         self.make_plant, self.asked = make_plant, workers
-        self.kind = f"{settings} {wrappers} {makers}"
+        self.kind = f"{name} {settings} {wrappers} {makers}"
+        self.seconds: dict[str, float | None] = {}
         self.workers: Workers | None = None
         self.info, self.optional = tuple(info), [("info", name) for name in info]
         with guard.whole():
@@ -177,8 +178,8 @@ class GymnasiumEnv(SeededRows):
             key = entry.key if len(entry.key) > 1 else name
             if entry.choices:
                 self.observed_choices[key] = Choices(entry.space)
-            if (bounds := entry.bounds) is not None:
-                low, high = (bound.to(self.device) for bound in bounds)
+            if entry.bounds and entry.spec.dtype.is_floating_point:
+                low, high = (torch.from_numpy(bound).to(self.device) for bound in entry.bounds)
                 self.observation_bounds[key] = low, high
         for name in self.info:
             observation["info", name] = number.clone()
@@ -254,7 +255,7 @@ class GymnasiumEnv(SeededRows):
             return GymnasiumRows(codec, self.info, self.held.guard).extend(map(make_plant, rows))
 
         seconds = partial(timed, make, codec.actions.space.sample)
-        number = choose(self.asked, count, seconds, codec.name, self.kind)
+        number = choose(self.asked, count, seconds, codec.name, self.seconds, self.kind)
         if number:
             self.shard = self.workers = Workers(make, count, number, codec.name)
         else:
@@ -296,15 +297,6 @@ class GymnasiumEnv(SeededRows):
             tensors[key] = value
         data = TensorDict(tensors, self.batch_size)
         return data if self.device is None or self.device.type == "cpu" else data.to(self.device)
-
-
-def _check_workers(workers: int | str) -> None:
-    """Raise a `ValueError` for what is no number of processes."""
-    whole = isinstance(workers, int) and not isinstance(workers, bool)
-    if workers != AUTO and not (whole and 0 <= int(workers) <= MOST_WORKERS):
-        raise ValueError(
-            f"workers={workers} must be auto or a whole number from 0 to {MOST_WORKERS}"
-        )
 
 
 def _rate(env: Env) -> float:

@@ -21,7 +21,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from coil_rl.errors import did_you_mean
-from coil_rl.foreign.faults import ForeignError, action_array, foreign
+from coil_rl.foreign.codec import Choices
+from coil_rl.foreign.faults import action_array, foreign
 from coil_rl.foreign.guard import Numbers
 
 INSTALLED = {"site-packages", "dist-packages"}  # folders of libraries
@@ -80,10 +81,15 @@ def _predicts(thing: Any) -> bool:
 
     Those of scikit-learn do not take `deterministic`.
     """
+    return "deterministic" in _parameters(getattr(thing, "predict", None))
+
+
+def _parameters(thing: Any) -> Mapping[str, inspect.Parameter]:
+    """Return the parameters of a callable; none of anything else."""
     try:
-        return "deterministic" in inspect.signature(thing.predict).parameters
-    except (AttributeError, TypeError, ValueError):  # some functions written in C have no signature
-        return False
+        return inspect.signature(thing).parameters
+    except (TypeError, ValueError):  # some that are written in C have no signature
+        return {}
 
 
 class Predictor:
@@ -148,14 +154,10 @@ def _mapped(convert: Callable[[Any], Any], kind: type, value: Any) -> Any:
 
 def _in_space(entry: NDArray[Any], space: Any) -> Any:
     """Return an entry as an observation of a Gymnasium space: choices are indices there."""
-    if space is not None and entry.shape == space.shape:
+    if space is None or entry.shape == space.shape:
         return entry
-    if isinstance(space, spaces.Discrete):
-        return int(entry.argmax()) + int(space.start)
-    if isinstance(space, spaces.MultiDiscrete):
-        parts = np.split(entry, np.cumsum(space.nvec.ravel())[:-1])
-        indices = np.array([part.argmax() for part in parts]).reshape(space.nvec.shape)
-        return indices + space.start
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        return Choices(space)(torch.from_numpy(entry)).numpy()[()]
     if isinstance(space, spaces.Box) and entry.size == math.prod(space.shape):
         return entry.reshape(space.shape)
     return entry
@@ -163,12 +165,8 @@ def _in_space(entry: NDArray[Any], space: Any) -> Any:
 
 def asks_for_env(thing: Any) -> bool:
     """Return whether a class or function, or a partial of one, has a parameter `env`."""
-    if not (inspect.isclass(called(thing)) or role_of(thing) == "function"):
-        return False
-    try:
-        return "env" in inspect.signature(thing).parameters
-    except (TypeError, ValueError):  # some that are written in C have no signature
-        return False
+    is_called = inspect.isclass(called(thing)) or role_of(thing) == "function"
+    return is_called and "env" in _parameters(thing)
 
 
 class Host:
@@ -233,11 +231,7 @@ class Host:
         if self.thing is None:
             self.open()
         with self.of_call(), foreign(self.place, "act"):
-            answer = self.thing.act(*observed)
-        try:
-            return action_array(answer)
-        except ForeignError as error:
-            raise ForeignError(f"{self.place}: {error}") from error
+            return action_array(self.thing.act(*observed))
 
 
 def check_call(

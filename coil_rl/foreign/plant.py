@@ -7,8 +7,8 @@ import copy
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, MutableMapping
+from contextlib import suppress
 from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
@@ -22,6 +22,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from coil_rl.foreign.beside import maker_beside
 from coil_rl.foreign.codec import Codec
 from coil_rl.foreign.faults import (
+    FaultError,
     ForeignError,
     flag,
     foreign,
@@ -53,7 +54,6 @@ class Plant(ABC):
         numbers: global random numbers as the env and the controllers beside it see them.
     """
 
-    ended_by: ClassVar[str]  # what could end an episode, for the warning
     limit: int | None = None
 
     def __init__(self, name: str, row: int) -> None:
@@ -91,19 +91,11 @@ class Plant(ABC):
         """Where the env is: its name, the row, the seed of the episode and the step."""
         return f"the env {self.name} (row {self.row}, seed {self.seed}, step {self.steps})"
 
-    @contextmanager
-    def placed(self) -> Iterator[None]:
-        """Add the place to a `ForeignError`."""
-        try:
-            yield
-        except ForeignError as error:
-            raise ForeignError(f"{self.place}: {error}") from error.__cause__
-
-    def is_too_long(self) -> bool:
-        """Return whether an episode has reached the limit, and say so."""
+    def is_too_long(self, wrapper: str) -> bool:
+        """Return whether an episode has reached the limit that a wrapper could set, and say so."""
         if self.limit is None or self.steps < self.limit:
             return False
-        warn_of_limit(self.name, self.limit, self.ended_by)
+        warn_of_limit(self.name, self.limit, wrapper)
         return True
 
 
@@ -125,7 +117,6 @@ class GymnasiumPlant(Plant):
         advice: of the controllers, by name.
     """
 
-    ended_by = "TimeLimit"
     # The envs of all rows of this process, to find one that two rows would share.
     alive: ClassVar[MutableMapping[int, Any]] = WeakValueDictionary()
     codec: Codec
@@ -172,15 +163,14 @@ class GymnasiumPlant(Plant):
         given: dict[str, Any] = {"options": dict(self.options)} if self.options else {}
         with foreign(self.place, "reset"):
             answer: Any = self.env.reset(seed=self.seed, **given)
-        with self.placed():
             if not isinstance(answer, (tuple, list)) or len(answer) != 2:
-                raise ForeignError(
+                raise FaultError(
                     f"reset returned {_counted(answer)}, not the two of Gymnasium (observation, "
                     "info)"
                 )
             self.observation, self.info = answer
             if not isinstance(self.info, Mapping):
-                raise ForeignError(f"info of reset is {shown(self.info)}, not a dictionary")
+                raise FaultError(f"info of reset is {shown(self.info)}, not a dictionary")
             self._look_for_masks()
             self.values = self.codec.read(self.observation)
         self.reward, self.terminated, self.truncated = 0.0, False, False
@@ -193,27 +183,23 @@ class GymnasiumPlant(Plant):
             self.reward = 0.0
             return
         self.steps += 1
-        try:  # without `foreign` and `placed`, which cost as much as a step of a small env
-            answer: Any = self.env.step(action)
+        try:  # without `foreign`, which costs as much as a step of a small env
+            self._take(self.env.step(action))
+            self.values = self.codec.read(self.observation)
         except BaseException as error:
             with foreign(self.place, "step"):
                 raise error
-        try:
-            self._take(answer)
-            self.values = self.codec.read(self.observation)
-        except ForeignError as error:
-            raise ForeignError(f"{self.place}: {error}") from error.__cause__
         if self.codec.fineness.unseen:
             self.codec.fineness.see(np.asarray(self.reward))
         if self.limit is not None and not self.terminated and not self.truncated:
-            self.truncated = self.is_too_long()
+            self.truncated = self.is_too_long("TimeLimit")
         if self.controllers and not self.terminated:
             self._advise()
 
     def _take(self, answer: Any) -> None:
         """Keep the checked values of a step."""
         if not isinstance(answer, (tuple, list)) or len(answer) != 5:
-            raise ForeignError(
+            raise FaultError(
                 f"step returned {_counted(answer)}, not the five of Gymnasium (observation, "
                 "reward, terminated, truncated, info)"
             )
@@ -226,7 +212,7 @@ class GymnasiumPlant(Plant):
             and -self.codec.largest <= reward <= self.codec.largest
         ):
             if not isinstance(info, Mapping):
-                raise ForeignError(f"info of step is {shown(info)}, not a dictionary")
+                raise FaultError(f"info of step is {shown(info)}, not a dictionary")
             reward = number(reward, "the reward", self.codec.floats)
             terminated, truncated = flag(terminated, "terminated"), flag(truncated, "truncated")
         if terminated and not truncated and info.get(OLD_LIMIT):
@@ -267,7 +253,7 @@ class GymnasiumPlant(Plant):
         value = self.info.get(name, math.nan)
         if np.ndim(value) == 1 and np.size(value) == 1:
             value = np.ravel(value)[0]
-        with self.placed():
+        with foreign(self.place, "info"):
             return one_number(value, f"info entry {name!r}")
 
     def _begin_controllers(self) -> None:
@@ -332,8 +318,6 @@ class TorchRLPlant(Plant):
         after: the entries after the last step or reset.
     """
 
-    ended_by = "StepCounter"
-
     def __init__(self, env: EnvBase, row: int) -> None:
         own = env.base_env if isinstance(env, TransformedEnv) else env
         super().__init__(type(own).__name__, row)
@@ -358,7 +342,7 @@ class TorchRLPlant(Plant):
 
     def _truncate(self, after: TensorDictBase) -> None:
         """End an episode that is too long."""
-        if not after["done"].any() and self.is_too_long():
+        if not after["done"].any() and self.is_too_long("StepCounter"):
             for name in ("done", "truncated"):
                 ends = after.get(name, None)
                 if ends is not None:

@@ -65,10 +65,7 @@ def takes_batch(
         raise
     except Exception:
         first = [entry[: len(ROWS)] for entry in rows]
-        if each is None:
-            return _agrees(title, first, together, None, form)
-        _agrees(title, first, each, None, form)
-        return False
+        return _agrees(title, first, each or together, None, form) and each is None
 
 
 def _agrees(
@@ -150,6 +147,18 @@ class _Shared(HostedGuide):
     space: ActionSpace | None = None  # unknown outside of an env
     choices: OwnChoices = {}  # noqa: RUF012  replaced, never changed
     for_batch: bool | None = None  # unknown before the first call
+    each: Ask | None = None  # asks for one row after the other, if that is possible
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action, which may be one number for each row, as regressors predict it."""
+        entries = [tensordict[key] for key in self.in_keys]
+        if torch.compiler.is_compiling():  # a traced function cannot raise
+            action = self._of_batch(entries)
+        else:
+            action = self._actions(entries, tensordict.batch_dims)
+        if self.space is not None:
+            action = self.space.as_column(action, tensordict.batch_size)
+        return tensordict.set("action", action)
 
     @abstractmethod
     def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
@@ -163,30 +172,30 @@ class _Shared(HostedGuide):
         self, action: Tensor, batch: torch.Size, space: ActionSpace, problem: str
     ) -> Exception | None:
         """Return the error for an action that does not fit the env."""
-        return ForeignError(f"the controller {self.title}: its action {problem}")
+        if self.for_batch:
+            return ForeignError(f"the controller {self.title}: its action {problem}")
+        number, returned, problem = space.unfit_row(action, batch)
+        place = f"the controller {self.title} (row {number})"
+        return ForeignError(f"{place}: it returned {shown(returned)}, which {problem}")
 
-    def _actions(self, entries: Sequence[Tensor], dims: int, each: Ask | None = None) -> Tensor:
+    def _actions(self, entries: Sequence[Tensor], dims: int) -> Tensor:
         """Return the actions for entries; before the first ones it is tried, see `takes_batch`.
 
         Args:
             entries: [*batch, ...].
             dims: number of dimensions of the batch.
-            each: asks for one row after the other; None if that is not possible.
         """
-        if torch.compiler.is_compiling():  # a traced function cannot raise
-            return self._of_batch(entries)
         with self.guard:
-            if self.for_batch and dims:
-                return self._of_batch(entries)
             rows = [entry.flatten(0, dims - 1) if dims else entry[None] for entry in entries]
             if self.for_batch is None:
                 with torch.no_grad(), warnings.catch_warnings():
                     warnings.simplefilter("ignore")  # of numbers that no env has
-                    form = self._has_form
-                    self.for_batch = takes_batch(self.title, rows, self._of_batch, each, form)
-            if self.for_batch or each is None:
+                    self.for_batch = takes_batch(
+                        self.title, rows, self._of_batch, self.each, self._has_form
+                    )
+            if self.for_batch or self.each is None:
                 return self._of_batch(entries)
-            action = each(rows).to(rows[0].device)
+            action = self.each(rows).to(rows[0].device)
             return action.reshape(*entries[0].shape[:dims], *action.shape[1:])
 
     def _has_form(self, together: Tensor, alone: Tensor) -> bool:
@@ -201,12 +210,6 @@ class _Shared(HostedGuide):
         if together.shape == (count, *alone.shape):
             return True
         return self.space is not None and self.space.takes(together, torch.Size([count]))
-
-    def _write(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
-        """Write the action, which may be one number for each row, as regressors predict it."""
-        if self.space is not None:
-            action = self.space.as_column(action, tensordict.batch_size)
-        return tensordict.set("action", action)
 
 
 class NetworkGuide(_Shared, TensorDictModule):
@@ -226,17 +229,12 @@ class NetworkGuide(_Shared, TensorDictModule):
         TensorDictModule.__init__(self, network, in_keys=list(in_keys), out_keys=["action"])
         self.title, self.guard = title, Guard()
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        entries = [tensordict[key] for key in self.in_keys]
-        return self._write(tensordict, self._actions(entries, tensordict.batch_dims))
-
     def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
         """Return the actions for all rows."""
         data = TensorDict({}, [], device=entries[0].device)
         for key, entry in zip(self.in_keys, entries, strict=True):
             data.set(key, entry)
-        action: Tensor = super().forward(data)["action"]
+        action: Tensor = TensorDictModule.forward(self, data)["action"]
         return action
 
 
@@ -276,22 +274,6 @@ class FunctionGuide(_Shared):
         self.title = title or getattr(function, "__name__", type(function).__name__)
         self.guard = Guard()
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        entries = [tensordict[key] for key in self.in_keys]
-        action = self._actions(entries, tensordict.batch_dims, self._of_rows)
-        return self._write(tensordict, action)
-
-    def unfit(
-        self, action: Tensor, batch: torch.Size, space: ActionSpace, problem: str
-    ) -> Exception | None:
-        """Return the error for an action that does not fit the env."""
-        if self.for_batch:
-            return super().unfit(action, batch, space, problem)
-        number, returned, problem = space.unfit_row(action, batch)
-        place = f"the controller {self.title} (row {number})"
-        return ForeignError(f"{place}: it returned {shown(returned)}, which {problem}")
-
     def _as_given(self, entries: Sequence[Tensor]) -> list[Tensor]:
         """Return entries as the env gives them, [*batch, ...]."""
         named = zip(self.in_keys, entries, strict=True)
@@ -299,16 +281,12 @@ class FunctionGuide(_Shared):
 
     def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
         """Return the actions for all rows."""
-        with foreign(f"the controller {self.title}", "it"):
-            action = self.function(*(entry.clone() for entry in self._as_given(entries)))
+        action = self.function(*(entry.clone() for entry in self._as_given(entries)))
         if isinstance(action, Tensor):
             return action  # checked on its device by `GuideActions`
-        try:
-            return torch.as_tensor(action_array(action), device=entries[0].device)
-        except ForeignError as error:
-            raise ForeignError(f"the controller {self.title}: {error}") from error
+        return torch.as_tensor(action_array(action), device=entries[0].device)
 
-    def _of_rows(self, entries: Sequence[Tensor]) -> Tensor:
+    def each(self, entries: Sequence[Tensor]) -> Tensor:
         """Return the actions for one row after the other."""
         rows = [self._alone(entries, row) for row in range(len(entries[0]))]
         if len({row.shape for row in rows}) > 1:
@@ -322,11 +300,7 @@ class FunctionGuide(_Shared):
         """Return the action for one row, as an array of at least one dimension."""
         with foreign(f"the controller {self.title} (row {row})", "it"):
             alone = self._as_given([entry[row] for entry in entries])
-            action = self.function(*(entry.cpu().numpy().copy()[()] for entry in alone))
-        try:
-            return action_array(action)
-        except ForeignError as error:
-            raise ForeignError(f"the controller {self.title} (row {row}): {error}") from error
+            return action_array(self.function(*(each.cpu().numpy().copy()[()] for each in alone)))
 
 
 def _beside_others(entry: Tensor) -> Tensor:

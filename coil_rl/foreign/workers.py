@@ -19,7 +19,6 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from itertools import pairwise
 from multiprocessing.connection import Connection, wait
 from multiprocessing.util import Finalize, register_after_fork
@@ -29,6 +28,7 @@ import torch
 from numpy.typing import NDArray
 
 from coil_rl.foreign.faults import ForeignError
+from coil_rl.foreign.guard import SIGNALS
 from coil_rl.foreign.rows import Entries, GymnasiumRows
 
 AUTO = "auto"
@@ -36,30 +36,12 @@ SAVED = 2e-3  # seconds; a batched step of this length pays for the messages
 LEAST_STEPS, MOST_STEPS, LONGEST = 5, 30, 0.05  # of a timing, in steps and seconds
 FIRST = 10  # priority of what ends the processes, at the end of the program
 PATIENCE = 5.0  # seconds between two messages while processes start, and until one must have ended
-# Signals that are meant for the program: it saves its state, and then ends its processes itself.
-IGNORED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
 
 MakeRows = Callable[[range], GymnasiumRows]
+# What a process answers: a value, or an error in its place, and warnings.
+Reply = tuple[Any, Exception | None, list[tuple[str, type[Warning]]]]
 
 _log = logging.getLogger(__name__)
-_seconds: dict[str, float | None] = {}  # of a step of one row, by env
-
-
-@dataclass
-class _Reply:
-    """What a process answers.
-
-    Args:
-        value: of the command.
-        fault: of an env or controller, as one sentence.
-        bug: a traceback, of anything else.
-        warned: messages and categories of warnings.
-    """
-
-    value: Any = None
-    fault: str = ""
-    bug: str = ""
-    warned: list[tuple[str, type[Warning]]] = field(default_factory=list)
 
 
 def _spread(pids: Sequence[int]) -> None:
@@ -95,12 +77,9 @@ class Workers:
         edges = [rows * number // count for number in range(count + 1)]
         self.ranges = [range(*pair) for pair in pairwise(edges)]
         self.name = name
-        self.pipes: list[Connection] = []
-        self.processes: list[Any] = []
-        for own in self.ranges:
-            pipe, process = _started(_serve, make, own)
-            self.pipes.append(pipe)
-            self.processes.append(process)
+        started = [_started(make, own) for own in self.ranges]
+        self.pipes = [pipe for pipe, _ in started]
+        self.processes = [process for _, process in started]
         _spread([process.pid for process in self.processes])
         # At the end of the program this runs before multiprocessing waits for its processes, which
         # do not end while their pipes are open.
@@ -134,7 +113,7 @@ class Workers:
             mine = {row - own.start: seed for row, seed in seeds.items() if row in own}
             theirs = {row - own.start: actions[row] for row in actions if row in own}
             self._send(pipe, ("begin", mine, theirs))
-        return self._gather()
+        return [entries for part in self._gather() for entries in part]
 
     def step(self, actions: Sequence[Any]) -> list[Entries]:
         """Take a step in all rows, and return the entries of each process.
@@ -144,7 +123,7 @@ class Workers:
         """
         for pipe, own in zip(self.pipes, self.ranges, strict=True):
             self._send(pipe, ("step", actions[own.start : own.stop]))
-        return self._gather()
+        return [entries for part in self._gather() for entries in part]
 
     def picture(self, row: int) -> NDArray[Any]:
         """Return a picture of a row."""
@@ -166,46 +145,46 @@ class Workers:
         replies = [self._reply(number) for number in range(len(self.pipes))]
         return [self._value(reply) for reply in replies]
 
-    def _reply(self, number: int) -> _Reply:
-        try:
-            reply: _Reply = self.pipes[number].recv()
-        except (EOFError, OSError):
-            return _Reply(fault=self._death(number))
-        return reply
-
-    def _value(self, reply: _Reply) -> Any:
-        for text, category in reply.warned:
-            warnings.warn(text, category, stacklevel=2)
-        if reply.fault:
-            raise ForeignError(reply.fault)
-        if reply.bug:
-            raise RuntimeError(f"a process of env.workers failed:\n{reply.bug}")
-        return reply.value
-
-    def _death(self, number: int) -> str:
+    def _reply(self, number: int) -> Reply:
+        with suppress(EOFError, OSError):  # of a process that died
+            reply: Reply = self.pipes[number].recv()
+            return reply
         process, own = self.processes[number], self.ranges[number]
         process.join(PATIENCE)
         code = process.exitcode
         how = f"by signal {-code}" if code is not None and code < 0 else f"with exit code {code}"
-        return (
+        error = ForeignError(
             f"the process of env.workers that held the rows {own.start} to {own.stop - 1} of the "
             f"env {self.name} ended {how}; an env that needs too much memory or a crash in its "
             "own library does that: try env.workers=0"
         )
+        return None, error, []
+
+    def _value(self, reply: Reply) -> Any:
+        value, error, warned = reply
+        for text, category in warned:
+            warnings.warn(text, category, stacklevel=2)
+        if error is not None:
+            raise error
+        return value
 
 
 def choose(
-    workers: int | str, rows: int, seconds: Callable[[], float | None], name: str, kind: str = ""
+    workers: int | str,
+    rows: int,
+    seconds: Callable[[], float | None],
+    name: str,
+    known: dict[str, float | None],
+    kind: str = "",
 ) -> int:
     """Return the number of processes for some rows; 0 for none besides this one.
-
-    An env is timed once in a program.
 
     Args:
         workers: as a person gave it: a number, or "auto" for as many as there are cores if a step
             of all rows is long enough.
         seconds: gives the duration of a step of one row; None if it cannot be timed.
-        kind: text that tells envs of one name apart.
+        known: these durations, by `kind`, which are measured once.
+        kind: text that tells envs apart.
 
     Raises:
         ValueError: for a number of processes on a system that cannot fork.
@@ -223,11 +202,10 @@ def choose(
     # A process of a sweep has its share of the cores already.
     if not can_fork or cores < 2 or multiprocessing.parent_process() is not None:
         return 0
-    known = f"{name} {kind}"
-    first = known not in _seconds
+    first = kind not in known
     if first:
-        _seconds[known] = seconds()
-    each = _seconds[known]
+        known[kind] = seconds()
+    each = known[kind]
     if each is None:
         return 0
     count = cores if each * rows >= SAVED else 0
@@ -274,13 +252,13 @@ def _cores() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
-def _started(serve: Callable[..., None], *arguments: Any) -> tuple[Connection, Any]:
+def _started(make: MakeRows, own: range) -> tuple[Connection, Any]:
     """Fork a process; return this program's end of the pipe to it, and the process."""
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe()
     # A pipe that another process holds open too would not say that its program has ended.
     register_after_fork(here, Connection.close)
-    process = context.Process(target=_in_process, args=(serve, there, *arguments), daemon=True)
+    process = context.Process(target=_serve, args=(there, make, own), daemon=True)
     with warnings.catch_warnings():
         # Newer Pythons warn of a fork beside threads; those here hold no lock that an env needs.
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -289,51 +267,37 @@ def _started(serve: Callable[..., None], *arguments: Any) -> tuple[Connection, A
     return here, process
 
 
-def _in_process(serve: Callable[..., None], pipe: Connection, *arguments: Any) -> None:
-    """Serve one pipe in a process that has just been forked."""
-    for name in IGNORED:
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+def _serve(pipe: Connection, make: MakeRows, own: range) -> None:
+    """Make rows in a process that has just been forked, and do what the batch asks of them."""
+    for number in SIGNALS:  # the program saves its state, and then ends its processes itself
+        signal.signal(number, signal.SIG_IGN)
     torch.set_num_threads(1)  # threads do not survive a fork
-    serve(pipe, *arguments)
+    shard, *fault = _caught(make, own)
+    with suppress(EOFError, OSError):  # the batch has ended
+        pipe.send((None, *fault))
+        while shard is not None:
+            name, *arguments = pipe.recv()
+            pipe.send(_caught(getattr(shard, name), *arguments))
+    if shard is not None:
+        shard.close()
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)  # what the program does at its end, such as on a GPU, is not for its copies
 
 
-def _serve(pipe: Connection, make: MakeRows, own: range) -> None:
-    """Make rows, and do what the batch asks of them until it closes the pipe."""
-    reply, shard = _caught(lambda: make(own))
-    with suppress(EOFError, OSError):  # the batch has ended
-        pipe.send(_Reply(None, reply.fault, reply.bug, reply.warned))
-        while shard is not None:
-            name, *arguments = pipe.recv()
-            reply, _ = _caught(lambda: _done(shard, name, arguments))  # noqa: B023
-            pipe.send(reply)
-    if shard is not None:
-        shard.close()
-
-
-def _done(shard: GymnasiumRows, name: str, arguments: Sequence[Any]) -> Any:
-    if name == "picture":
-        return shard.picture(*arguments)
-    (entries,) = shard.begin(*arguments) if name == "begin" else shard.step(*arguments)
-    return entries
-
-
-def _caught(call: Callable[[], Any]) -> tuple[_Reply, Any]:
-    """Return the reply for a call, and its value."""
-    reply, value = _Reply(), None
+def _caught(call: Callable[..., Any], *arguments: Any) -> Reply:
+    """Return the reply for a call."""
+    value, error = None, None  # type: Any, Exception | None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         try:
-            reply.value = value = call()
-        except ValueError as error:
-            reply.fault = str(error)
+            value = call(*arguments)
+        except ValueError as fault:
+            error = ForeignError(str(fault))
         except Exception:
-            reply.bug = traceback.format_exc()
-    reply.warned = [(str(each.message), each.category) for each in caught]
-    return reply, value
+            text = traceback.format_exc()
+            error = RuntimeError(f"a process of env.workers failed:\n{text}")
+    return value, error, [(str(each.message), each.category) for each in caught]
 
 
 def _ended(pipes: Sequence[Connection], processes: Sequence[Any]) -> None:

@@ -19,7 +19,7 @@ from worlds import continued
 
 from coil_rl import GymnasiumEnv
 from coil_rl.foreign.faults import ForeignError
-from coil_rl.foreign.host import Predictor, role_of
+from coil_rl.foreign.host import role_of
 from coil_rl.guides import ControllerGuide, FollowAdvice, PerRow
 from coil_rl.learners import PPO
 from coil_rl.run import checkpoint
@@ -572,26 +572,11 @@ def test_saved_model_of_stable_baselines3_is_a_guide(tmp_path):
             np.testing.assert_allclose(advice.numpy(), expected, atol=1e-5)
 
 
-class Recurrent:
-    """As a model of Stable-Baselines3, recurrent; it knows its batches of rows by their calls."""
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        count = np.zeros(1) if state is None or episode_start[0] else state[0]
-        assert deterministic
-        return np.float32(observation[:1] * 0 + count), (count + 1,)
-
-
 def test_model_with_predict_is_a_controller_beside_its_env():
-    env = GymnasiumEnv("Pendulum-v1", 2, max_steps=4, controllers={"model": Recurrent()})
+    env = GymnasiumEnv("Pendulum-v1", 2, max_steps=4, controllers={"model": Model()})
     advice = env.rollout(6, break_when_any_done=False)["controller", "model"]
-    assert advice[..., 0].tolist() == [[0, 1, 2, 3, 0, 1]] * 2
-
-
-def test_predictor_hands_the_state_on():
-    controller = Predictor(Recurrent())
-    for _ in range(2):
-        controller.reset()
-        assert [controller.act(np.zeros(2)).item() for _ in range(3)] == [0, 1, 2]
+    expected = torch.tensor([[0, 0.1, 0.2, 0.3, 0, 0.1]] * 2)
+    torch.testing.assert_close(advice[..., 0], expected)
 
 
 def test_only_models_with_deterministic_predict():
@@ -599,9 +584,9 @@ def test_only_models_with_deterministic_predict():
         def predict(self, x):
             return x
 
-    class Both(Recurrent):
+    class Both(Model):
         def act(self, x):
             return x
 
-    found = [role_of(each) for each in (Recurrent(), Recurrent, Regressor(), Both(), 3)]
+    found = [role_of(each) for each in (Model(), Model, Regressor(), Both(), 3)]
     assert found == ["predict", "predict", "", "act", ""]

@@ -11,9 +11,11 @@ import torch
 from gymnasium import spaces
 from worlds import drive, reloaded, same
 
-from coil_rl import GymnasiumEnv
+from coil_rl import GymnasiumEnv, compose_train
+from coil_rl.config.parts import env_maker
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.workers import choose
+from coil_rl.run.parts import TEST, TRAIN
 
 
 class Plant(gymnasium.Env):
@@ -158,7 +160,8 @@ def test_env_that_cannot_be_made_is_refused_at_once() -> None:
 
 @pytest.mark.parametrize("workers", [-1, 1.5, "many", True, 10_000])
 def test_number_of_processes_is_checked(workers) -> None:
-    with pytest.raises(ValueError, match=f"workers={workers} must be auto or a whole number"):
+    message = r"workers=.* must be 'auto' or (at (least|most)|a valid int)"
+    with pytest.raises(ValueError, match=message):
         plants(workers)
 
 
@@ -166,14 +169,17 @@ def test_number_of_processes_is_checked(workers) -> None:
     ("seconds", "count"), [(1e-6, 0), (1e-3, min(2, len(os.sched_getaffinity(0)))), (None, 0)]
 )
 def test_long_steps_are_spread_over_the_cores(seconds, count) -> None:
-    found = choose("auto", 2, lambda: seconds and 2 * seconds, "Plant", kind=str(seconds))
+    found = choose("auto", 2, lambda: seconds and 2 * seconds, "Plant", {})
     assert found == (count if count > 1 else 0)
 
 
-def test_an_env_is_timed_once_in_a_program() -> None:
-    times = iter([1e-6])
-    for rows in (2, 4):
-        assert choose("auto", rows, lambda: next(times), "Plant", kind="once") == 0
+def test_envs_of_a_run_are_timed_once(monkeypatch) -> None:
+    timed = []
+    monkeypatch.setattr("coil_rl.foreign.gymnasium_env.timed", lambda *_: timed.append(1))
+    make = env_maker(compose_train(["env=pendulum", "method=ppo"]))
+    for rows, cases in ((2, TRAIN), (4, TEST)):
+        make(rows, cases).reset()
+    assert len(timed) == (len(os.sched_getaffinity(0)) > 1)
 
 
 def test_a_slow_plant_is_spread_by_itself() -> None:
