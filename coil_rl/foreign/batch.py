@@ -139,7 +139,7 @@ class SeededRows(SeededEnv):
         if self.continues:
             taken = {row: steps[longest - age :, row] for row, age in enumerate(self.ages)}
         self.begin(dict(enumerate(self.seeds)), taken)
-        self.continues = self.continues and _same(self._observed().to_dict(), state["observed"])
+        self.continues = self.continues and same(self._observed().to_dict(), state["observed"])
         if not self.continues:
             warnings.warn(
                 "the env cannot go on with its running episodes to the bit, so new ones begin"
@@ -148,12 +148,12 @@ class SeededRows(SeededEnv):
             )
 
 
-def _same(one: Any, other: Any) -> bool:
+def same(one: Any, other: Any) -> bool:
     """Return whether two nested dictionaries of tensors are equal, NaN included."""
     if isinstance(one, dict):
         if one.keys() != other.keys():
             return False
-        return all(_same(value, other[key]) for key, value in one.items())
+        return all(same(value, other[key]) for key, value in one.items())
     return np.array_equal(one.cpu().numpy(), other.cpu().numpy(), equal_nan=one.is_floating_point())
 
 

@@ -5,6 +5,7 @@ both live by their steps and not by the clock? It is the same in the check befor
 is evaluated, driven or exported, and in `coil_rl.testing`.
 """
 
+import gc
 import inspect
 import math
 import pickle
@@ -24,7 +25,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from coil_rl.foreign.batch import SeededRows, optional_entries
+from coil_rl.foreign.batch import SeededRows, optional_entries, same
 from coil_rl.foreign.controllers import PerRow
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
@@ -102,7 +103,10 @@ class Trial:
 
     def ask_env(self) -> None:
         """Ask the env: finite numbers, its seed, the clock, its bounds and its rows."""
-        shared = _Shared(self._kinds_of_env())
+        kinds: list[type] = []
+        if isinstance(self.base, GymnasiumEnv):
+            kinds = [type(layer) for layer in layers(self.base.held.plants[0].env)]
+        shared = _Shared(kinds)
         state = self.env.state_dict() if self.env is not self.base else None
         with torch.random.fork_rng():
             first, _, again = (self._rollout(seed, state) for seed in (0, 1, 0))
@@ -111,7 +115,7 @@ class Trial:
             if changed is not None:
                 self._find_unrepeated(changed)
             elif isinstance(self.base, SeededRows):
-                changed = difference(first, self._rollout(0, state, pause=PAUSE))
+                changed = difference(first, self._rollout(0, state, pause=True))
                 if changed is not None:
                     self.find("clock", f"{_title(changed)} differs when time passes {CLOCK}")
             self._look_at_bounds(first)
@@ -120,20 +124,20 @@ class Trial:
                 self._reset_of_one_row(shared)
 
     def _rollout(
-        self, seed: int, state: Mapping[str, Any] | None = None, pause: float = 0.0
+        self, seed: int, state: Mapping[str, Any] | None = None, *, pause: bool = False
     ) -> TensorDictBase:
         """Return a rollout of random actions, the same ones for each seed of the env.
 
         Args:
             state: of the transforms, which have no seed.
-            pause: before each of the first steps, in seconds.
+            pause: whether time passes before each of the first steps.
         """
         act, left = _random(self.env), [PAUSED if pause else 0]
 
         def policy(data: TensorDictBase) -> TensorDictBase:
             if left[0]:
                 left[0] -= 1
-                self.clock.pause(pause)
+                self.clock.pause()
             return act(data)
 
         if state is not None:
@@ -207,11 +211,6 @@ class Trial:
             env.set_seed(1)
             return present
 
-        def reset(present: TensorDictBase) -> TensorDictBase:
-            mask = torch.zeros_like(present["done"])
-            mask[0] = True
-            return env.reset(present.set("_reset", mask))
-
         def second_step(change: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:
             env.set_seed(0)
             torch.manual_seed(0)
@@ -220,7 +219,7 @@ class Trial:
             return env.step(act(present))["next"]
 
         plain, seeded = second_step(lambda present: present), second_step(seed)
-        changed = difference(plain[1:], second_step(reset)[1:])
+        changed = difference(plain[1:], second_step(partial(_with_new_row, env))[1:])
         if difference(plain, seeded) is None and changed is not None:
             self.find(
                 "rows",
@@ -228,11 +227,6 @@ class Trial:
                 f"all rows share {shared.changed() or SOMETHING}; make it in __init__, for each "
                 "object its own",
             )
-
-    def _kinds_of_env(self) -> list[type]:
-        if not isinstance(self.base, GymnasiumEnv):
-            return []
-        return [type(layer) for layer in layers(self.base.held.plants[0].env)]
 
     def recorded(self) -> TensorDictBase:
         """Return data [B, T] of random actions, with at least two rows.
@@ -272,10 +266,10 @@ class Trial:
             action_key: of the action.
             tolerance: allowed effect of other rows.
         """
-        asked, middle = self._asked(guide, recorded, action_key), recorded.shape[1] // 2
-        first, again, fresh = asked.advice(), asked.advice(), asked.advice(begin=middle)
+        ask, middle = partial(self._advice, guide, action_key=action_key), recorded.shape[1] // 2
+        first, again, fresh = ask(recorded), ask(recorded), ask(recorded[:, middle:])
         try:
-            interrupted = asked.advice(reset_at=middle)
+            interrupted = ask(recorded, reset_at=middle)
         except (IndexError, RuntimeError) as error:
             self.find(
                 "past",
@@ -284,29 +278,65 @@ class Trial:
             )
             return
         equal = partial(torch.allclose, rtol=0, atol=tolerance)
-        if not torch.equal(first, again):
-            self.find(
+        found: list[tuple[Kind, bool, str]] = [
+            (
                 "draws",
+                torch.equal(first, again),
                 "the guide's action is another one for the same history; it draws, or remembers "
                 "earlier episodes",
-            )
-        if not equal(interrupted[1:], first[1:]):
-            self.find("rows", "the guide's action for a row depends on the reset of another row")
-        if not equal(interrupted[0, middle:], fresh[0]):
-            self.find(
+            ),
+            (
+                "rows",
+                equal(interrupted[1:], first[1:]),
+                "the guide's action for a row depends on the reset of another row",
+            ),
+            (
                 "past",
+                equal(interrupted[0, middle:], fresh[0]),
                 "the guide's action after the reset of a row depends on what was before it",
-            )
-        if not torch.equal(first, asked.advice(pause=PAUSE)) and torch.equal(first, again):
-            self.find("clock", f"the guide's action is another one when time passes {CLOCK}")
+            ),
+            (
+                "clock",
+                torch.equal(again, ask(recorded, pause=True)) or not torch.equal(first, again),
+                f"the guide's action is another one when time passes {CLOCK}",
+            ),
+        ]
+        for kind, is_right, text in found:
+            if not is_right:
+                self.find(kind, text)
 
-    def _asked(
+    def _advice(
         self,
         guide: TensorDictModuleBase,
-        recorded: TensorDictBase,
+        data: TensorDictBase,
         action_key: NestedKey = "action",
-    ) -> "AskedGuide":
-        return AskedGuide(guide, self.env, recorded, action_key, self.clock)
+        *,
+        reset_at: int | None = None,
+        pause: bool = False,
+    ) -> Tensor:
+        """Return the advice of a guide at each step of recorded data, [B, T].
+
+        Args:
+            guide: the guide.
+            data: [B, T].
+            action_key: of the action.
+            reset_at: step at which an episode of row 0 begins anew; None for no reset.
+            pause: whether time passes before each of the first steps.
+        """
+        env = TransformedEnv(Recorded(self.env, data), GuideActions({"guide": guide}, action_key))
+        taken = []
+        with self.clock:
+            present = env.reset()
+            for step in range(data.shape[1]):
+                if step:
+                    if pause and step <= PAUSED:
+                        self.clock.pause()
+                    present.set(action_key, data[action_key][:, step - 1])
+                    present = env.step(present)["next"]
+                if step == reset_at:
+                    present = _with_new_row(env, present)
+                taken.append(present["guide_action"])
+        return torch.stack(taken, 1)
 
     def ask_controller(self, guide: TensorDictModuleBase) -> None:
         """Ask objects of a controller along a few steps, each time new ones.
@@ -328,7 +358,7 @@ class Trial:
 
     def _ask_objects(self, own: PerRow, recorded: TensorDictBase, shared: "_Shared") -> None:
         first, start = _new(own, own.make), time.perf_counter()
-        advice = self._asked(first, recorded).advice()
+        advice = self._advice(first, recorded)
         slow = math.ceil((time.perf_counter() - start) / self.patience)
         if slow > 1:
             recorded = recorded[:, : max(FEWEST, recorded.shape[1] // slow)]
@@ -336,7 +366,7 @@ class Trial:
 
         def ask(data: TensorDictBase, **how: Any) -> Tensor:
             again = _new(own, lambda: _reseeded(own.make(), first))
-            return self._asked(again, data).advice(**how)
+            return self._advice(again, data, **how)
 
         title = f"the controller {own.title}"
         if not torch.allclose(advice, ask(recorded)):
@@ -349,7 +379,7 @@ class Trial:
                 self.find("draws", f"{title} {text}: {UNREPEATED}")
             return
         # First, because the readings of one row pass the time of the others.
-        if not torch.allclose(advice, ask(recorded, pause=PAUSE)):
+        if not torch.allclose(advice, ask(recorded, pause=True)):
             self.find("clock", f"{title} gives other actions when time passes {CLOCK}")
             return
         alone, reset = ask(recorded[:1]), ask(recorded, reset_at=recorded.shape[1] // 2)
@@ -403,10 +433,8 @@ class Clock:
 
     def __enter__(self) -> "Clock":
         self.passed = 0.0
-        for name in self.names:
+        for name in self.read:
             setattr(time, name, partial(self._now, name))
-        for name in self.dates:
-            setattr(time, name, partial(self._date, name))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -414,19 +442,18 @@ class Clock:
         for name, read in self.read.items():
             setattr(time, name, read)
 
-    def _now(self, name: str) -> float:
+    def _now(self, name: str, *given: float) -> Any:
+        if name in self.dates:
+            return self.read[name](*(given or [self._now("time")]))
         self.passed += self.tick
         since = round(self.passed * 1e9) if name.endswith("_ns") else self.passed
         return self.start[name] + since
 
-    def _date(self, name: str, *given: float) -> time.struct_time:
-        return self.read[name](*(given or [self._now("time")]))
-
-    def pause(self, seconds: float) -> None:
+    def pause(self) -> None:
         """Let time pass: much of it by this clock, and some by every other one."""
         self.passed += JUMP
         self.tick = SLOW
-        time.sleep(seconds)
+        time.sleep(PAUSE)
 
 
 class _Shared:
@@ -513,10 +540,12 @@ def difference(one: TensorDictBase, other: TensorDictBase) -> NestedKey | None:
     return next((key for key, value in one.items(True, True) if not same(value, other[key])), None)
 
 
-def same(one: Tensor, other: Tensor) -> bool:
-    """Return whether two tensors have the same shape and numbers, NaN included."""
-    arrays = one.cpu().numpy(), other.cpu().numpy()
-    return np.array_equal(*arrays, equal_nan=one.is_floating_point())
+def _with_new_row(env: EnvBase, present: TensorDictBase) -> TensorDictBase:
+    """Return the data of an env after a reset of row 0."""
+    done = torch.zeros(len(present), 1, dtype=torch.bool, device=env.device)
+    mask = torch.zeros_like(present.get("done", done))
+    mask[0] = True
+    return env.reset(present.set("_reset", mask))
 
 
 class Recorded(EnvBase):
@@ -558,60 +587,6 @@ class Recorded(EnvBase):
         pass
 
 
-class AskedGuide:
-    """A guide that is asked along recorded data.
-
-    Args:
-        guide: the guide.
-        env: of which the data is.
-        recorded: the data, [B, T].
-        action_key: of the action.
-        clock: that it reads.
-    """
-
-    def __init__(
-        self,
-        guide: TensorDictModuleBase,
-        env: EnvBase,
-        recorded: TensorDictBase,
-        action_key: NestedKey,
-        clock: Clock,
-    ) -> None:
-        self.action_key, self.recorded, self.clock = action_key, recorded, clock
-        advise = GuideActions({"guide": guide}, action_key)
-        self.env = TransformedEnv(Recorded(env, recorded), advise)
-
-    def advice(self, begin: int = 0, reset_at: int | None = None, pause: float = 0.0) -> Tensor:
-        """Return the advice at each step, [B, T - begin].
-
-        Args:
-            begin: step of the data with which the episodes begin.
-            reset_at: step at which an episode of row 0 begins anew; None for no reset.
-            pause: before each of the first steps, in seconds.
-        """
-        data = self.recorded[:, begin:].exclude("next")
-        self.env.base_env.data = data
-        with self.clock:
-            return self._asked(data, reset_at, pause)
-
-    def _asked(self, data: TensorDictBase, reset_at: int | None, pause: float) -> Tensor:
-        present, taken = self.env.reset(), []
-        for step in range(data.shape[1]):
-            if step == reset_at:
-                mask = torch.zeros(len(data), 1, dtype=torch.bool, device=self.env.device)
-                mask[0] = True
-                present = self.env.reset(present.set("_reset", mask))
-            taken.append(present["guide_action"])
-            if step + 1 < data.shape[1]:
-                if pause and step < PAUSED:
-                    self.clock.pause(pause)
-                action = TensorDict(
-                    {self.action_key: data[self.action_key][:, step]}, present.batch_size
-                )
-                present = self.env.step(present.update(action))["next"]
-        return torch.stack(taken, 1)
-
-
 def _reseeded(thing: Any, first: PerRow) -> Any:
     """Return an object with other random numbers than the copy of it that acted first."""
     known = dict(_unseeded(first.hosts[0].thing))
@@ -629,18 +604,14 @@ def _unseeded(thing: Any) -> Iterator[tuple[int, Any]]:
     seen, waiting = set[int](), [thing]
     while waiting:
         value = waiting.pop()
-        if id(value) in seen or isinstance(value, (type, ModuleType, FunctionType, float, str)):
+        if id(value) in seen or isinstance(value, (type, ModuleType, FunctionType)):
             continue
         seen.add(id(value))
-        if isinstance(value, (np.random.Generator, np.random.RandomState)):
-            holder: Any = value
-            bits = getattr(holder, "bit_generator", None) or holder._bit_generator
-            entropy = getattr(bits.seed_seq, "entropy", None)
-            if isinstance(entropy, int) and entropy >= LARGEST_SEED:
-                yield id(bits), bits
-        elif isinstance(value, Mapping):
-            waiting.extend(value.values())
-        elif isinstance(value, (list, tuple, set, deque)):
-            waiting.extend(value)
-        elif hasattr(value, "__dict__"):
-            waiting.extend(vars(value).values())
+        if not isinstance(value, (np.random.Generator, np.random.RandomState)):
+            waiting.extend(gc.get_referents(value))
+            continue
+        holder: Any = value
+        bits = getattr(holder, "bit_generator", None) or holder._bit_generator
+        entropy = getattr(bits.seed_seq, "entropy", None)
+        if isinstance(entropy, int) and entropy >= LARGEST_SEED:
+            yield id(bits), bits
