@@ -411,7 +411,10 @@ def test_fault_of_a_controller_has_its_place(answer, message, beside):
         given = {"guide": PerRow(lambda: next(makers), title="PID")}
     with pytest.raises(ForeignError, match=message) as caught:
         stepped(**given)
-    place = r"row 0, seed 7, step 3" if beside else "the controller PID (row 1, step 3): "
+    place = "the controller PID (row 1, step 3): "
+    if beside:
+        assert str(caught.value).startswith("the controller pid beside the env ")
+        place = "row 0, seed 7, step 3): "
     assert place in str(caught.value)
     assert is_one_sentence(caught)
 
