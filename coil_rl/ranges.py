@@ -27,6 +27,7 @@ Share = Annotated[float, Interval(ge=0, le=1)]
 Count = Annotated[int, Ge(1)]
 Index = Annotated[int, Ge(0)]
 Seed = Annotated[int, Interval(ge=0, le=2**63 - 1)]
+Processes = Literal["auto"] | Annotated[int, Interval(ge=0, le=256)]
 
 # What is said of pydantic's errors; of others its own words.
 WORDS = {

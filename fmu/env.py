@@ -15,7 +15,7 @@ from coil_fmu.plant import FAILED, FMU, SETPOINT, Clock, Reward, Wiring, action_
 from coil_fmu.reward import Follow
 from coil_fmu.setpoints import Course, course_of
 from coil_rl import GymnasiumEnv
-from coil_rl.ranges import Count, Len, Positive, Seed, checked
+from coil_rl.ranges import Count, Len, Positive, Processes, Seed, checked
 
 
 class Rows(TypedDict, total=False):
@@ -27,7 +27,7 @@ class Rows(TypedDict, total=False):
     cases: Count | None
     controllers: Mapping[str, Any] | None
     fresh: bool
-    workers: int | str
+    workers: Processes
     device: torch.device | str
     dtype: torch.dtype
 

@@ -9,7 +9,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,9 +34,8 @@ from coil_rl.foreign.makers import (
 from coil_rl.foreign.plant import GymnasiumPlant
 from coil_rl.foreign.rows import GymnasiumRows
 from coil_rl.foreign.workers import Workers, choose, timed
-from coil_rl.ranges import Count, Interval, Seed, checked
+from coil_rl.ranges import Count, Processes, Seed, checked
 
-Processes = Literal["auto"] | Annotated[int, Interval(ge=0, le=256)]
 RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "controller", "next")
 
 
