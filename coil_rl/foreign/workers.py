@@ -103,12 +103,7 @@ class Workers:
     def begin(
         self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]
     ) -> list[Entries]:
-        """Begin episodes, take some actions in each, and return the entries of each process.
-
-        Args:
-            seeds: by row.
-            actions: by row, as the env takes them; a row that is missing takes none.
-        """
+        """Begin episodes, see `Shard`."""
         for pipe, own in zip(self.pipes, self.ranges, strict=True):
             mine = {row - own.start: seed for row, seed in seeds.items() if row in own}
             theirs = {row - own.start: actions[row] for row in actions if row in own}
@@ -116,11 +111,7 @@ class Workers:
         return [entries for part in self._gather() for entries in part]
 
     def step(self, actions: Sequence[Any]) -> list[Entries]:
-        """Take a step in all rows, and return the entries of each process.
-
-        Args:
-            actions: of all rows, as the env takes them.
-        """
+        """Take a step in all rows, see `Shard`."""
         for pipe, own in zip(self.pipes, self.ranges, strict=True):
             self._send(pipe, ("step", actions[own.start : own.stop]))
         return [entries for part in self._gather() for entries in part]

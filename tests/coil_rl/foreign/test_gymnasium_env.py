@@ -9,9 +9,10 @@ import pytest
 import torch
 from gymnasium import spaces
 from torchrl.data import Bounded, Categorical, MultiCategorical, Unbounded
+from torchrl.envs import GymEnv, PendulumEnv
 from worlds import drive, reloaded, same
 
-from coil_rl import GymnasiumEnv
+from coil_rl import EnvBatch, GymnasiumEnv
 from coil_rl.testing import check_env
 
 LIMIT = 7  # steps of an episode of `Echo`
@@ -105,7 +106,13 @@ ENVS = {
 }
 
 
+SINGLE = {"Pendulum": PendulumEnv, "CartPole": partial(GymEnv, "CartPole-v1")}  # of TorchRL
+ALL = [*ENVS, *SINGLE]
+
+
 def build(id, num_envs=3, **arguments):
+    if id in SINGLE:
+        return EnvBatch(SINGLE[id], num_envs, **arguments)
     if id in ("LunarLander-v3", "BipedalWalker-v3"):
         pytest.importorskip("Box2D", reason="Box2D is not installed")
     return GymnasiumEnv(id, num_envs, **(ENVS.get(id, {}) | arguments))
@@ -118,16 +125,21 @@ def test_env_fits_its_specs(id, dtype):
     check_env(build(id, dtype=dtype), steps=30)
 
 
-@pytest.mark.fast(2)
-@pytest.mark.parametrize("id", ENVS)
+@pytest.mark.parametrize("id", SINGLE)
+def test_batch_of_single_envs_fits_its_specs(id):
+    check_env(build(id))
+
+
+@pytest.mark.fast("CartPole-v1", "Pendulum")
+@pytest.mark.parametrize("id", ALL)
 def test_seed_determines_all_episodes(id):
     one, other, third = (drive(build(id, seed=seed), 60)[0] for seed in (1, 1, 2))
     assert same(one, other)
     assert not same(one, third)
 
 
-@pytest.mark.fast(2)
-@pytest.mark.parametrize("id", ENVS)
+@pytest.mark.fast("Echo-v0", "CartPole")
+@pytest.mark.parametrize("id", ALL)
 def test_saved_env_goes_on_to_the_bit(id):
     env = build(id, 4, seed=5)
     _, carrier = drive(env, 45)
@@ -477,28 +489,6 @@ def test_finished_row_stays_as_it_is():
     assert after["terminated"].all()
     assert after["real"][:, 0].tolist() == [LIMIT] * 3
     assert after["reward"].tolist() == [[0.0]] * 3
-
-
-@pytest.mark.parametrize("steps", [3, 9])
-def test_own_number_of_steps_replaces_that_of_the_maker(steps):
-    def limited():
-        inner = gymnasium.wrappers.TimeLimit(gymnasium.make("Pendulum-v1"), 6)
-        return gymnasium.wrappers.OrderEnforcing(inner)
-
-    env = GymnasiumEnv(limited, max_steps=steps)
-    assert env.rollout(20)["next", "truncated"].flatten().tolist() == [False] * (steps - 1) + [True]
-
-
-def test_own_number_of_steps_replaces_that_of_a_registered_maker():
-    def limited(**options):
-        return gymnasium.wrappers.TimeLimit(gymnasium.make("Pendulum-v1", **options), 6)
-
-    gymnasium.register("LimitedInside-v0", limited)
-    try:
-        env = GymnasiumEnv("LimitedInside-v0", max_steps=9)
-        assert env.rollout(20).shape == (1, 9)
-    finally:
-        del gymnasium.registry["LimitedInside-v0"]
 
 
 @pytest.mark.parametrize("workers", [0, 2])

@@ -1,5 +1,7 @@
 """A TorchRL env that never ends and names no limit is truncated after 1,000 steps."""
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -95,10 +97,10 @@ def test_attribute_only_makes_the_limit_longer():
     class Planner(Endless):
         horizon = 10
 
-    class Named(Endless):
+    class Patient(Endless):
         max_steps = 1010
 
-    assert [part.max_steps for part in limits_of(Named(2))] == [1010]
+    assert [part.max_steps for part in limits_of(Patient(2))] == [1010]
     assert [part.max_steps for part in limits_of(Planner(2))] == [1000]
 
 
@@ -145,31 +147,43 @@ def ended(env, steps):
     return None
 
 
-@pytest.mark.usefixtures("few")
-def test_env_without_a_limit_gets_one_that_is_said():
-    env = GymnasiumEnv(lambda: Plant(end=None), 2)
-    with pytest.warns(UserWarning, match=r"did not end within 30 steps, and no TimeLimit"):
-        assert ended(env, LIMIT + 5) == (LIMIT, True)
+class Named(Plant):
+    max_steps = 40
+
+
+class Mistaken(Plant):
+    horizon = 10  # of a predictive controller
+
+
+class AlsoMistaken(Plant):
+    horizon = np.int64(40)
+
+
+def limited(**_):
+    """Return the plant with a limit of 6 steps inside of another wrapper."""
+    return gymnasium.wrappers.OrderEnforcing(gymnasium.wrappers.TimeLimit(Plant(), 6))
+
+
+gymnasium.register("LimitedInside-v0", limited)
 
 
 @pytest.mark.usefixtures("few")
 @pytest.mark.filterwarnings("error")
-def test_limit_of_an_env_is_its_own():
-    assert ended(GymnasiumEnv(lambda: Plant(end=None), max_steps=4), 9) == (4, True)
-    assert ended(GymnasiumEnv(lambda: Plant(end=6)), 9) == (6, True)
-
-    class Named(Plant):
-        max_steps = 40
-
-    assert ended(GymnasiumEnv(lambda: Named(end=40)), 50) == (40, True)
+@pytest.mark.parametrize(
+    ("id", "max_steps", "expected"),
+    [
+        (Plant, 4, 4),
+        (partial(Plant, end=6), None, 6),
+        (partial(Named, end=40), None, 40),
+        *((limited, None, 6), (limited, 3, 3), (limited, 9, 9), ("LimitedInside-v0", 9, 9)),
+    ],
+)
+def test_limit_of_an_env_is_its_own_or_that_of_the_user(id, max_steps, expected):
+    assert ended(GymnasiumEnv(id, max_steps=max_steps), 50) == (expected, True)
 
 
 @pytest.mark.usefixtures("few")
-@pytest.mark.parametrize(("steps", "expected"), [(10, LIMIT), (np.int64(40), 40)])
-def test_attribute_of_a_gymnasium_env_only_makes_the_limit_longer(steps, expected):
-    class Mistaken(Plant):
-        horizon = steps  # of a predictive controller
-
-    env = GymnasiumEnv(lambda: Mistaken(end=None))
-    with pytest.warns(UserWarning, match=rf"did not end within {expected} steps"):
-        assert ended(env, 50) == (expected, True)
+@pytest.mark.parametrize(("id", "expected"), [(Plant, 30), (Mistaken, 30), (AlsoMistaken, 40)])
+def test_env_without_a_limit_gets_one_that_is_said_and_attributes_make_it_longer(id, expected):
+    with pytest.warns(UserWarning, match=rf"not end within {expected} steps, and no TimeLimit"):
+        assert ended(GymnasiumEnv(id, 2), 50) == (expected, True)
