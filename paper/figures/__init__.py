@@ -1,1 +1,1 @@
-"""Illustrations of the docs: `python -m coil_paper.figures.world`, also `spline` and `lines`."""
+"""Illustrations of the docs: `python -m coil_paper.figures.world`, and `lines`."""
