@@ -491,6 +491,14 @@ def test_finished_row_stays_as_it_is():
     assert after["reward"].tolist() == [[0.0]] * 3
 
 
+def test_time_limit_truncates():
+    env = GymnasiumEnv("Pendulum-v1", 2, max_steps=5)
+    ends = env.rollout(5, break_when_any_done=False)["next"]
+    assert ends["truncated"][:, -1].all()
+    assert not ends["terminated"].any()
+    assert ends["done"].sum() == 2
+
+
 @pytest.mark.parametrize("workers", [0, 2])
 def test_episodes_begin_with_the_options_of_reset(workers):
     env = GymnasiumEnv(
@@ -545,6 +553,13 @@ def test_discrete_controller_gives_indices():
     )
     assert env.reset()["controller", "a"].tolist() == [11, 11]
     assert drive(env, 4)[0][-1]["controller", "a"].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("advice", [[0.0], [0.0, float("nan")], None])
+def test_wrong_advice_names_the_controller(advice):
+    env = GymnasiumEnv("Echo-v0", controllers={"broken": lambda env, observation: advice})
+    with pytest.raises(ValueError, match="the controller broken beside the env Echo-v0 "):
+        env.reset()
 
 
 def test_pictures_show_the_first_row():
