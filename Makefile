@@ -54,7 +54,7 @@ test-bench: $(INSTALLED) ## install Stable-Baselines3 and run the tests that com
 # The packages of the loggers are needed for this only; without them these tests are skipped.
 test-extras: $(INSTALLED) ## install Weights & Biases and MLflow and run the tests of the loggers
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[wandb,mlflow]'
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m '' tests/coil_rl/config/test_logger.py tests/coil_rl/programs/test_loggers.py
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m '' tests/coil_rl/config/test_trust.py tests/coil_rl/programs/test_loggers.py
 
 test-wheel: $(INSTALLED) ## run the tests that need no checkout with a wheel in a bare environment
 	$(BIN)/python tests/try_wheel.py $(ARGS)

@@ -10,10 +10,11 @@ from coil_rl.lazy import lazy_names
 
 if TYPE_CHECKING:
     from coil_rl.comparison.compare import compare as compare
+    from coil_rl.config.assemble import LearnedGuide as LearnedGuide
+    from coil_rl.config.compose import check_values as check_values
     from coil_rl.config.compose import compose_train as compose_train
     from coil_rl.config.folder import pretrained_card as pretrained_card
     from coil_rl.config.folder import pretrained_names as pretrained_names
-    from coil_rl.config.learned_guide import LearnedGuide as LearnedGuide
     from coil_rl.config.nodes import build as build
     from coil_rl.config.python import open_run as open_run
     from coil_rl.config.python import prepare as prepare
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from coil_rl.config.schema import NodeConfig as NodeConfig
     from coil_rl.config.schema import ProgramConfig as ProgramConfig
     from coil_rl.config.trust import trust_packages as trust_packages
-    from coil_rl.config.values import check_values as check_values
     from coil_rl.envs import ConeTrackEnv as ConeTrackEnv
     from coil_rl.envs import DrivingTasksEnv as DrivingTasksEnv
     from coil_rl.envs import McapReplayEnv as McapReplayEnv

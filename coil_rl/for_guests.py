@@ -1,6 +1,6 @@
 """What a guest needs for programs of its own, besides the other public names.
 
-A guest is a package beside coil-rl. See `coil_rl.config.compose` for its YAML files.
+A guest is a package beside coil-rl. See `coil_rl.config.schema` for its YAML files.
 """
 
 from typing import TYPE_CHECKING
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from coil_rl.lazy import lazy_names as lazy_names
 
 if TYPE_CHECKING:
-    from coil_rl.config.fits import check_guide_in_env as check_guide_in_env
+    from coil_rl.config.check import check_guide_in_env as check_guide_in_env
     from coil_rl.config.nodes import check_arguments as check_arguments
     from coil_rl.config.parts import build_guides as build_guides
     from coil_rl.config.schema import PolicyConfig as PolicyConfig

@@ -17,7 +17,7 @@ from omegaconf import base
 from package_entries import find_entry_points
 from torch._export import utils
 
-from coil_rl.config.compose import shipped_places
+from coil_rl.config.schema import shipped_places
 from coil_rl.envs import Track, load_track
 from coil_rl.report import style
 

@@ -39,11 +39,10 @@ from coil_rl.comparison.page import command_of, delayed_sentence, draw, page_of
 from coil_rl.comparison.same import identity_of, keep_plan, known_plan
 from coil_rl.comparison.timing import Plan
 from coil_rl.comparison.verdict import NOTHING, Verdict, verdict
-from coil_rl.config.check import check
+from coil_rl.config.check import check, check_read
 from coil_rl.config.parts import env_maker
 from coil_rl.config.python import Named, composed, named, new_folder
 from coil_rl.config.trust import trust_own
-from coil_rl.config.unread import check_read
 from coil_rl.errors import UserError
 from coil_rl.files import FAILED_JOBS, write_text
 from coil_rl.output import decoration, quietly, say

@@ -10,9 +10,9 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from coil_rl.comparison.timing import Plan
-from coil_rl.config import source
+from coil_rl.config import nodes
 from coil_rl.config.folder import identity
-from coil_rl.config.given import kept
+from coil_rl.config.nodes import kept
 from coil_rl.config.python import Named
 from coil_rl.record import json_file
 from coil_rl.run.folder import check_same
@@ -51,7 +51,7 @@ def identity_of(given: Named, config: DictConfig, minutes: float, seed: int) -> 
         minutes: that it may take.
         seed: of the first trainings.
     """
-    code = source.code_of_user(config, ("env", "guide"))
+    code = nodes.code_of_user(config, ("env", "guide"))
     arguments = {
         "words": list(given.words),
         "objects": sorted(given.nodes),
@@ -65,9 +65,7 @@ def identity_of(given: Named, config: DictConfig, minutes: float, seed: int) -> 
         for key, node in given.nodes.items():
             # The node of an object contains the folder, which may be moved.
             if key != "tune":
-                OmegaConf.update(
-                    described, key, source.identity_of(kept(node["name"])), merge=False
-                )
+                OmegaConf.update(described, key, nodes.identity_of(kept(node["name"])), merge=False)
     found = {"identity": arguments, "configuration": identity(described)}
     return dict(json.loads(json.dumps(found, default=str)))
 

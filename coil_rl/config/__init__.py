@@ -3,5 +3,4 @@
 Besides the programs it is the only package that reads YAML.
 """
 
-import coil_rl.config.compose  # noqa: F401  registers the files of guests with Hydra
-import coil_rl.config.schema  # noqa: F401  registers the root configurations and resolvers with Hydra
+import coil_rl.config.schema  # noqa: F401  registers with Hydra

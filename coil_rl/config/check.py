@@ -1,12 +1,15 @@
 """Check of a configuration before a run starts: ranges, and one small build of every part.
 
-A mistake is found in seconds.
+A mistake is found in seconds. So is a word of the command line that nothing reads: it would have
+no effect, and is refused. Some nodes are read by some runs only, or only where another value refers
+to them.
 """
 
+import math
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict import NestedKey
@@ -14,34 +17,46 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from coil_rl.config import parts
-from coil_rl.config.fits import (
-    check_entry,
-    check_guide_in_env,
-    check_measures,
-    check_number,
-)
+from coil_rl.config.compose import check_values
 from coil_rl.config.folder import run_folder
 from coil_rl.config.nodes import build, build_all, check_node
-from coil_rl.config.own_run import own_run
-from coil_rl.config.passive import check_passive, passive
-from coil_rl.config.proxies import (
+from coil_rl.config.parts import (
     frames_of_proxies,
     guides_with_untrained_proxies,
     guides_without_parameters,
+    own_run,
     proxy_config,
 )
-from coil_rl.config.schema import TrainConfig
-from coil_rl.config.trust import check_logger
-from coil_rl.config.values import check_values
+from coil_rl.config.schema import TrainConfig, passive
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.off_policy import OffPolicy
+from coil_rl.output import say
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, transformed, try_out
 from coil_rl.run.training import INIT
 from coil_rl.transforms.action_space import nested_key
+
+if TYPE_CHECKING:
+    pass
+from collections.abc import Iterator, Mapping, Sequence
+
+import torch
+from torchrl.data import Composite
+from torchrl.envs import TransformedEnv
+
+from coil_rl.config.compose import REFERENCE, covers, key_of
+from coil_rl.config.parts import advises, env_maker, learner_kind, trains_guides
+from coil_rl.extras import require
+from coil_rl.foreign.batch import optional_entries
+from coil_rl.foreign.faults import ForeignError
+from coil_rl.guides.simple import FollowAdvice
+from coil_rl.measures import measures_of
+from coil_rl.plain_yaml import is_part, leaves
+from coil_rl.transforms import GuideActions
+from coil_rl.transforms.guide_actions import UnfitActionError
 
 # Kind of a learner: description and example.
 KINDS = {
@@ -323,3 +338,285 @@ def _check_frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> None:
             f"guides take {taken} frames; give at least "
             f"{taken + budget.num_envs * budget.steps}, or a smaller proxy.budget.frames"
         )
+
+
+def check_passive(config: DictConfig, make_env: "EnvMaker") -> None:
+    """Check a training in an env that does not react, and print what there is to learn from.
+
+    Raises:
+        UserError: for a method that needs the effect of its actions, for a budget that does not
+            reach all steps, and if nothing can be learned.
+    """
+    from coil_rl.run.parts import TRAIN  # imports torch
+
+    kind = passive(config)
+    if kind is None:
+        return
+    env: Any = make_env.bare(None, TRAIN, None)  # first, because it says if there are no data
+    explores = False
+    for node in config.method.transforms.values():
+        probability = OmegaConf.select(node, "probability")
+        explores = explores or (probability is not None and probability != 1.0)
+    if config.method.learner != "imitation" or explores:
+        raise UserError(
+            f"{kind.__name__} does not react to actions, so method={config.method.name} cannot "
+            "learn there; imitate what it shows with method=oil, and go on from there in an env "
+            "that reacts: method=dagger env=ENV learner.dataset=FOLDER/dataset.pt"
+        )
+    _check_pass(config, env, kind.whole_pass(config.env)[0])
+    try:
+        for line in env.demonstrations():
+            say(line)
+    except ValueError as error:
+        raise UserError(f"env: {error}") from error
+
+
+def _check_pass(config: DictConfig, env: Any, episodes: int) -> None:
+    """Raise a `UserError` for a training that ends before all steps of all episodes were seen."""
+    rows, longest = env.batch_size[0], int(env.length.max())
+    if rows < episodes:
+        raise UserError(
+            f"env.num_envs={rows} leaves out episodes, of which there are {episodes}; leave "
+            f"budget.num_envs and env.num_envs out, or give at least {episodes}"
+        )
+    steps = config.budget.steps
+    seen = math.ceil(config.budget.frames / (rows * steps)) * steps
+    if seen < longest:
+        raise UserError(
+            f"budget.frames={config.budget.frames} is {seen} steps of each episode, and the "
+            f"longest has {longest}, so the others would be left out; leave budget.frames "
+            f"out, or give at least {rows * longest}"
+        )
+
+
+EPISODE_REWARD = "episode_reward"  # written by a transform of every env
+
+
+def check_measures(measures: Any, env: EnvBase) -> None:
+    """Raise a `UserError` for a measure of an entry that is missing or not one number per row.
+
+    So it is for a `where` that is neither true or false in each row nor a number of Gymnasium's
+    info.
+
+    Args:
+        measures: nodes by name.
+    """
+    for name, measure in measures_of(measures).items():
+        place = f"evaluation.measures.{name}"
+        check_number(env, nested_key(measure.entry), place)
+        if measure.where is not None:
+            _check_flag(env, nested_key(measure.where), place)
+
+
+def check_number(env: EnvBase, key: NestedKey, name: str) -> None:
+    """Raise a `UserError` if an entry does not have exactly one number per row, or per agent."""
+    check_entry(env, key, name)
+    rewards = [env.full_reward_spec[each].shape for each in env.reward_keys]
+    for group in _groups(env, key):
+        spec = group[key]
+        parent = group[key[:-1]] if isinstance(key, tuple) and len(key) > 1 else group
+        shape = spec.shape[len(parent.shape) :]
+        is_one = shape.numel() == 1 or spec.shape in rewards  # of each agent, for some envs
+        if isinstance(spec, Composite) or spec.dtype is None or not is_one:
+            numbers = f"{shape.numel()} numbers" if shape.numel() > 1 else "no number"
+            raise UserError(
+                f"{name}={dotted(key)} has {numbers} a row, and one is needed; name an entry of "
+                "one number, or let the env write one"
+            )
+
+
+def _check_flag(env: EnvBase, key: NestedKey, name: str) -> None:
+    """Raise a `UserError` if an entry is not a flag with one value per row.
+
+    It is a boolean, or a number of Gymnasium's info, where flags are numbers too.
+    """
+    check_entry(env, key, name)
+    found = [group[key] for group in _groups(env, key)]
+    rows = env.batch_size.numel()
+    of_info = key in optional_entries(env)
+    if not any(
+        (of_info or spec.dtype == torch.bool) and spec.shape.numel() == rows for spec in found
+    ):
+        raise UserError(
+            f"{name}.where={dotted(key)} must be a flag, true or false once a row, or a number of "
+            "Gymnasium's info (env.info); name another entry, or leave it out"
+        )
+
+
+def _specs(env: EnvBase) -> list[Composite]:
+    """Return the specs of what an env writes after a step."""
+    return [env.observation_spec, env.full_reward_spec, env.full_done_spec]
+
+
+def _groups(env: EnvBase, key: NestedKey) -> list[Composite]:
+    """Return the specs of an env that have an entry; none for the sum of rewards."""
+    return [group for group in _specs(env) if key in group.keys(True)]
+
+
+def check_entry(env: EnvBase, key: NestedKey, name: str) -> None:
+    """Raise a `UserError` if an env does not write an entry; `name` is the key that names it."""
+    known = {EPISODE_REWARD}
+    for spec in _specs(env):
+        known |= {dotted(each) for each in spec.keys(True)}
+    given = dotted(key)
+    if given not in known:
+        raise UserError(
+            f"{name}={given} is no entry of the env; it has {', '.join(sorted(known))}"
+            f"{did_you_mean(given, known)}"
+        )
+
+
+def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
+    """Check that a guide can act in an env.
+
+    Args:
+        env: of any number of rows; it is stepped once.
+        name: key of the guide, for the message.
+
+    Raises:
+        UserError: if the env lacks an entry that the guide reads, or its action does not fit.
+    """
+    try:
+        transform = GuideActions({"guide": guide})
+        memory = (key for each in transform.guides.memories.values() for key in each.specs)
+        known = [*env.observation_spec.keys(True), *transform.supplied, *memory]
+        for key in guide.in_keys:
+            if key not in known:
+                has = ", ".join(map(dotted, env.observation_spec.keys()))
+                remedy = getattr(guide, "remedy", "")  # what gives the entry that it reads
+                raise UserError(
+                    f"{name}: it reads {dotted(key)}, but the env has only {has}"
+                    f"{remedy and '; '}{remedy}"
+                )
+        advised = TransformedEnv(env, transform)
+        advised.step(FollowAdvice(advised)(advised.reset()))
+        advised.state_dict()  # a state that no checkpoint can hold is refused before the training
+    except UnfitActionError as error:
+        raise UserError(f"{name}: its action {error.problem}") from error
+    except ForeignError as error:  # its sentence says whether the env or the guide is at fault
+        raise UserError(str(error)) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{name}: {error.args[0] if error.args else error}") from error
+    except RuntimeError as error:
+        first = str(error).partition("\n")[0]
+        raise UserError(
+            f"{name}: it cannot act on the observations of this env ({first})"
+        ) from error
+
+
+def dotted(key: str | Iterable[Any]) -> str:
+    """Return the name of an entry as in a configuration, such as "info.lap".
+
+    Args:
+        key: of the entry, perhaps nested.
+    """
+    return key if isinstance(key, str) else ".".join(map(str, key))
+
+
+# Nodes that other values refer to, and that nothing else reads.
+REFERRED = (
+    "preset",
+    "track",
+    "recording",
+    "training.learning_rate",
+    "training.imitation_env",
+    "budget.minibatches",
+)
+NOISE = "training.noise_correlation"
+NEEDS_GUIDE = "method.needs_guide"  # a fact about the method, not a choice
+OF_A_LEARNER = (
+    *("learner", "network", "checkpoint_every", "evaluation.repeats"),
+    *("budget.num_envs", "budget.steps", "training.normalise", "training.scale_rewards"),
+)
+OF_A_TRAINING = (
+    *("training", "budget", "logger", "watch", "observes", "action", "compile"),
+    *("evaluation.curve", "evaluation.guides", "evaluation.policy"),
+)
+
+
+def check_read(config: DictConfig, task: Iterable[str]) -> None:
+    """Refuse a word of the command line that a run does not read.
+
+    Raises:
+        UserError: for the first word without an effect.
+    """
+    for sentence in unread(config, task):
+        raise UserError(sentence)
+
+
+def unread(config: DictConfig, task: Iterable[str]) -> Iterator[str]:
+    """Yield a sentence for each word of the command line that a run does not read."""
+    closed = [*_unread_nodes(config)]
+    references = set(_references(config, closed))
+    for text in task:
+        key = key_of(text)
+        if key == NEEDS_GUIDE:
+            yield (
+                f"{text} has no effect: the file of method={config.method.name} says whether its "
+                "policy needs a guide; leave it out"
+            )
+        is_read = not is_part(key, (*closed, *REFERRED))
+        if key == NOISE:
+            is_read = is_read and _adds_noise(config)
+        if not is_read and not any(covers(key, other) for other in references):
+            yield (
+                f"{text} has no effect: nothing in this run reads {key} "
+                f"(method={config.method.name}); leave it out"
+            )
+
+
+def _unread_nodes(config: DictConfig) -> Iterator[str]:
+    """Yield the nodes that a run does not read, whatever they hold."""
+    has_agent = config.method.observes is not None
+    learns = has_agent and not config.method.run
+    anchored = OmegaConf.select(config, "learner.anchor") is not None
+    if not has_agent:
+        yield from OF_A_TRAINING
+    if not learns:
+        yield from (*OF_A_LEARNER, NOISE)
+    if not (anchored or config.delivery == "tested"):
+        yield "training.tests"
+    if not trains_guides(config):
+        yield "proxy"
+    if not advises(config):
+        yield "evaluation.advice"
+
+
+def _references(config: DictConfig, closed: Sequence[str]) -> Iterator[str]:
+    """Yield the keys to which values refer, except values in nodes that are not read.
+
+    A run without a learner has one row for each case, whatever the number of rows in its env.
+    """
+    left_out = (*closed, "env.num_envs") if "learner" in closed else closed
+    values: Any = OmegaConf.to_container(config, resolve=False)
+    for key, value in leaves(values).items():
+        if isinstance(value, (str, list)) and not is_part(key, left_out):
+            yield from (name for name in REFERENCE.findall(str(value)) if name != key)
+
+
+def _adds_noise(config: DictConfig) -> bool:
+    """Return whether noise is added to the actions of a training, which are numbers then."""
+    if learner_kind(config) == "imitation":
+        return False
+    env = env_maker(config)()
+    return bool(env.full_action_spec[env.action_key].dtype.is_floating_point)
+
+
+# The packages of TorchRL's loggers, which are extras of this one.
+PACKAGES = {
+    "MLFlowLogger": "mlflow",
+    "TensorboardLogger": "tensorboard",
+    "TrackioLogger": "trackio",
+    "WandbLogger": "wandb",
+}
+
+
+def check_logger(node: Mapping[str, Any]) -> None:
+    """Check that the package of a logger is installed, before a run is begun.
+
+    Raises:
+        UserError: if it is missing.
+    """
+    package = PACKAGES.get(str(node["_target_"]).rpartition(".")[2])
+    if package is not None:
+        require("this logger (logger=none needs no package)", package, package)

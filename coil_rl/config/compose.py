@@ -5,74 +5,36 @@ before method. So a value of a later group replaces the one that a user wrote in
 earlier group, `learner: {normalise: true}` in a file of an env for example, and nobody says so.
 Here every value that is written in a file of somebody else than coil-rl is put into its place
 again, unless the command line gives another one.
-
-Guests, packages beside coil-rl, bring YAML files of envs, guides, experiments and programs. A guest
-names the package of its files by an entry point, and Hydra then finds them like those of coil-rl,
-by the names of their folders:
-
-    [project.entry-points."coil_rl.conf"]
-    my_package = "my_package.conf"
 """
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import fields
 from functools import cache
-from importlib import metadata, resources
+from importlib import resources
 from importlib.resources.abc import Traversable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
-from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
-from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
+from pydantic import TypeAdapter, ValidationError
 
-from coil_rl.config.messages import SEVERAL, sentence
+from coil_rl.config.messages import SEVERAL, sentence, similar
+from coil_rl.config.schema import WRITTEN, shipped_places
 from coil_rl.errors import UserError
+from coil_rl.measures import measures_of
+from coil_rl.output import say
 from coil_rl.plain_yaml import entries
-
-CORE = "coil_rl.conf"  # the package of our own files, and the group of the entry points
-# Of the last composition: the file of a user by each key that it gives.
-WRITTEN: dict[str, str] = {}
+from coil_rl.ranges import validation_message
 
 REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
-
-
-@cache
-def packages() -> tuple[str, ...]:
-    """Return the packages with YAML files, coil-rl's own first."""
-    return (CORE, *sorted(entry.value for entry in metadata.entry_points(group=CORE)))
-
-
-@cache
-def shipped_places() -> tuple[str, ...]:
-    """Return where Hydra finds its own files, and those that are installed with coil-rl."""
-    entries = metadata.entry_points(group=CORE)
-    ours = sorted(each.value for each in entries if each.dist and each.dist.name == "coil-rl")
-    return ("pkg://hydra", "structured://", *(f"pkg://{package}" for package in (CORE, *ours)))
-
-
-class GuestFiles(SearchPathPlugin):
-    """Lets Hydra find the files of all of them in a program whose own file is in one of them."""
-
-    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Append what is not there."""
-        places = [f"pkg://{package}" for package in packages()]
-        known = {element.path for element in search_path.get_path()}
-        if not known.isdisjoint(places):
-            for place in places:
-                if place not in known:
-                    search_path.append(CORE, place)
-
-
-Plugins.instance().register(GuestFiles)
 
 
 def keep_written(
@@ -211,3 +173,127 @@ def _own_hydra() -> Iterator[None]:
             yield
     finally:
         GlobalHydra.instance().hydra = outer
+
+
+LARGEST_BATCH = 2**28  # frames
+
+
+def check_values(config: DictConfig) -> None:
+    """Check the values of the configuration of any program.
+
+    Args:
+        config: composed by Hydra, or read from a folder.
+
+    Raises:
+        UserError: for an unknown key, or a value out of range.
+    """
+    values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    schema: Any = OmegaConf.get_type(config)
+    try:
+        _adapter(schema).validate_python(values)
+    except ValidationError as error:
+        for detail in error.errors():
+            if detail["type"] == "unexpected_keyword_argument":
+                raise UserError(_unknown_key(config, *map(str, detail["loc"]))) from None
+        raise UserError(validation_message(error, values)) from None
+    measures_of(values.get("evaluation", {}).get("measures", {}))
+    for name in ("budget", "proxy.budget"):
+        budget = OmegaConf.select(config, name)
+        if (
+            isinstance(budget, DictConfig)
+            and (frames := budget.num_envs * budget.steps) > LARGEST_BATCH
+        ):
+            raise UserError(
+                f"{name}.num_envs x {name}.steps={frames} must be at most {LARGEST_BATCH}"
+            )
+    for name in ("device", "env.device"):
+        if isinstance(device := OmegaConf.select(config, name), str):
+            _check_device(config, name, device)
+
+
+def _check_device(config: DictConfig, name: str, device: str) -> None:
+    """Raise a `UserError` for a device that is unknown, is not there or cannot do what is asked."""
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+        raise UserError(f"{name}={device} must be cpu, cuda, or one GPU such as cuda:0")
+    if device != "cpu" and OmegaConf.select(config, "compile"):
+        raise UserError(
+            f"compile=true is for the CPU only, not for {name}={device}; take compile=false"
+        )
+    import torch  # here, so that help and a wrong word do not wait for it
+
+    try:
+        torch.empty(0, device=device)
+    except (AssertionError, RuntimeError) as error:
+        problem = str(error).splitlines()[0]
+        raise UserError(f"{name}={device} cannot be used ({problem}); take {name}=cpu") from error
+
+
+@cache
+def _adapter(schema: type) -> TypeAdapter[Any]:
+    """Return the validator of a schema, which takes longer to make than to use."""
+    return TypeAdapter(schema)
+
+
+def _unknown_key(config: DictConfig, *path: str) -> str:
+    *parents, key = path
+    name = ".".join(parents)
+    node = OmegaConf.select(config, name) if name else config
+    known = [field.name for field in fields(OmegaConf.get_type(node)) if field.name != "defaults"]  # type: ignore[arg-type]
+    return (
+        f"there is no key {key}; {name or 'the configuration'} has {', '.join(known)}"
+        f"{similar(key, known)}"
+    )
+
+
+ANY_ENV = ("fmu", "gym", "torchrl")  # files of conf/env that stand for any env
+FRAMES = 100_000  # 3.5 minutes of the processor with SAC, where the steps of an env are fast
+
+
+def default_learner(
+    words: Iterable[str], compose: Callable[[list[str]], DictConfig] = compose_train
+) -> list[str]:
+    """Return the words that select SAC, or none if the command or the env excludes it.
+
+    SAC needs far fewer frames where actions are numbers (docs/learners.md), and cannot learn
+    choices. Hydra composes the learner before the env exists. So the env is made once before, and
+    the choice becomes words of the command, which the folder of the run keeps.
+
+    A learner, a network, an experiment, a policy to begin with and a method are a choice, but for
+    `coil_anchored`, which is the default method with a guide.
+
+    An env that cannot be made gives none: the run says what is wrong with it.
+
+    Args:
+        words: of the command line.
+        compose: returns the configuration for some of them.
+    """
+    given = {key_of(word): word for word in words}
+    kind, method = (given.get(key, "").partition("=")[2] for key in ("env", "method"))
+    chosen = given.keys() & {"experiment", "init", "learner", "network", "resume"}
+    if kind not in ANY_ENV or chosen or method not in ("", "coil_anchored"):
+        return []
+    read = ("env", "hydra.searchpath", "budget.frames")
+    of_env = [word for key, word in given.items() if key.startswith(read)]
+    with suppress(Exception):
+        config = compose([*of_env, "learner=sac"])
+        if _acts_in_numbers(config):
+            more = [f"budget.frames={FRAMES}"]
+            if "budget.frames" in given:
+                # A very short run learns too: its first quarter is stored without learning.
+                frames, starts = config.budget.frames, config.learner.starts
+                is_short = frames < 4 * starts and "learner.starts" not in given
+                more = [f"learner.starts={frames // 4}"] if is_short else []
+            say("learner=sac, because actions are numbers (for PPO write learner=ppo)")
+            return ["learner=sac", *more]
+    return []
+
+
+def _acts_in_numbers(config: DictConfig) -> bool:
+    """Return whether SAC can learn in the env of a configuration."""
+    from coil_rl.config.parts import build_bare_env  # imports torch
+    from coil_rl.learners.off_policy import check_replay
+
+    few = {"num_envs": 1} | ({"workers": 0} if "workers" in config.env else {})
+    with closing(build_bare_env(config, few)) as env:
+        check_replay(env, "SAC")
+        return env.action_spec.dtype.is_floating_point

@@ -1,13 +1,26 @@
-"""Instantiation of nodes with a `_target_`, after a check of their arguments.
+"""What a node with a `_target_` names: checked, built, and identified.
 
 This is the only caller of Hydra's `instantiate`.
+
+A class or a function of a module that a user handed over in Python is named in the configuration by
+its import path, as on the command line. An object without such a path, such as one with a state or
+a lambda, is kept here, in this process, and the configuration holds a name for it. A folder with
+such a name can be opened again if the object is handed over again.
+
+What a run depends on of a user's code is the file that defines a part, and the state of an object.
 """
 
+import hashlib
 import inspect
+import io
+import pickle
+import sys
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from numbers import Number
-from types import NoneType, UnionType
+from pathlib import Path
+from types import FunctionType, ModuleType, NoneType, SimpleNamespace, UnionType
 from typing import Any, Union, get_args, get_origin
 
 import hydra.utils
@@ -16,11 +29,15 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from pydantic import ValidationError
 from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
+from torch import Tensor, nn
 from torchrl.envs import Transform
 
-from coil_rl.config.compose import WRITTEN
 from coil_rl.config.messages import similar
+from coil_rl.config.schema import WRITTEN, packages
+from coil_rl.config.trust import import_paths
 from coil_rl.errors import UserError
+from coil_rl.foreign.host import is_of_user
+from coil_rl.plain_yaml import entries
 from coil_rl.ranges import adapter, settings_of, validation_message, yaml_text
 
 PLAIN = (bool, int, float, str, NoneType)
@@ -321,3 +338,215 @@ def _signature(function: Callable[..., Any]) -> inspect.Signature:
         return inspect.signature(function, eval_str=True)
     except (NameError, TypeError):  # annotations that only a type checker can resolve
         return inspect.signature(function)
+
+
+TARGET = "coil_rl.config.nodes.kept"
+PLACES = {"env": ("env.id", "env.of", "env"), "guide": ("guide.controller.of",)}
+_objects: dict[str, Any] = {}  # by the name in a configuration
+
+
+def keep(name: str, thing: Any) -> dict[str, str]:
+    """Keep an object under a name, and return the node of a configuration that stands for it."""
+    _objects[name] = thing
+    return {"_target_": TARGET, "name": name}
+
+
+def kept(name: str) -> Any:
+    """Return the object that was kept under a name.
+
+    Raises:
+        UserError: if it was not handed over in this process.
+    """
+    if name not in _objects:
+        part = name.rpartition("#")[2]
+        raise UserError(
+            f"this run was made in Python with an object as its {part}, which no import path "
+            f"names; open it in Python with coil_rl.open_run(FOLDER, {part}=OBJECT)"
+        )
+    return _objects[name]
+
+
+def give(config: DictConfig, objects: Mapping[str, Any]) -> None:
+    """Hand over the objects of a configuration again.
+
+    Args:
+        config: of a run that was made in Python.
+        objects: by "guide" or "env"; None for nothing.
+
+    Raises:
+        UserError: for an object that the configuration has no place for.
+    """
+    for part, thing in objects.items():
+        if thing is None:
+            continue
+        names = _names(config, part)
+        if not names:
+            raise UserError(f"{part}: the run names its own {part}; leave {part}= out")
+        keep(names[0], thing)
+
+
+def kept_objects(config: DictConfig, part: str) -> list[Any]:
+    """Return the Python objects that a configuration names, as they were handed over.
+
+    Args:
+        part: "guide" or "env".
+
+    Raises:
+        UserError: if one was not handed over in this process.
+    """
+    return [kept(name) for name in _names(config, part)]
+
+
+def _names(config: DictConfig, part: str) -> list[str]:
+    """Return the names under which objects of a configuration are kept."""
+    nodes = [OmegaConf.select(config, place) for place in PLACES[part]]
+    return [
+        node["name"]
+        for node in nodes
+        if isinstance(node, DictConfig) and node.get("_target_") == TARGET
+    ]
+
+
+def import_path(thing: Any) -> str | None:
+    """Return MODULE:NAME of a class or function that any process can import, else None."""
+    module, name = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
+    if not isinstance(module, str) or not isinstance(name, str) or module == "__main__":
+        return None
+    found: Any = sys.modules.get(module)
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    return f"{module}:{name}" if found is thing else None
+
+
+# Parts of a configuration on which the numbers of a run depend, besides its evaluation.
+PARTS = ["env", "training", "guide", "method", "learner", "degrade", "disturb", "action"]
+
+
+def identity_of(thing: Any) -> str:
+    """Return the name of a class, function or object, with a hash that is equal in every process.
+
+    It is of the files that define it and its bases, and of the state of an object, if that can be
+    pickled: its numbers, texts and arrays, and what a function without a name has closed over.
+
+    Args:
+        thing: it may be anything.
+    """
+    defined = thing if isinstance(thing, (type, FunctionType)) else type(thing)
+    inner = getattr(thing, "func", getattr(thing, "__func__", None))  # of a partial, of a method
+    digest = hashlib.sha256()
+    for part in (*getattr(defined, "__mro__", [defined]), inner):
+        if part is not None and is_of_user(part):
+            with suppress(OSError, TypeError):  # no file defines it
+                digest.update("".join(inspect.findsource(part)[0]).encode())
+    state = io.BytesIO()
+    with suppress(Exception):  # whatever the pickling of somebody else's object raises
+        _State(state).dump(thing)
+        digest.update(state.getvalue())
+    return f"{defined.__module__}.{defined.__qualname__} (state {digest.hexdigest()[:10]})"
+
+
+class _State(pickle.Pickler):
+    """Pickles what the actions of an object depend on; it is not to be read again."""
+
+    def reducer_override(self, thing: Any) -> Any:
+        """Replace what cannot be pickled, or is not the same in each process, by plain values."""
+        if isinstance(thing, Tensor):
+            return str, (str(thing.dtype), thing.detach().cpu().tolist())
+        if isinstance(thing, nn.Module):  # it is used in one mode or the other
+            state = [item for item in vars(thing).items() if item[0] != "training"]
+            return dict, (type(thing), state)
+        if isinstance(thing, type) and is_of_user(thing):
+            return str, (f"{thing.__module__}.{thing.__qualname__}",)
+        if isinstance(thing, FunctionType) and is_of_user(thing):
+            closed = [cell.cell_contents for cell in thing.__closure__ or ()]
+            code = thing.__code__
+            return list, (thing.__qualname__, code.co_firstlineno, code.co_code, closed)
+        return NotImplemented
+
+
+def code_of_user(config: DictConfig, keys: Iterable[str]) -> list[str]:
+    """Return the identity of each class and function of the user that a configuration names.
+
+    Args:
+        keys: parts of it to look at, among them `env`, whose id may be registered with Gymnasium.
+    """
+    parts = OmegaConf.masked_copy(config, list(keys))
+    named = [*map(_named, sorted(import_paths(parts))), _registered(config.env.get("id"))]
+    found = [identity_of(each) for each in named if each is not None and is_of_user(each)]
+    return [*found, *_files_of(parts).values()]
+
+
+def code_of_run(config: DictConfig) -> dict[str, str]:
+    """Return the SHA-256 of each file of the user that a run depends on, by its module.
+
+    They are those that define its parts, what these use of other files of the user, and what its
+    configuration names as a `file`, by its name.
+
+    Args:
+        config: of the run.
+    """
+    parts = OmegaConf.masked_copy(config, PARTS)
+    parts.evaluation = {key: config.evaluation.get(key) for key in ("env", "advice", "cases")}
+    things = [*map(_named, import_paths(parts)), _registered(config.env.get("id"))]
+    for place in PLACES:
+        with suppress(UserError):  # an object that was not handed over
+            things += kept_objects(config, place)
+    waiting = [name for thing in things for name in _modules_of(thing)]
+    found: dict[str, str] = {}
+    ours = {package.partition(".")[0] for package in packages()}
+    for name in waiting:  # it grows
+        module = sys.modules.get(name)
+        file = getattr(module, "__file__", None)
+        if name in found or file is None or name.partition(".")[0] in ours:
+            continue
+        if not is_of_user(SimpleNamespace(__module__=name)):
+            continue
+        with suppress(OSError):  # it is gone
+            found[name] = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+            waiting += [each for value in vars(module).values() for each in _modules_of(value)]
+    return dict(sorted((found | _files_of(parts)).items()))
+
+
+def _files_of(parts: DictConfig) -> dict[str, str]:
+    """Return the SHA-256 of each `file` that a configuration names, by its name."""
+    named = entries(OmegaConf.to_container(parts), lists=True)
+    paths = {Path(value) for _, key, value in named if key == "file" and isinstance(value, str)}
+    found = {}
+    for path in paths:
+        with suppress(OSError):  # what is missing is said where it is read
+            found[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
+
+
+def _modules_of(thing: Any) -> list[str]:
+    """Return the names of the modules that define a thing: a module, class, function or object."""
+    if isinstance(thing, ModuleType):
+        return [thing.__name__]
+    thing = getattr(thing, "func", thing)  # of a partial
+    defined = thing if isinstance(thing, (type, FunctionType)) else type(thing)
+    return [str(each.__module__) for each in getattr(defined, "__mro__", [defined])]
+
+
+def _named(path: str) -> Any:
+    """Return what an import path names; None for nothing, which is refused where it is built.
+
+    Args:
+        path: written with points only.
+    """
+    with suppress(Exception):
+        return hydra.utils.get_object(path)
+    return None
+
+
+def _registered(id: Any) -> Any:
+    """Return what makes an env that is registered with Gymnasium; None for another one.
+
+    Args:
+        id: of the env; it may be anything.
+    """
+    if isinstance(id, str):
+        with suppress(Exception):
+            from coil_rl.foreign.makers import registered_maker
+
+            return registered_maker(id)
+    return None

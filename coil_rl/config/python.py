@@ -17,14 +17,12 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from torchrl.envs import EnvBase
 
 from coil_rl.config.assemble import assemble
-from coil_rl.config.check import check
-from coil_rl.config.compose import compose_train, packages, quoted
-from coil_rl.config.default_learner import default_learner
+from coil_rl.config.check import check, check_read
+from coil_rl.config.compose import compose_train, default_learner, quoted
 from coil_rl.config.folder import PREFIX, make_folder, read_config, run_folder
-from coil_rl.config.given import give, import_path, keep
-from coil_rl.config.schema import method_for
+from coil_rl.config.nodes import give, import_path, keep
+from coil_rl.config.schema import method_for, packages
 from coil_rl.config.trust import trust_own, trust_packages
-from coil_rl.config.unread import check_read
 from coil_rl.errors import UserError
 from coil_rl.foreign.faults import foreign
 from coil_rl.run.controller import Controller

@@ -1,7 +1,7 @@
-"""Typed root configurations of the programs, and the fingerprint of a run.
+"""All that is registered with Hydra: typed root configurations, resolvers and files of guests.
 
 The types of the fields are checked by OmegaConf, their ranges by pydantic
-(`coil_rl.config.check.check_values`).
+(`coil_rl.config.compose.check_values`).
 """
 
 import hashlib
@@ -9,16 +9,23 @@ import json
 import os
 import re
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import metadata
 from importlib.util import find_spec
 from typing import Annotated, Any
 
+import hydra.utils
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 from pydantic import ConfigDict, Field, GetPydanticSchema
 from pydantic_core import core_schema
 
-from coil_rl.config.passive import whole_pass
-
+CORE = "coil_rl.conf"  # the package of our own files, and the group of the entry points
+# Of the last composition: the file of a user by each key that it gives.
+WRITTEN: dict[str, str] = {}
 LARGEST = 2**63 - 1
 GRU = "coil_rl.learners.Gru"
 # Keys in which two runs with the same numbers may differ.
@@ -35,6 +42,44 @@ IGNORED_KEYS = (
     "evaluation.gif",
     "evaluation.pictures",
 )
+
+
+@cache
+def packages() -> tuple[str, ...]:
+    """Return the packages with YAML files, coil-rl's own first."""
+    return (CORE, *sorted(entry.value for entry in metadata.entry_points(group=CORE)))
+
+
+@cache
+def shipped_places() -> tuple[str, ...]:
+    """Return where Hydra finds its own files, and those that are installed with coil-rl."""
+    entries = metadata.entry_points(group=CORE)
+    ours = sorted(each.value for each in entries if each.dist and each.dist.name == "coil-rl")
+    return ("pkg://hydra", "structured://", *(f"pkg://{package}" for package in (CORE, *ours)))
+
+
+class GuestFiles(SearchPathPlugin):
+    """Lets Hydra find the files of all of them in a program whose own file is in one of them.
+
+    Guests, packages beside coil-rl, bring YAML files of envs, guides, experiments and programs. A
+    guest names the package of its files by an entry point, and Hydra then finds them like those of
+    coil-rl, by the names of their folders:
+
+        [project.entry-points."coil_rl.conf"]
+        my_package = "my_package.conf"
+    """
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append what is not there."""
+        places = [f"pkg://{package}" for package in packages()]
+        known = {element.path for element in search_path.get_path()}
+        if not known.isdisjoint(places):
+            for place in places:
+                if place not in known:
+                    search_path.append(CORE, place)
+
+
+Plugins.instance().register(GuestFiles)
 
 
 def one_of(*choices: str) -> GetPydanticSchema:
@@ -141,7 +186,7 @@ class MethodConfig(NodeConfig):
     """A method: transforms of the agent, the kind of its learner, and what it observes.
 
     `observes` are entries besides those of the env. `run` makes the run of a method that
-    trains no policy, see `coil_rl.config.own_run`; its learner is "none".
+    trains no policy, see `coil_rl.config.parts`; its learner is "none".
     """
 
     name: str = MISSING
@@ -262,6 +307,39 @@ class ReportConfig(ProgramConfig):
     actions: Annotated[str, one_of("deterministic", "sampled", "both")] = "deterministic"
     against: str | None = None
     figures: Annotated[str, one_of("png", "pdf", "svg")] = "png"
+
+
+def passive(config: DictConfig) -> Any:
+    """Return the class of an env that does not react to actions; None for any other env.
+
+    Nothing can be learned by trial in such an env, a recording for example. What somebody else did
+    there can be imitated, and the imitation is tested in another env. The class says so by
+    `reacts = False`, and has
+
+    - `whole_pass(arguments)`, a static method: how many episodes there are, and the steps of the
+      longest, by the arguments of the constructor;
+    - `length`, [B], the steps of the episode of each row;
+    - `demonstrations()`: lines on what there is to learn; a `ValueError` if there is nothing.
+    """
+    try:
+        kind = hydra.utils.get_object(str(config.env.get("_target_", "")))
+    except Exception:  # who builds it says what is wrong
+        return None
+    return None if getattr(kind, "reacts", True) else kind
+
+
+def whole_pass(what: str, otherwise: int, *, _root_: DictConfig) -> int:
+    """Return what a training takes that sees all of an env that does not react.
+
+    Args:
+        what: "num_envs", one for each episode; "steps", those of the longest; or "frames".
+        otherwise: the value in other envs.
+    """
+    kind = passive(_root_)
+    if kind is None:
+        return otherwise
+    rows, steps = kind.whole_pass(_root_.env)
+    return {"num_envs": rows, "steps": steps, "frames": rows * steps}[what]
 
 
 def fingerprint(config: DictConfig) -> str:

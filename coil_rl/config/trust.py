@@ -29,9 +29,8 @@ import hydra.utils
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from coil_rl.config.compose import packages
+from coil_rl.config.schema import packages
 from coil_rl.errors import UserError, did_you_mean
-from coil_rl.extras import require
 from coil_rl.plain_yaml import entries
 
 ENTRY_POINTS = (
@@ -53,7 +52,7 @@ NEVER_TRUSTED = frozenset(sys.stdlib_module_names) | {
 
 NAMED = frozenset(
     [
-        "coil_rl.config.given.kept",  # it looks an object up that the user handed over in Python
+        "coil_rl.config.nodes.kept",  # it looks an object up that the user handed over in Python
         "torchrl.envs.CatFrames",
         "torchrl.envs.ClipTransform",
         "torchrl.envs.DoubleToFloat",
@@ -68,15 +67,6 @@ NAMED = frozenset(
 
 _packages: frozenset[str] = frozenset()  # of the option `trust`
 _own: frozenset[str] = frozenset()  # targets in the configuration of the command
-
-
-# The packages of TorchRL's loggers, which are extras of this one.
-PACKAGES = {
-    "MLFlowLogger": "mlflow",
-    "TensorboardLogger": "tensorboard",
-    "TrackioLogger": "trackio",
-    "WandbLogger": "wandb",
-}
 CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.-]*")  # MODULE:NAME, wherever it is
 PLAIN = r"[\w-]+"  # a name that is no path, no address and no reference
 
@@ -276,37 +266,6 @@ def _fits(shipped: Any, given: Any) -> bool:
         return isinstance(given, bool)
     names = isinstance(shipped, str) and isinstance(given, str)
     return names and all(re.fullmatch(PLAIN, text) for text in (shipped, given))
-
-
-def check_logger(node: Mapping[str, Any]) -> None:
-    """Check that the package of a logger is installed, before a run is begun.
-
-    Raises:
-        UserError: if it is missing.
-    """
-    package = PACKAGES.get(str(node["_target_"]).rpartition(".")[2])
-    if package is not None:
-        require("this logger (logger=none needs no package)", package, package)
-
-
-def make_logger(node: Any) -> Any:
-    """Return the logger of a run.
-
-    Raises:
-        UserError: for whatever the logger raises, such as without a log-in or a server.
-    """
-    from coil_rl.config.nodes import build  # imports torch
-
-    try:
-        return build(node, "logger")
-    except UserError:
-        raise
-    except Exception as error:
-        reason = " ".join(str(error.__cause__ or error).split())[:300]
-        raise UserError(
-            f"logger: {node['_target_']} could not be started ({reason}); correct the cause, or "
-            "take logger=none"
-        ) from error
 
 
 @cache

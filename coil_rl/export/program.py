@@ -48,7 +48,7 @@ def next_step(run: str, folder: str, guide: str) -> str:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration."""
-    from coil_rl.config.values import check_values
+    from coil_rl.config.compose import check_values
     from coil_rl.envs.meanings import meaning
     from coil_rl.errors import UserError
     from coil_rl.extras import require

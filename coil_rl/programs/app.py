@@ -210,7 +210,7 @@ def run_program(
         config_name: of the YAML file; also the name of the program.
         check: raises a `UserError` for a mistake in the configuration, before anything is done.
         config_path: where the YAML file is. One of another package, such as "pkg://my_package.conf",
-            finds the files of coil-rl by an entry point, see `coil_rl.config.guest_files`, and
+            finds the files of coil-rl by an entry point, see `coil_rl.config.schema`, and
             gets the help and the clean-up of these programs by the schema `ProgramConfig`.
         further: returns the words that a command line leaves open.
     """

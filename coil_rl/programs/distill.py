@@ -11,7 +11,7 @@ from coil_rl.programs import app
 
 def distill(config: DictConfig) -> float:
     """Train the missing proxies of all guides; return the lowest mean test reward of a proxy."""
-    from coil_rl.config import proxies
+    from coil_rl.config import parts
     from coil_rl.config.assemble import run_configured
     from coil_rl.config.parts import build_guides
     from coil_rl.report.runs import read_runs
@@ -20,7 +20,7 @@ def distill(config: DictConfig) -> float:
 
     table, found = [], 0
     for name in build_guides(config):
-        proxy_config = proxies.proxy_config(config, name)
+        proxy_config = parts.proxy_config(config, name)
         found += is_evaluated(Path(proxy_config.run_dir))
         reward = run_configured(proxy_config, wait=True)
         (finished,) = read_runs([Path(proxy_config.run_dir)])
@@ -54,8 +54,8 @@ def check(config: DictConfig) -> None:
     Otherwise make their folder.
     """
     from coil_rl.config.check import check_proxies
+    from coil_rl.config.compose import check_values
     from coil_rl.config.folder import make_folder
-    from coil_rl.config.values import check_values
 
     used = ("preset", "track", "env", "disturb", "guide", "evaluation", "proxy")
     app.check_used(used, "a proxy is trained as the key proxy says")

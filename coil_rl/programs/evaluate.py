@@ -65,7 +65,7 @@ def with_exported(config: DictConfig, file: str) -> DictConfig:
     Raises:
         UserError: for a file that cannot be used, or a policy whose guide is outside.
     """
-    from coil_rl.config.fits import check_guide_in_env
+    from coil_rl.config.check import check_guide_in_env
     from coil_rl.config.nodes import build
     from coil_rl.config.parts import env_maker
     from coil_rl.run.parts import SOME_ROWS, TEST
@@ -91,10 +91,10 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
         UserError: for a folder without a run, one without tracks although tracks are given, or an
             env that does not write what is measured.
     """
-    from coil_rl.config.fits import check_measures
+    from coil_rl.config.check import check_measures
+    from coil_rl.config.compose import check_values
     from coil_rl.config.folder import read_config
     from coil_rl.config.parts import env_maker
-    from coil_rl.config.values import check_values
     from coil_rl.run.parts import SOME_ROWS, TEST
 
     config = read_config(folder, "run", {"device": requested.device})

@@ -259,7 +259,7 @@ def _folders(config: DictConfig) -> list[Path]:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration."""
-    from coil_rl.config.values import check_values
+    from coil_rl.config.compose import check_values
 
     check_values(config)
     app.check_folder("folder")

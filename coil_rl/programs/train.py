@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from coil_rl.config.default_learner import default_learner
+from coil_rl.config.compose import default_learner
 from coil_rl.config.folder import PREFIX
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import trust_packages
@@ -43,7 +43,7 @@ def check(config: DictConfig) -> None:
 
     In a sweep a word may be meant for other runs, so each run says what it ignores.
     """
-    from coil_rl.config.unread import check_read, unread
+    from coil_rl.config.check import check_read, unread
 
     app.check_run(config)
     words = app.typed().task

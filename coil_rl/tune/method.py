@@ -7,7 +7,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from coil_rl.config.own_run import OwnRun
+from coil_rl.config.parts import OwnRun
 from coil_rl.errors import UserError
 from coil_rl.extras import require
 from coil_rl.ranges import checked

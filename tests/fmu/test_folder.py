@@ -8,7 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from coil_rl import UserError, compose_train
-from coil_rl.config import parts, source, trust
+from coil_rl.config import nodes, parts, trust
 from coil_rl.config.parts import build_pictures, env_maker
 from coil_rl.report import Film
 
@@ -40,7 +40,7 @@ def test_a_received_folder_runs_no_fmu_without_trust() -> None:
 
 def test_another_fmu_of_that_name_is_seen(tmp_path: Path) -> None:
     other = fmus.edited(fmus.motor(), tmp_path / "motor.fmu", {"of the armature": "of it"})
-    one, two = (source.code_of_run(config(path)) for path in (fmus.motor(), other))
+    one, two = (nodes.code_of_run(config(path)) for path in (fmus.motor(), other))
     assert one.keys() == two.keys() == {"motor.fmu"}
     assert one != two
 

@@ -12,7 +12,7 @@ from programs import called
 from torchrl.envs import TransformedEnv
 
 import coil_rl
-from coil_rl.config.learned_guide import LearnedGuide
+from coil_rl.config.assemble import LearnedGuide
 from coil_rl.config.parts import env_maker
 from coil_rl.envs import McapReplayEnv, Perception, SimulatedRobotEnv, record_drives
 from coil_rl.envs import simulated_cone_classifier as classifier

@@ -1,15 +1,19 @@
 """What a person wrote in a file, or on the command line, is what runs, or is refused."""
 
 import math
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
-from programs import CONF, called, shipped
+from programs import CONF, ROOT, called, environment, shipped
 
-from coil_rl import compose_train
-from coil_rl.config.compose import covers
+from coil_rl import Measure, UserError
+from coil_rl.config import python
+from coil_rl.config.compose import compose_train, covers, default_learner
+from coil_rl.measures import measures_of
 
 METHODS = shipped("method")
 FAST = ("coil", "dagger", "rlpd")
@@ -153,3 +157,150 @@ def test_value_that_a_learner_does_not_take_is_refused_by_its_name(tmp_path):
 )
 def test_one_of_two_keys_is_the_other_or_inside_it(one, other, is_covered):
     assert covers(one, other) == is_covered
+
+
+PENDULUM = ["env=gym", "env.id=Pendulum-v1"]
+SAC = ["learner=sac", "budget.frames=100000"]
+
+
+@pytest.mark.fast(4)
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (PENDULUM, SAC),
+        ([*PENDULUM, "guide=random", "budget.frames=64"], ["learner=sac", "learner.starts=16"]),
+        (["env=gym", "env.id=CartPole-v1"], []),
+        ([*PENDULUM, "learner=a2c"], []),
+        ([*PENDULUM, "method=coil_anchored", "learner.gamma=0.9"], SAC),
+        ([*PENDULUM, "seed=0,1"], SAC),
+        (["env=torchrl", "env.of._target_=torchrl.envs.PendulumEnv"], SAC),
+        ([*PENDULUM, "budget.frames=2_000"], SAC[:1]),
+        ([*PENDULUM, "budget.frames=1e3"], []),
+        ([*PENDULUM, "budget.frames=${evaluation.cases}"], ["learner=sac", "learner.starts=5"]),
+        ([*PENDULUM, "method=ppo"], []),
+        ([*PENDULUM, "network=gru"], []),
+        ([*PENDULUM, "init=earlier"], []),
+        (["env=gym", "env.id=Pendulum-v1,CartPole-v1"], []),
+        (["env=gym", "env.id=Nothing-v0"], []),
+        (["env=gym"], []),
+        (["env=pendulum"], []),
+        ([], []),
+    ],
+)
+def test_actions_that_are_numbers_are_learned_by_sac(words: list[str], found: list[str]) -> None:
+    assert default_learner(words) == found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("env", "label"), [("Pendulum-v1", "sac"), ("CartPole-v1", "ppo"), ("pendulum", "ppo")]
+)
+def test_a_run_in_python_has_the_learner_of_the_command(tmp_path, env: str, label: str) -> None:
+    run = python.prepare(env, folder=tmp_path, frames=640)
+    assert run.label == label
+    assert (f"learner={label}" in run.command) == (label == "sac")
+
+
+ADDED = "evaluation.measures.last_reward."
+WORDS = ["env=pendulum", "method=ppo"]
+
+
+def measures_with(*words: str) -> dict[str, Measure]:
+    return measures_of(compose_train([*WORDS, *words]).evaluation.measures)
+
+
+@pytest.mark.parametrize(
+    "added",
+    [
+        [f"{ADDED}entry=reward", f"{ADDED}reduction=last"],
+        [f"+{ADDED}entry=reward", f"+{ADDED}reduction=last"],
+        ["evaluation.measures.last_reward={entry: reward, reduction: last}"],
+    ],
+)
+def test_a_measure_is_added_on_the_command_line_beside_those_of_the_env(added: list[str]) -> None:
+    measures = measures_with(*added)
+    assert set(measures) == {"completed", "last_reward"}
+    assert measures["last_reward"] == Measure("reward", "last")
+
+
+@pytest.mark.parametrize("name", ["reward", "case", "driver", "steps"])
+def test_a_measure_named_as_another_column_is_refused(name: str) -> None:
+    with pytest.raises(UserError, match=f"{name} is already a column of the tables"):
+        measures_with(f"evaluation.measures.{name}.entry=reward")
+
+
+def test_values_of_a_measure_have_their_types() -> None:
+    with pytest.raises(UserError, match=r"measures\.low: could not convert .* 'much'"):
+        measures_with("evaluation.measures.low={entry: reward, at_least: much}")
+
+
+SCRIPT = """
+import coil_rl.config
+from hydra import compose, initialize_config_dir
+from coil_rl import compose_train
+from coil_rl.config.trust import _shipped_targets
+
+config = compose_train(["guide=wise", "run_dir=unused"])
+assert config.guide.wise._target_ == "stranger.Wise", config.guide
+assert "stranger.Wise" in _shipped_targets()
+with initialize_config_dir("FOLDER", version_base="1.3"):
+    # Where the group does not exist this is a value, and no choice of a file.
+    assert dict(compose("own", ["+guide=wise"])) == {"a": 1, "guide": "wise"}
+"""
+
+
+@pytest.mark.slow
+def test_files_of_an_installed_package_are_found_and_only_by_programs_of_coil_rl(tmp_path):
+    package, info = tmp_path / "stranger" / "conf", tmp_path / "stranger-1.dist-info"
+    (package / "guide").mkdir(parents=True)
+    for folder in (package.parent, package):
+        (folder / "__init__.py").write_text("")
+    (package / "guide" / "wise.yaml").write_text("# @package guide.wise\n_target_: stranger.Wise\n")
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[coil_rl.conf]\nstranger = stranger.conf\n")
+    (tmp_path / "own.yaml").write_text("a: 1\n")
+    command = [sys.executable, "-c", SCRIPT.replace("FOLDER", str(tmp_path))]
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment(tmp_path), capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+FILES = {
+    "method/a": ("# @package _global_\nmethod: {observes: []}", "name into method/a.yaml"),
+    "method/b": ("method: {name: b, observes: []}", "method/b.yaml: Hydra puts its keys under"),
+    "method/c": (
+        "# @package _global_\nmethod: {name: c, transform: {}}",
+        "method/c.yaml: method has no key transform; it has name, observes, transforms, "
+        "needs_guide, learner, run; did you mean transforms?",
+    ),
+    "method/d": ("# @package _global_\nmethod: {name: d}", "observes into method/d.yaml"),
+    "method/f": (
+        "# @package _global_\ndefaults: [ppo]\nlearner: {anchr: null}",
+        "method/f.yaml: learner: PPO takes no anchr; it takes ",
+    ),
+    "experiment/e": (
+        "defaults: [override /env: pendulum]",
+        "experiment/e.yaml: begin the file with the line # @package _global_",
+    ),
+}
+
+
+@pytest.mark.fast(2)
+@pytest.mark.parametrize("file", FILES)
+def test_mistake_in_a_file_of_the_user_names_the_file(file, tmp_path):
+    text, said = FILES[file]
+    group, name = file.split("/")
+    (tmp_path / group).mkdir()
+    (tmp_path / group / f"{name}.yaml").write_text(text)
+    chosen = f"+{group}={name}" if group == "experiment" else f"{group}={name}"
+    done = called("train", "--config-dir", str(tmp_path), chosen, cwd=tmp_path, code=2)
+    assert done.stderr.startswith("train: ")
+    assert said in done.stderr
+
+
+def test_key_of_a_swept_file_says_how_to_write_it(tmp_path):
+    words = ["-m", "env=pendulum,cart_pole", "env.workers=0", "seed=0,1"]
+    done = called("train", *words, cwd=tmp_path, code=2)
+    assert "write env.workers=choice(VALUE)" in done.stderr

@@ -14,7 +14,7 @@ from outside_package.install import SOURCE
 from programs import called
 
 import coil_rl
-from coil_rl.config import given
+from coil_rl.config import nodes
 from coil_rl.errors import UserError
 from coil_rl.run import checkpoint
 
@@ -129,7 +129,7 @@ def test_folder_made_with_an_object_is_opened_with_the_object(tmp_path, monkeypa
     coil_rl.train(ENV, guide=guide, method="coil", frames=32, folder=folder, overrides=SHORT)
     observation = np.array([-6.0, 3.0], np.float32)
     expected = coil_rl.open_run(folder).controller().act(observation)
-    monkeypatch.setattr(given, "_objects", {})  # as in another process
+    monkeypatch.setattr(nodes, "_objects", {})  # as in another process
     refused = called("evaluate", f"run={folder}", "trust=[thermostat]", code=2).stderr
     assert "made in Python with an object as its guide, which no import path names" in refused
     assert "coil_rl.open_run(FOLDER, guide=OBJECT)" in refused

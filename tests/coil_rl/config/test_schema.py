@@ -2,6 +2,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
+from coil_rl.config.compose import compose_train
 from coil_rl.config.schema import fingerprint
 
 
@@ -77,3 +78,24 @@ def test_fingerprint_in_the_name_of_a_sweep_folder():
     subdir = "hydra.sweep.subdir=${label}_seed${seed}_${fingerprint:}"
     config = composed("seed=3", subdir, return_hydra_config=True)
     assert config.hydra.sweep.subdir == f"coil_seed3_{fingerprint(composed('seed=3'))}"
+
+
+@pytest.mark.fast(4)
+@pytest.mark.parametrize(
+    ("words", "method"),
+    [
+        ([], "coil"),
+        (["env=cone_track_paper"], "coil"),
+        (["env=simulated_robot"], "coil"),
+        (["env=gym", "env.id=Pendulum-v1"], "ppo"),
+        (["env=gym", "env.id=Pendulum-v1", "guide=random"], "coil_anchored"),
+        (["env=gym", "env.id=Pendulum-v1", "guide=[random,zero]"], "coil_anchored"),
+        (["env=pendulum"], "coil_anchored"),
+        (["env=pendulum", "method=rfc"], "rfc"),
+        (["env=pendulum", "+experiment=placebo"], "coil"),
+    ],
+)
+def test_a_run_that_names_no_method_holds_the_guide_of_a_foreign_env(
+    words: list[str], method: str
+) -> None:
+    assert compose_train(words).method.name == method

@@ -6,8 +6,7 @@ from functools import partial
 import pytest
 from hydra import compose, initialize_config_module
 
-from coil_rl.config.given import keep
-from coil_rl.config.nodes import build
+from coil_rl.config.nodes import build, keep
 from coil_rl.errors import UserError
 from coil_rl.tune.numbers import (
     GuideWithNumbers,

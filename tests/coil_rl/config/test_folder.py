@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from hydra.utils import get_object
 from programs import called
 from tiny_runs import trained
 
 import coil_rl
 from coil_rl.config import folder as folders
-from coil_rl.config.folder import CARD, CHECKSUMS, LARGEST
+from coil_rl.config.folder import CARD, CHECKSUMS, LARGEST, OLD_NAMES, renamed
 from coil_rl.run.training import INIT
 
 PLACE = Path(folders.__file__).parents[1] / "policies"
@@ -113,3 +114,11 @@ def test_shipped_policy_is_the_first_one_of_a_run(tmp_path):
 def test_program_says_what_a_shipped_policy_is_not_for(name, argument, message, tmp_path):
     said = called(name, f"{argument}pretrained:cone_track/ppo", cwd=tmp_path, code=2)
     assert message in said.stderr
+
+
+def test_parts_that_moved_are_found_at_any_depth():
+    assert all(map(get_object, OLD_NAMES.values()))
+    for old, new in OLD_NAMES.items():
+        node = {"guide": {"one": {"_target_": old}}, "list": [{"_target_": old, "of": 3}]}
+        found = {"guide": {"one": {"_target_": new}}, "list": [{"_target_": new, "of": 3}]}
+        assert renamed(node) == found

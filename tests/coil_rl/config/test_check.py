@@ -1,0 +1,312 @@
+"""A method that needs numbers as actions is refused where they are choices."""
+
+import logging
+import warnings
+
+import gymnasium
+import numpy as np
+import odd_parts
+import pytest
+import torch
+from gymnasium import spaces
+from hydra import compose, initialize_config_module
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+from programs import SHORT_LAP, called, shipped
+
+import coil_rl
+from coil_rl.config.check import check, check_read
+from coil_rl.config.compose import compose_train
+from coil_rl.config.messages import is_no_bug, sentence
+from coil_rl.config.parts import env_maker
+from coil_rl.errors import UserError
+
+METHODS = shipped("method")
+# Methods that take choices as actions; all others need numbers.
+WITH_CHOICES = (
+    *("coil_anchored", "coil", "coil_dropout", "rfc", "coil_rfc", "kickstart", "jump_start"),
+    *("imitate_then_ppo", "advisor", "dagger", "oil", "ppo"),
+)
+# They have no agent, or need several guides, or numbers of a guide.
+OTHERS = ("guide", "coil_multi", "tune")
+
+
+class Switches(gymnasium.Env):
+    """Three switches are set at once, for five steps."""
+
+    observation_space = spaces.Box(-1, 1, (2,))
+    action_space = spaces.MultiBinary(3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        observation = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        return observation, float(np.sum(action)), False, self.steps >= 5, {}
+
+
+def on(observation):
+    return np.array([1, 0, 1])
+
+
+def checked(method, tmp_path, *words):
+    env = ["env=gym", f"env.id={__name__}:Switches", "evaluation.cases=2"]
+    guide = ["guide=controller", f"guide.controller.of={__name__}:on"]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", [*env, *guide, f"method={method}", f"run_dir={tmp_path}", *words])
+    check(config)
+
+
+@pytest.mark.fast(2)
+@pytest.mark.parametrize("method", sorted({*METHODS} - {*OTHERS}))
+def test_method_takes_choices_or_is_refused_with_those_that_do(method, tmp_path):
+    if method in WITH_CHOICES:
+        checked(method, tmp_path)
+        return
+    message = r" needs continuous actions, but this env .* method=coil_anchored"
+    with pytest.raises(UserError, match=message):
+        checked(method, tmp_path)
+
+
+GUIDE = "(method=guide); leave it out"
+
+
+def unread(*words):
+    """Return the reason why the last of some words is not read; empty if it is."""
+    try:
+        check_read(compose_train(list(words)), words[-1:])
+    except UserError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.fast(4)
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("method=dagger budget.minibatches=3", "nothing in this run reads budget.minibatches"),
+        (
+            "learner=sac training.learning_rate=1",
+            "reads training.learning_rate (method=coil); leave it out",
+        ),
+        ("training.imitation_env.assignment=random", "reads training.imitation_env.assignment"),
+        ("training.tests.starts=5", "reads training.tests.starts (method=coil)"),
+        ("recording=drive.mcap", "nothing in this run reads recording (method=coil); leave it out"),
+        ("method.needs_guide=false", "the file of method=coil says whether its policy needs a"),
+        ("method=guide learner.gamma=0.9", GUIDE),
+        ("method=guide learner=sac", GUIDE),
+        ("method=guide training.noise_correlation=0.5", GUIDE),
+        ("method=guide budget.num_envs=3", GUIDE),
+        ("method=guide budget.frames=100", GUIDE),
+        ("method=guide evaluation.curve.points=2", GUIDE),
+        ("method=guide logger=csv", GUIDE),
+        (
+            "action=choices training.noise_correlation=0.5",
+            "reads training.noise_correlation (method=coil)",
+        ),
+        (
+            "method=oil training.noise_correlation=0.5",
+            "reads training.noise_correlation (method=oil)",
+        ),
+        (
+            "method=ppo +degrade@evaluation.advice.zeroed=zeroed",
+            "reads evaluation.advice.zeroed (method=ppo)",
+        ),
+        (
+            "method=dynamic_coil_sequential +degrade@evaluation.advice.zeroed=zeroed",
+            "reads evaluation.advice.zeroed (method=dynamic_coil_sequential)",
+        ),
+    ],
+)
+def test_override_that_nothing_reads_is_refused(words, message):
+    assert message in unread(*words.split())
+
+
+@pytest.mark.parametrize("word", ["method=coil_anchored", "delivery=tested"])
+def test_cases_of_comparisons_are_read_where_policies_are_compared(word):
+    check_read(compose_train([word]), ["training.tests.starts=5"])
+
+
+@pytest.mark.parametrize(
+    ("word", "read"),
+    [
+        ("learner.gamma=0.9", False),
+        ("network=mlp", False),
+        ("training.learning_rate=1", False),
+        ("budget.minibatches=3", False),
+        ("checkpoint_every=3", False),
+        ("budget.frames=1000", True),
+        ("training.tests.starts=5", True),
+        ("evaluation.curve.points=2", True),
+        ("preset.rate=10", True),
+    ],
+)
+def test_search_of_the_numbers_of_a_guide_reads_nothing_of_a_learner(word, read):
+    assert (unread("method=tune", word) == "") == read
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "guide.spline.gain=0.5",
+        "env.rate=10",
+        "preset.rate=10",
+        "track.test.count=2",
+        "evaluation.gif=false",
+        "seed=3",
+        "device=cpu",
+        "label=mine",
+        "disturb=[late]",
+        "degrade=[noisy]",
+    ],
+)
+def test_guide_alone_reads_what_says_how_it_drives(word):
+    assert unread("method=guide", "track=generated", word) == ""
+
+
+def test_value_that_an_env_refers_to_is_read_by_a_guide_alone():
+    words = ["method=guide", "env.time_limit=${budget.steps}", "budget.steps=3"]
+    assert unread(*words) == ""
+    assert "(method=guide)" in unread("method=guide", "budget.steps=3")
+
+
+@pytest.mark.slow
+def test_each_run_of_a_sweep_says_what_it_does_not_read(tmp_path):
+    words = ["-m", "method=guide", "seed=0,1", *SHORT_LAP, "evaluation.gif=false"]
+    said = called("train", *words, "learner.gamma=0.9", cwd=tmp_path).stderr
+    assert said.count("learner.gamma=0.9 has no effect: nothing in this run reads") == 2
+
+
+def test_noise_is_read_where_actions_are_numbers():
+    assert unread("method=coil", "training.noise_correlation=0.5") == ""
+
+
+@pytest.mark.slow
+def test_words_from_python_are_read_too(tmp_path):
+    words = ["logger=none", "proxy.seed=3"]
+    folder = tmp_path / "run"
+    with pytest.raises(
+        UserError, match=r"proxy\.seed=3 has no effect: nothing in this run reads proxy\.seed"
+    ):
+        coil_rl.prepare("cone_track", method="ppo", folder=folder, overrides=words)
+    with pytest.raises(UserError, match=r"budget\.frames=64 has no effect: .*method=guide"):
+        coil_rl.prepare("cone_track", guide="spline", method="guide", frames=64, folder=folder)
+    assert not folder.exists()
+
+
+SMALL = ["evaluation.cases=2", "evaluation.curve.num_envs=2", "logger=none"]
+NAMES = [  # guide.controller.of
+    ("odd_parts", "of=odd_parts must be MODULE:NAME"),
+    ("odd_parts.first", "of=odd_parts.first must be MODULE:NAME"),
+    ("", "of= must be MODULE:NAME"),
+    ("3", "of=3 is int; name a class, a function"),
+    ("odd_parts:firts", "odd_parts has no firts; did you mean first?"),
+    ("odd_party:first", "there is no module odd_party; install its package"),
+]
+WORDS = [  # of a run of PPO in env=gym env.id=odd_parts:Plain
+    ("env.id=odd_parts:Nothing", "odd_parts has no env Nothing, and registers none of this name"),
+    ("env.id=", "env.id is empty; write env.id=MODULE:NAME"),
+    ("env.id=no_such-v3", "or PACKAGE:no_such-v3 if a package registers"),
+    ("env.id=7", "env.id=7 must be a valid string or callable"),
+    ("+env.options.speed=3", "it raised TypeError: Plain() takes no arguments"),
+    ("env.max_steps=-5", "max_steps=-5 must be at least 1"),
+    ("env.info=speed", "env.info='speed' must be a list"),
+    ("observes=observation", "observes=observation must be a list; write observes=[observation]"),
+    ("observes=[speed]", "the env has no entry speed to observe; it has observation"),
+    ("budget.frames=1.5", "Value '1.5' of type 'float' could not be converted to Integer"),
+    ("budget.frames=many", "Value 'many' of type 'str' could not be converted to Integer"),
+    ("budget.steps=100000000", "budget.steps=100000000 must be at most 65536"),
+    ("training.noise_correlation=much", "'much' of type 'str' could not be converted to Float"),
+    ("compile=maybe", "Value 'maybe' is not a valid bool"),
+    ("label=a/b", "label=a/b cannot be used: it must not be empty"),
+    ("evaluation.cases=two", "evaluation.cases=two must be at least 1, or the names of the"),
+    ("learner.hidden=64", "learner.hidden=64 must be a list"),
+    ("learner=[ppo,sac]", "chooses several files of a group that takes one; for a run with each"),
+    ("method=[ppo,coil]", "write -m method=ppo,coil"),
+    ("degrade=[noisy]", "degrade=[noisy] has no effect, because there is no guide"),
+    ("network=gru learner=sac", "SAC cannot train a network with a memory; take network=mlp"),
+    ("method=mixing guide=random method.transforms.mixing.weight=2", "weight=2 must be at most 1"),
+    ("track=unseen", "Could not override 'track'. No match in the defaults list"),
+    ("+track=unseen", "+track=unseen has no effect: nothing in this run reads track"),
+    ("+preset=paper", "+preset=paper has no effect: nothing in this run reads preset"),
+    ("+evaluation.measures.speed.entry=speed", "measures.speed=speed is no entry of the env"),
+    ("evaluation.measures.speed=speed", "write evaluation.measures.speed.entry=ENTRY"),
+    ("evaluation.measures.speed.entrry=reward", "no key entrry; evaluation.measures.speed"),
+    ("evaluation.measures.steps.entry=reward", "steps is already a column of the tables"),
+    ("guide.controller.of=odd_parts:first", "it belongs to guide=controller: write"),
+]
+OTHER_ENVS = [
+    ("env.id=odd_parts:Plain", "it belongs to env=gym: write env=gym env.id=VALUE"),
+    ("env=odd_parts:Plain", "for an env of Gymnasium write env=gym env.id=odd_parts:Plain"),
+    ("env=gym", "env.id must be given: write env.id=VALUE"),
+    ("env=torchrl env.of._target_=odd_parts.Plain", "of makes Plain, which is no env of TorchRL"),
+]
+
+
+def answer(*words):
+    """Return the sentence that refuses the words of a command line, or an empty string."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            config = compose_train([*words, "run_dir=run"])
+            check(config)
+            check_read(config, words)
+    except Exception as error:
+        from_hydra = isinstance(error, (HydraException, OmegaConfBaseException))
+        if not from_hydra and not is_no_bug(error):
+            raise
+        return sentence(error)
+    return ""
+
+
+def in_gym(env, *words):
+    return answer("env=gym", f"env.id=odd_parts:{env}", *SMALL, "method=ppo", *words)
+
+
+@pytest.mark.parametrize(("of", "expected"), NAMES)
+def test_odd_name_of_a_controller_is_answered(of, expected):
+    assert expected in in_gym("Plain", "guide=controller", f"guide.controller.of={of}")
+
+
+@pytest.mark.fast(8)
+@pytest.mark.parametrize(("words", "expected"), WORDS)
+def test_odd_word_is_answered(words, expected, caplog):
+    caplog.set_level(logging.CRITICAL)
+    assert expected in in_gym("Plain", *words.split())
+
+
+@pytest.mark.parametrize(("words", "expected"), OTHER_ENVS)
+def test_odd_env_is_answered(words, expected):
+    assert expected in answer(*words.split(), "method=ppo")
+
+
+@pytest.mark.parametrize(
+    ("space", "of", "given"),
+    [
+        ("wide", "far", 1000.0),  # clamped to the upper bound
+        ("unit", "seven", 1.0),
+        ("scalar", "seven", 7.0),
+        ("half", "far", 5e6),  # no upper bound
+        ("half_floats", "far", 1.0),
+        ("from5", "seven", 7),
+        ("from5", "six", 6),
+    ],
+)
+def test_env_is_given_the_action_of_its_guide_in_its_own_numbers(space, of, given, monkeypatch):
+    seen = []
+    step = odd_parts.Acts.step
+
+    def noted(self, action):
+        seen.append(float(np.asarray(action).reshape(-1)[0]))
+        return step(self, np.zeros(1))
+
+    monkeypatch.setattr(odd_parts.Acts, "step", noted)
+    words = ["env=gym", "env.id=odd_parts:Acts", f"+env.options.space={space}", *SMALL]
+    words += ["guide=controller", f"guide.controller.of=odd_parts:{of}", "method=guide"]
+    env, policy = env_maker(compose_train([*words, "run_dir=run"])).guided(1, "test")
+    with torch.no_grad():
+        env.rollout(3, policy)
+    assert seen == [given] * 3
