@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from coil_rl.extras import require as require
     from coil_rl.files import LARGEST_NUMBERS as LARGEST_NUMBERS
     from coil_rl.files import read_text as read_text
+    from coil_rl.foreign.controllers import load as load
     from coil_rl.output import progress as progress
     from coil_rl.output import say as say
     from coil_rl.programs.app import check_unused as check_unused

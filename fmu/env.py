@@ -1,6 +1,5 @@
 """FMUs as one batched env, made from the names of what is connected to them."""
 
-import importlib
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -15,6 +14,7 @@ from coil_fmu.plant import FAILED, FMU, SETPOINT, Clock, Reward, Wiring, action_
 from coil_fmu.reward import Follow
 from coil_fmu.setpoints import Course, course_of
 from coil_rl import GymnasiumEnv
+from coil_rl.for_guests import load
 from coil_rl.ranges import Count, Len, Positive, Processes, Seed, checked
 
 
@@ -191,13 +191,7 @@ def _clock(model: Model, step: float | None, seconds: float | None, substeps: in
 def _reward(given: str | Reward | None, wiring: Wiring) -> Reward:
     """Return the function of a reward; a `ValueError` for none."""
     if isinstance(given, str):
-        module, _, name = given.partition(":")
-        try:
-            given = getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ValueError(
-                f"reward={given} must be MODULE:NAME of a function that can be imported ({error})"
-            ) from error
+        given = load(given, "reward")
     if given is not None and not callable(given):
         raise ValueError(f"reward={given!r} must be a function, or MODULE:NAME of one")
     if isinstance(given, Follow) or given is None:

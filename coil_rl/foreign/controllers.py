@@ -343,30 +343,34 @@ def _parts_of(key: NestedKey, entry: TensorDictBase) -> str:
     )
 
 
-def load(of: str) -> Any:
-    """Return what is named by `MODULE:NAME`; raises a `ValueError` if it cannot be imported."""
+def load(of: str, key: str = "of") -> Any:
+    """Return what is named by `MODULE:NAME`; raises a `ValueError` if it cannot be imported.
+
+    Args:
+        key: of the argument that names it, for the message.
+    """
     module, _, names = of.partition(":")
     if not module or not names:
-        raise ValueError(f"of={of} must be MODULE:NAME, such as my_package.control:MyPID")
+        raise ValueError(f"{key}={of} must be MODULE:NAME, such as my_package.control:MyPID")
     try:
         thing: Any = importlib.import_module(module)
     except ModuleNotFoundError as error:
         # The missing module is the one that was named, or a package around it.
         if f"{module}.".startswith(f"{error.name}."):
             raise ValueError(
-                f"of={of}: there is no module {error.name}; install its package, or add its folder "
-                "to PYTHONPATH"
+                f"{key}={of}: there is no module {error.name}; install its package, or add its "
+                "folder to PYTHONPATH"
             ) from error
         raise ValueError(
-            f"of={of}: {module} needs {error.name}, which is missing; install it"
+            f"{key}={of}: {module} needs {error.name}, which is missing; install it"
         ) from error
     except Exception as error:
         raise ValueError(
-            f"of={of}: {module} cannot be imported ({type(error).__name__}: {error})"
+            f"{key}={of}: {module} cannot be imported ({type(error).__name__}: {error})"
         ) from error
     for name in names.split("."):
         if not hasattr(thing, name):
             hint = did_you_mean(name, vars(thing)) or "; name another"
-            raise ValueError(f"of={of}: {module} has no {names}{hint}")
+            raise ValueError(f"{key}={of}: {module} has no {names}{hint}")
         thing = getattr(thing, name)
     return thing

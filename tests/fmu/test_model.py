@@ -163,7 +163,11 @@ CASES: dict[str, tuple[Callable[[Path], Path], dict[str, Any], str]] = {
         {"setpoints": {"speed": {"low": 3, "high": 1}}},
         "low=3.* must be at most high=1",
     ),
-    "no module": (lambda _: fmus.motor(), {"reward": "nowhere:none"}, "reward=nowhere:none must"),
+    "no module": (
+        lambda _: fmus.motor(),
+        {"reward": "nowhere:none"},
+        "reward=nowhere:none: there is no",
+    ),
 }
 
 
