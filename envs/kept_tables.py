@@ -42,7 +42,9 @@ def kept(name: str, source: Iterable[bytes], make: Callable[[], dict[str, Tensor
         source: everything that they follow from, the program included.
     """
     try:
-        file = cache_folder() / f"{name}_{_digest(source)[:32]}{SUFFIX}"
+        # Of digests, so that no part can be taken for some of another one.
+        digests = b"".join(hashlib.sha256(part).digest() for part in source)
+        file = cache_folder() / f"{name}_{hashlib.sha256(digests).hexdigest()[:32]}{SUFFIX}"
     except RuntimeError:  # there is no home
         return make()
     with suppress(OSError, ValueError, EOFError, BadZipFile):
@@ -56,14 +58,6 @@ def kept(name: str, source: Iterable[bytes], make: Callable[[], dict[str, Tensor
         with suppress(OSError, UserError):  # a file in the place of the folder
             _write(file, made)
     return made
-
-
-def _digest(parts: Iterable[bytes]) -> str:
-    """Return the digest of some bytes, of which none may be taken for parts of others."""
-    total = hashlib.sha256()
-    for part in parts:
-        total.update(hashlib.sha256(part).digest())
-    return total.hexdigest()
 
 
 def _write(file: Path, tables: Tables) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from coil_rl.envs.simulator_files import Row, is_of_simulator, numbers, simulator_track
 from coil_rl.envs.track import Track, TrackError
 from coil_rl.files import read_file, whole_file
+from coil_rl.ranges import checked
 
 Split = Literal["train", "test", "all"]
 
@@ -127,6 +128,7 @@ def save_track(track: Track, path: str | os.PathLike[str]) -> None:
         unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="")
 
 
+@checked
 def shipped_tracks(split: Split) -> list[Track]:
     """Return the project's own tracks.
 
@@ -134,10 +136,6 @@ def shipped_tracks(split: Split) -> list[Track]:
         split: "train" for the seven to train on, "test" for the three to test on, or "all" ten;
             else a `ValueError`.
     """
-    if split not in ("train", "test", "all"):
-        raise ValueError(
-            f"There is no split {split!r} of the shipped tracks; give 'train', 'test' or 'all'."
-        )
     if split == "all":
         return [*_shipped("train"), *_shipped("test")]
     return list(_shipped(split))

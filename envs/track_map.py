@@ -91,9 +91,6 @@ class TrackMap(nn.Module):
         self.slots = self.cones.shape[1] // (2 * len(tracks))
         self.most = self.candidate.shape[1] // 2
 
-    def __len__(self) -> int:
-        return len(self.tracks)
-
     def locate(self, track: Tensor, position: Tensor) -> Location:
         """Locate positions [2, B] m on tracks [B]; positions off the map are moved to its edge."""
         points = self.points.index_select(1, track).view(4, 2, -1)

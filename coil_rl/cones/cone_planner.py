@@ -5,7 +5,6 @@ hidden. A pure pursuit follows its path: the car steers along the arc through a 
 """
 
 import math
-from functools import cached_property
 from types import ModuleType
 from typing import Any
 
@@ -51,10 +50,6 @@ class ConePlannerGuide(TensorDictModuleBase):
         self.max_steering = math.radians(max_steering)
         self.package = _package()
 
-    @cached_property
-    def _no_cones(self) -> list[NDArray[np.float64]]:
-        return [np.zeros((0, 2)) for _ in self.package.ConeTypes]
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action`: [*batch, 1], fraction of the maximal steering."""
         batch = tensordict.batch_size
@@ -75,7 +70,7 @@ class ConePlannerGuide(TensorDictModuleBase):
             right: [M, 2] m.
         """
         kinds = self.package.ConeTypes
-        cones = list(self._no_cones)
+        cones = [np.zeros((0, 2)) for _ in kinds]
         cones[kinds.LEFT], cones[kinds.RIGHT] = left, right
         # A new planner each time: an old one returns its last path where it finds none.
         planner = self.package.PathPlanner(self.package.MissionTypes.trackdrive)

@@ -60,7 +60,12 @@ def _about_view(env: "McapReplayEnv", number: int, recording: Recording) -> str:
         problems.append(f"only {both_valid.mean():.0%} of the scans show both boundaries")
     ordered = in_order(env.cones[scans].cpu().numpy(), env.count[scans].cpu().numpy())
     if len(ordered) and ordered.mean() < IN_ORDER:
-        problems.append(f"{OUT_OF_ORDER} in only {ordered.mean():.0%} of the scans with both")
+        problems.append(
+            "the left cones lie left of the right ones (the scans are mirrored, as of a laser that "
+            "is upside down; or turned, see perception.laser_yaw, 180 for a laser that points "
+            "backwards; or thin cones stand on the right) in only "
+            f"{ordered.mean():.0%} of the scans with both"
+        )
     if isinstance(env.perception, Perception):
         some = slice(None, None, -(-len(recording.ranges) // CHECKED_SCANS))
         rejected = env.perception.rejected(recording.ranges[some], recording.angles(some))
@@ -70,13 +75,6 @@ def _about_view(env: "McapReplayEnv", number: int, recording: Recording) -> str:
                 "(coil-reproduce figure=25 trains a classifier on your cones)"
             )
     return " and ".join(problems)
-
-
-OUT_OF_ORDER = (
-    "the left cones lie left of the right ones (the scans are mirrored, as of a laser that is "
-    "upside down; or turned, see perception.laser_yaw, 180 for a laser that points backwards; or "
-    "thin cones stand on the right)"
-)
 
 
 def in_order(cones: NDArray[np.floating], count: NDArray[np.int64]) -> NDArray[np.bool_]:

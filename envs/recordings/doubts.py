@@ -40,8 +40,8 @@ def _about_clock(recording: Recording) -> list[str]:
         remarks.append(f"has scans whose stamps {_fault(stamp)}, so their log times are the clock")
     elif not believed(stamp, log_time):
         remarks.append(
-            f"has scans {_rate(stamp)} times a second by their stamps, so their log times are the "
-            "clock"
+            f"has scans {1e9 / np.median(np.diff(stamp)):.3g} times a second by their stamps, so "
+            "their log times are the clock"
         )
     elif ascending(log_time):
         ratio = float((stamp[-1] - stamp[0]) / (log_time[-1] - log_time[0]))
@@ -87,11 +87,6 @@ def _fault(stamp: Times) -> str:
     parts = [f"repeat {repeated} times"] if repeated else []
     parts += [f"fall {falling} times"] if falling else []
     return " and ".join(parts)
-
-
-def _rate(times: Times) -> str:
-    """Return the scans per second by a clock."""
-    return f"{1e9 / np.median(np.diff(times)):.3g}"
 
 
 def _about_scans(recording: Recording) -> list[str]:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from oracle import guide_action
 from torch import Tensor
 
-from coil_rl.guides import RacingLineGuide, SplineGuide
+from coil_rl.guides import RacingLineGuide, SplineGuide, SplineMemoryGuide
 
 SLOTS = 16
 both_splines = pytest.mark.parametrize("spline", ["cubic", "quadratic"])
@@ -207,6 +207,7 @@ def test_advice_is_an_action_for_any_cones(
                 "max_steering": 100,
             },
         ),
+        (SplineMemoryGuide, {"sight": 0, "sharpness": -1}),
     ],
 )
 def test_values_out_of_range_are_refused(guide: type, values: dict) -> None:
