@@ -104,9 +104,9 @@ def test_clearance_is_the_distance_to_the_nearest_crash() -> None:
 
 def test_positions_far_from_the_track_have_no_cones_and_finite_clearance() -> None:
     lookup = track_map(torch.float32)
-    which = torch.arange(len(lookup))
+    which = torch.arange(len(lookup.tracks))
     for x, y in ((-1e3, 0.0), (1e3, 1e3), (0.0, -1e6)):
-        pose = torch.tensor([[x], [y], [1.0]]).expand(3, len(lookup))
+        pose = torch.tensor([[x], [y], [1.0]]).expand(3, len(lookup.tracks))
         _, position = candidates(lookup, which, pose)
         clearance = clearances(lookup, which, pose[:2])
         assert ((position - pose[:2].view(2, 1, 1, -1)).square().sum(0) > 49).all()
