@@ -11,14 +11,13 @@ rest.
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import re
 import resource
 import shutil
-import subprocess
 import sys
 import tempfile
-from functools import partial
 from pathlib import Path
 
 from kill_and_resume import describe_state, differences, finish, start
@@ -32,20 +31,28 @@ def interrupted_by_full_disk(
 ) -> list[str]:
     """Start a run with so many bytes of room; return its standard error without the progress."""
     filler = folder.parent / "filler"
-    limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
     if disk:
-        limit = None
         with filler.open("wb") as file:
             file.write(bytes(max(0, shutil.disk_usage(disk).free - room)))
-    process = start(folder, overrides, stderr=subprocess.PIPE, preexec_fn=limit)
-    _, text = process.communicate(timeout=600)
+    errors, of_program = os.pipe()
+
+    def prepare() -> None:
+        os.dup2(of_program, 2)
+        os.close(of_program)
+        if not disk:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
+
+    process = start(folder, overrides, prepare)
+    os.close(of_program)
+    with open(errors) as file:
+        lines = [
+            line
+            for line in file.read().splitlines()
+            if line.strip() and not re.search(f"%|step/s|{LEFT_OUT}", line)
+        ]
+    process.join()
     filler.unlink(missing_ok=True)
-    lines = [
-        line
-        for line in text.decode().splitlines()
-        if line.strip() and not re.search(f"%|step/s|{LEFT_OUT}", line)
-    ]
-    return lines if process.returncode == 2 else [f"exit code {process.returncode}", *lines]
+    return lines if process.exitcode == 2 else [f"exit code {process.exitcode}", *lines]
 
 
 def main(argv: list[str] | None = None) -> int:

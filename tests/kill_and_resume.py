@@ -11,16 +11,17 @@ from __future__ import annotations
 
 import argparse
 import csv
+import multiprocessing
 import os
 import random
 import re
-import subprocess
 import sys
 import tempfile
 import time
 from bisect import bisect
+from collections.abc import Callable
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 # Started by its path, Python would take tests/coil_rl for the library.
@@ -29,10 +30,13 @@ sys.path.insert(0, str(ROOT))
 import torch  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
+import coil_rl.config.assemble  # noqa: E402, F401  once, and not in each process
+import coil_rl.config.check  # noqa: E402, F401
+from coil_rl.programs.train import main as train  # noqa: E402
 from coil_rl.run import checkpoint  # noqa: E402
 
 SMALL = [
-    "budget.frames=10240",
+    "budget.frames=5120",
     "budget.num_envs=32",
     "budget.steps=16",
     "evaluation.repeats=2",
@@ -60,20 +64,37 @@ STATES = ["policy_last.pt", "checkpoint.pt"]
 TIMEOUT = 600  # s
 
 
-def start(folder: Path, overrides: list[str], **options: Any) -> subprocess.Popen[bytes]:
-    """Start a process that begins the run in the folder or resumes it, with options of `Popen`."""
+def start(
+    folder: Path, overrides: list[str], prepare: Callable[[], object] = lambda: None
+) -> BaseProcess:
+    """Start a process that begins the run in the folder or resumes it.
+
+    The process is a copy of this one, which has imported PyTorch. `prepare` is called in it.
+    """
     begun = (folder / "config.yaml").exists()
     if begun:
         arguments = [f"resume={folder}", *(word for word in overrides if word.startswith("trust="))]
     else:
         other = any(word.startswith("env=") for word in overrides)
         arguments = [*SMALL, *([] if other else CONES), *overrides, f"hydra.run.dir={folder}"]
-    env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    with (folder.parent / f"{folder.name}.log").open("ab") as log:
-        command = [sys.executable, "-m", "coil_rl.programs.train", *arguments]
-        return subprocess.Popen(
-            command, cwd=folder.parent, env=env, **{"stdout": log, "stderr": log, **options}
-        )
+    process = multiprocessing.get_context("fork").Process(
+        target=program, args=(folder, arguments, prepare)
+    )
+    process.start()
+    return process
+
+
+def program(folder: Path, arguments: list[str], prepare: Callable[[], object]) -> None:
+    """Be coil-train, with a log beside the folder of the run."""
+    torch.set_num_threads(1)
+    os.chdir(folder.parent)
+    with Path(f"{folder.name}.log").open("ab") as log:
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+    prepare()
+    sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
+    sys.argv = ["coil-train", *arguments]
+    train()
 
 
 def marks(folder: Path) -> int:
@@ -87,11 +108,12 @@ def finish(folder: Path, overrides: list[str]) -> list[float]:
     """Run to the end, and return the seconds until each mark and the end."""
     began, reached = time.monotonic(), []
     process = start(folder, overrides)
-    while process.poll() is None and time.monotonic() - began < TIMEOUT:
+    while process.is_alive() and time.monotonic() - began < TIMEOUT:
         reached += [time.monotonic() - began] * (marks(folder) - len(reached))
         time.sleep(0.002)
     process.kill()
-    if process.wait() != 0:
+    process.join()
+    if process.exitcode != 0:
         sys.exit((folder.parent / f"{folder.name}.log").read_text()[-2000:])
     return [*reached, time.monotonic() - began]
 
@@ -106,16 +128,16 @@ def kill(
     mark = bisect(reached, moment)
     rest = moment - reached[mark - 1]
     process = start(folder, overrides)
-    while process.poll() is None and marks(folder) < mark:
+    while process.is_alive() and marks(folder) < mark:
         time.sleep(0.002)
     until = time.monotonic() + rest
-    while process.poll() is None and (
+    while process.is_alive() and (
         time.monotonic() < until or (hit_write and not unfinished(folder))
     ):
         time.sleep(0.0002 if time.monotonic() > until else 0.001)
-    ended = process.poll() is not None
+    ended = not process.is_alive()
     process.kill()
-    process.wait()
+    process.join()
     return f"{moment:.1f} s: " + ("it had ended" if ended else describe_state(folder))
 
 

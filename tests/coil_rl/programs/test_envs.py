@@ -55,11 +55,12 @@ def kill(folder, overrides, mark):
     """Start a run in a process of its own and kill it at a mark."""
     process = kill_and_resume.start(folder, overrides)
     began = time.monotonic()
-    while process.poll() is None and kill_and_resume.marks(folder) < mark:
+    while process.is_alive() and kill_and_resume.marks(folder) < mark:
         assert time.monotonic() < began + kill_and_resume.TIMEOUT
         time.sleep(0.002)
     process.kill()
-    assert process.wait() == -signal.SIGKILL, "the run ended before it was killed"
+    process.join()
+    assert process.exitcode == -signal.SIGKILL, "the run ended before it was killed"
     assert not (folder / "evaluation.csv").exists()
 
 
