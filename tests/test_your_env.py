@@ -36,7 +36,8 @@ TOY = {
     "coil-distill": PROXY,
     "coil-export": ["observations=50"],
 }
-FEW = ["budget.frames=2048", "evaluation.cases=2", "evaluation.curve.num_envs=2"]
+EVALUATION = ["evaluation.cases=2", "evaluation.curve.num_envs=2", "evaluation.curve.points=1"]
+FEW = ["budget.frames=2048", *EVALUATION]
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +77,7 @@ def test_path_is_measure_tune_train_export(plant):
 @pytest.mark.slow
 def test_python_of_the_ten_minutes_runs(plant):
     program = FROM_PYTHON.replace("20_000", "2048").replace("cases=100", "cases=2")
+    program = program.replace('"env.max_steps=60"', f'"env.max_steps=60", *{EVALUATION}')
     found: dict = {}
     exec(compile(program, "your_env.md", "exec"), found)
     assert 0 <= found["flow"][0] <= 20
@@ -103,8 +105,11 @@ def test_files_that_are_named_or_linked_are_there():
 def test_python_runs_as_printed(program, folder, tmp_path, monkeypatch):
     assert len([line for line in program.splitlines() if line]) <= 11
     monkeypatch.chdir(tmp_path)
-    for frames, toy in (("100_000", "2048"), ("200_000", "4096"), ("cases=50", "cases=2")):
-        program = program.replace(frames, toy)
+    program = program.replace("100_000", "1024").replace("200_000", "1280")
+    program = program.replace("cases=50", "cases=2")
+    program = program.replace(
+        'folder="outputs/py")', f'folder="outputs/py", overrides={EVALUATION})'
+    )
     found: dict = {}
     exec(compile(program, "your_env.md", "exec"), found)
     if "result" in found:
