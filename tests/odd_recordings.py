@@ -49,16 +49,6 @@ class Messages:
         found += [(self.command_topic, self.command_type, *each) for each in self.commands]
         return found + self.more
 
-    def of_scans(self, **changes):
-        """Set fields of all scans, each to a value or to a function of the old fields."""
-        for _, fields in self.scans:
-            made = {k: v(fields) if callable(v) else v for k, v in changes.items()}
-            fields.update(made)
-
-    def stamps(self, change):
-        for number, (_, fields) in enumerate(self.scans):
-            fields["header"] = header(int(change(number, fields["stamp_ns"])), "laser")
-
 
 def good_drive(folder, seconds=SECONDS, seed=4):
     """The path of a recorded drive of the spline guide on the simulated robot."""
@@ -101,11 +91,41 @@ def write(path, messages):
     return path
 
 
+def named(name, function):
+    function.__name__ = name
+    return function
+
+
+def of_scans(name, **changes):
+    """Set fields of all scans, each to a value or to a function of the old fields."""
+
+    def change(drive):
+        for _, fields in drive.scans:
+            fields.update({k: v(fields) if callable(v) else v for k, v in changes.items()})
+
+    return named(name, change)
+
+
+def stamps(name, stamp_of):
+    def change(drive):
+        for number, (_, fields) in enumerate(drive.scans):
+            fields["header"] = header(int(stamp_of(number, fields["stamp_ns"])), "laser")
+
+    return named(name, change)
+
+
+def commands(name, part, of, factor):
+    def change(drive):
+        for _, fields in drive.commands:
+            fields[part][of] *= factor
+
+    return named(name, change)
+
+
 # Scans
 
 
-def mirrored(drive):
-    drive.of_scans(ranges=lambda scan: np.roll(scan["ranges"][::-1], -1))
+mirrored = of_scans("mirrored", ranges=lambda scan: np.roll(scan["ranges"][::-1], -1))
 
 
 def mirrored_by_turns(drive):
@@ -113,83 +133,40 @@ def mirrored_by_turns(drive):
         scan["ranges"] = np.roll(scan["ranges"][::-1], -1)
 
 
-def backwards(drive):
-    drive.of_scans(ranges=lambda scan: np.roll(scan["ranges"], 180))
-
-
-def turned_left(drive):
-    drive.of_scans(ranges=lambda scan: np.roll(scan["ranges"], 90))
-
-
-def step_of_one_more(drive):
-    drive.of_scans(angle_increment=2 * np.pi / 361)
-
-
-def swapped_ends(drive):
-    drive.of_scans(angle_min=LAST, angle_max=FIRST)
-
-
-def clockwise(drive):
-    drive.of_scans(
-        angle_min=LAST,
-        angle_max=FIRST,
-        angle_increment=-STEP,
-        ranges=lambda scan: scan["ranges"][::-1].copy(),
-    )
-
-
-def clockwise_with_a_positive_step(drive):
-    drive.of_scans(ranges=lambda scan: scan["ranges"][::-1].copy())
-
-
-def degrees(drive):
-    drive.of_scans(angle_min=-179.0, angle_max=180.0, angle_increment=1.0)
-
-
-def step_in_degrees(drive):
-    drive.of_scans(angle_increment=1.0)
-
-
-def no_step(drive):
-    drive.of_scans(angle_increment=0.0)
-
-
-def no_angles(drive):
-    drive.of_scans(angle_min=0.0, angle_max=0.0, angle_increment=0.0)
-
-
-def no_last_angle(drive):
-    drive.of_scans(angle_max=0.0)
-
-
-def one_step_too_far(drive):
-    drive.of_scans(angle_max=LAST + STEP)
-
-
-def many_turns(drive):
-    drive.of_scans(angle_increment=2.0, angle_max=FIRST + 2.0 * 359)
-
-
-def millimetres(drive):
-    drive.of_scans(ranges=lambda scan: scan["ranges"] * 1000)
-
-
-def all_millimetres(drive):
-    drive.of_scans(ranges=lambda scan: scan["ranges"] * 1000, range_min=150.0, range_max=12_000.0)
-
-
-def no_limits(drive):
-    drive.of_scans(range_min=0.0, range_max=0.0)
-
-
-def blind(drive):
-    drive.of_scans(ranges=np.full(360, np.inf, np.float32))
+backwards = of_scans("backwards", ranges=lambda scan: np.roll(scan["ranges"], 180))
+turned_left = of_scans("turned_left", ranges=lambda scan: np.roll(scan["ranges"], 90))
+step_of_one_more = of_scans("step_of_one_more", angle_increment=2 * np.pi / 361)
+swapped_ends = of_scans("swapped_ends", angle_min=LAST, angle_max=FIRST)
+clockwise = of_scans(
+    "clockwise",
+    angle_min=LAST,
+    angle_max=FIRST,
+    angle_increment=-STEP,
+    ranges=lambda scan: scan["ranges"][::-1].copy(),
+)
+clockwise_with_a_positive_step = of_scans(
+    "clockwise_with_a_positive_step", ranges=lambda scan: scan["ranges"][::-1].copy()
+)
+degrees = of_scans("degrees", angle_min=-179.0, angle_max=180.0, angle_increment=1.0)
+step_in_degrees = of_scans("step_in_degrees", angle_increment=1.0)
+no_step = of_scans("no_step", angle_increment=0.0)
+no_angles = of_scans("no_angles", angle_min=0.0, angle_max=0.0, angle_increment=0.0)
+no_last_angle = of_scans("no_last_angle", angle_max=0.0)
+one_step_too_far = of_scans("one_step_too_far", angle_max=LAST + STEP)
+many_turns = of_scans("many_turns", angle_increment=2.0, angle_max=FIRST + 2.0 * 359)
+millimetres = of_scans("millimetres", ranges=lambda scan: scan["ranges"] * 1000)
+all_millimetres = of_scans(
+    "all_millimetres", ranges=lambda scan: scan["ranges"] * 1000, range_min=150.0, range_max=12e3
+)
+no_limits = of_scans("no_limits", range_min=0.0, range_max=0.0)
+blind = of_scans("blind", ranges=np.full(360, np.inf, np.float32))
 
 
 def room(drive):
     draw = np.random.default_rng(0)
     wall = 0.8 + 0.1 * np.sin(np.arange(360) / 20)
-    drive.of_scans(ranges=lambda scan: (wall + draw.normal(0, 0.002, 360)).astype(np.float32))
+    for _, scan in drive.scans:
+        scan["ranges"] = (wall + draw.normal(0, 0.002, 360)).astype(np.float32)
 
 
 def frozen(drive):
@@ -204,28 +181,16 @@ def one_scan(drive):
 # Clocks
 
 
-def zero_stamps(drive):
-    drive.stamps(lambda number, stamp: 0)
-
-
-def falling_stamps(drive):
-    drive.stamps(lambda number, stamp: 10**12 - stamp)
-
-
-def repeated_stamps(drive):
-    drive.stamps(lambda number, stamp: stamp - stamp % 10**9)
-
-
-def stamps_a_thousand_times_too_fast(drive):
-    drive.stamps(lambda number, stamp: stamp * 1000)
-
-
-def stamps_a_million_times_too_slow(drive):
-    drive.stamps(lambda number, stamp: number + 1)
-
-
-def stamps_three_times_too_fast(drive):
-    drive.stamps(lambda number, stamp: stamp * 3)
+zero_stamps = stamps("zero_stamps", lambda number, stamp: 0)
+falling_stamps = stamps("falling_stamps", lambda number, stamp: 10**12 - stamp)
+repeated_stamps = stamps("repeated_stamps", lambda number, stamp: stamp - stamp % 10**9)
+stamps_a_thousand_times_too_fast = stamps(
+    "stamps_a_thousand_times_too_fast", lambda number, stamp: stamp * 1000
+)
+stamps_a_million_times_too_slow = stamps(
+    "stamps_a_million_times_too_slow", lambda number, stamp: number + 1
+)
+stamps_three_times_too_fast = stamps("stamps_three_times_too_fast", lambda number, stamp: stamp * 3)
 
 
 def gaps(drive):
@@ -288,29 +253,11 @@ def commands_in_degrees(drive):
         fields["angular"]["z"] *= 180 / np.pi
 
 
-def _change(drive, part, name, factor):
-    for _, fields in drive.commands:
-        fields[part][name] *= factor
-
-
-def commands_in_cm(drive):
-    _change(drive, "linear", "x", 100)
-
-
-def commands_in_throttle(drive):
-    _change(drive, "linear", "x", 4)
-
-
-def commands_to_the_other_side(drive):
-    _change(drive, "angular", "z", -1)
-
-
-def commands_to_drive_backwards(drive):
-    _change(drive, "linear", "x", -1)
-
-
-def commands_of_half_a_turn(drive):
-    _change(drive, "angular", "z", 0.5)
+commands_in_cm = commands("commands_in_cm", "linear", "x", 100)
+commands_in_throttle = commands("commands_in_throttle", "linear", "x", 4)
+commands_to_the_other_side = commands("commands_to_the_other_side", "angular", "z", -1)
+commands_to_drive_backwards = commands("commands_to_drive_backwards", "linear", "x", -1)
+commands_of_half_a_turn = commands("commands_of_half_a_turn", "angular", "z", 0.5)
 
 
 def commands_a_second_late(drive):
