@@ -35,6 +35,7 @@ from coil_rl.config.parts import (
 )
 from coil_rl.config.python import Named, named, open_run
 from coil_rl.config.python import composed as composed_in_python
+from coil_rl.envs.reward import RewardWeights
 from coil_rl.errors import UserError
 from coil_rl.programs.distill import distill
 from coil_rl.programs.train import train
@@ -110,8 +111,8 @@ def test_override_with_another_target_replaces_all_arguments():
     env = build_bare_env(config, {"tracks": tracks, "reward": {"finish": 1.0}, "num_envs": 2})
     assert (env.batch_size, config.budget.num_envs) == ((2,), 4)
     assert [track.name for track in env.tracks] == ["robot (simulated)"]
-    assert env.weights["finish"] == 1
-    assert env.weights["crash"] == -100
+    weights = RewardWeights(*env.weights)
+    assert (weights.finish, weights.crash) == (1, -100)
 
 
 def lists_its_arguments(**options):
