@@ -110,6 +110,8 @@ class TrainingCases:
 
     def _build(self, rows: int) -> EnvBase:
         """Return the env with that many rows; it is made unless it has them."""
+        if rows == 0:
+            raise RuntimeError("there are no cases yet; call renew first")
         if self.env is None or self.env.batch_size.numel() != rows:
             with torch.random.fork_rng():
                 self.env = self.build(rows)
