@@ -59,10 +59,14 @@ def read_file(path: str | os.PathLike[str], largest: int) -> bytes:
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         # Some files of the system have no size before they are read.
-        content = file.read(max(size, BLOCK)) if size <= largest else b""
-    if max(size, len(content)) > largest:
+        blocks: list[bytes] = []
+        read = 0
+        while size <= largest and read <= largest and (block := file.read(max(size, BLOCK))):
+            blocks.append(block)
+            read += len(block)
+    if max(size, read) > largest:
         raise OSError(errno.EINVAL, f"it has more than {largest:,} bytes", os.fspath(path))
-    return content
+    return b"".join(blocks)
 
 
 def read_text(path: str | os.PathLike[str], largest: int) -> str:

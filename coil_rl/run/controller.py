@@ -162,7 +162,8 @@ class Controller:
             observation = {key: observation}
         for key in spec.keys(True, True):
             value: Any = observation
-            for part in (key,) if isinstance(key, str) else key:
+            whole = isinstance(key, str) or key in list(observation.keys())
+            for part in (key,) if whole else key:
                 value = value.get(part, {}) if hasattr(value, "get") else {}
             if not isinstance(value, Mapping):
                 _put(entries, key, value)
