@@ -2,12 +2,14 @@
 
     python -m benchmarks.hand_over outputs/experiments/guide_benchmark
 
-Each folder in it has the runs of one task. The differences of the returns of a policy and its guide
-in the same cases are shifted so that the policy is better or worse by a known part of the scale,
-which goes from the lowest to the highest mean return in the folder. A test draws some of them at
-random, with repetition, and decides by a rule. The table has, for each rule and number of cases,
-the share of tests that hand over the policy, by how much better it is, and the regret: what is lost
-against the better of both, in the mean over these shifts, as a part of the scale.
+Each folder in it has the runs of one task. The scale of a task is the distance from its lowest to
+its highest mean return. The returns of a policy minus those of its guide in the same cases are
+shifted: their mean becomes a known share of the scale, by which the policy is better or worse. A
+test draws some of these differences at random, with replacement, and decides by a rule.
+
+The table has a row for each rule and number of cases: the share of tests that hand over the policy
+at each shift, and the regret. That is the loss against always handing over the better of the two,
+averaged over the shifts, as a share of the scale.
 """
 
 import argparse
@@ -27,7 +29,7 @@ from coil_rl.report.runs import GUIDE, Run, read_runs
 Differences = NDArray[np.float64]  # [tests, cases]
 SHIFTS = (0.1, 0.03, 0.01, 0.0, -0.01, -0.03, -0.1)  # of the scale
 CASES = (2, 4, 8, 16, 32)
-TESTS = 1_000  # of each policy and shift
+TESTS = 1_000  # for each policy, shift and number of cases
 EVIDENCE = 20  # of the sequential test: it decides wrongly in at most 1 of 20 tests
 
 
@@ -96,8 +98,7 @@ def differences_of(runs: Sequence[Run]) -> list[NDArray[np.float64]]:
 
 def rows_of(pairs: Sequence[NDArray[np.float64]], seed: int = 0) -> list[dict[str, Any]]:
     """Return a row for each rule and number of cases."""
-    random = np.random.default_rng(seed)
-    rows = []
+    random, rows, shifts = np.random.default_rng(seed), [], np.array(SHIFTS)
     for cases in CASES:
         handed = {name: np.zeros(len(SHIFTS)) for name in RULES}
         for place, shift in enumerate(SHIFTS):
@@ -106,13 +107,10 @@ def rows_of(pairs: Sequence[NDArray[np.float64]], seed: int = 0) -> list[dict[st
                 for name, rule in RULES.items():
                     handed[name][place] += rule(drawn).mean() / len(pairs)
         for name, shares in handed.items():
-            lost = [
-                shift * (1 - share) if shift > 0 else -shift * share
-                for shift, share in zip(SHIFTS, shares, strict=True)
-            ]
+            lost = np.abs(shifts) * np.where(shifts > 0, 1 - shares, shares)
             row: dict[str, Any] = {"cases": cases, "rule": name}
             row |= {f"{shift:+.0%}": share for shift, share in zip(SHIFTS, shares, strict=True)}
-            rows.append(row | {"regret": float(np.mean(lost))})
+            rows.append(row | {"regret": float(lost.mean())})
     return rows
 
 

@@ -20,14 +20,13 @@ ROOT = Path(__file__).parents[1]
 
 
 def measure_processes(args: Namespace) -> list[Row]:
-    """Return a row for each number of cars in `memory_cars`, and one for an update of COIL.
+    """Return a row for each number of cars in `memory_cars`, and one with an update of COIL.
 
-    The update is that with the first one of `batches`.
+    The update is of the first of `batches`, which are pairs of a number of cars and one of steps.
     """
     rows = []
-    sizes = [(cars, 0) for cars in args.memory_cars]
-    for cars, steps in [*sizes, args.batches[0]]:
-        options = [str(cars), str(steps), args.device, str(args.threads)]
+    for cars, steps in [*((cars, 0) for cars in args.memory_cars), args.batches[0]]:
+        options = map(str, (cars, steps, args.device, args.threads))
         command = [sys.executable, "-m", __name__, *options]
         done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
         numbers = json.loads(done.stdout.splitlines()[-1])
@@ -36,10 +35,13 @@ def measure_processes(args: Namespace) -> list[Row]:
 
 
 def main(cars: int, steps: int, device: str, threads: int) -> Row:
-    """Import, build an env with advice and step it, and perhaps train COIL once.
+    """Import, build an env with advice and step it, and do one update of COIL if asked.
 
     Args:
-        steps: length of the batch of the training; 0 for no training.
+        cars: rows of the env.
+        steps: of each car in the rollout of the update; 0 for no update.
+        device: of the env.
+        threads: of torch.
     """
     start = time.perf_counter()
     import torch

@@ -22,9 +22,9 @@ AS_COMPLEX = np.array([1, 1j])
 MIN_CONES, MAX_CONES = 4, 1000
 MAX_COORDINATE = 10_000.0  # m
 MAX_EXTENT, MAX_LENGTH = 500.0, 5000.0  # m, of a side
-NEVER = -(2**30)  # as the step of the last entry of the finish circle
+NEVER = -(2**30)  # step at which a lap began, before the first entry of the finish circle
 PLACE_SPACING = 0.1  # m, of the line on which places are chosen
-GOLDEN_RATIO = (5**0.5 - 1) / 2  # steps of this share of a lap spread any number of places evenly
+GOLDEN_RATIO = (5**0.5 - 1) / 2  # of a lap, from place to place: spreads any number of them evenly
 MAX_PAIRS = 2 * 10**7  # of boundary segments tested for crossings
 
 
@@ -129,7 +129,7 @@ class Track:
         from scipy.interpolate import CubicSpline  # takes half a second
 
         cones: Array = getattr(self, side)
-        chord = np.concatenate([[0.0], np.linalg.norm(_edges(cones), axis=1).cumsum()])
+        chord = _travelled(cones)
         curve = CubicSpline(chord, np.vstack([cones, cones[:1]]), bc_type="periodic")
         return curve(np.linspace(0, chord[-1], int(np.ceil(chord[-1] / spacing)), endpoint=False))
 
@@ -205,8 +205,9 @@ def places(tracks: Sequence[Track], count: int | None) -> tuple[NDArray[np.int64
         count: P, number of places; None for the tracks' starts.
 
     Returns:
-        Index of the track, [P]; pose, [P, 3], m, m and heading in rad; and the way from the finish
-        in m, [P], NaN for the start of a track, from where the first lap has not begun.
+        Index of the track, [P]; pose, [P, 3]: x in m, y in m, heading in radians; and the distance
+        along the lap from the finish, [P] m. It is NaN for the tracks' starts, where no lap has
+        begun.
     """
     if count is None:
         starts = np.array([track.start for track in tracks])
@@ -218,14 +219,14 @@ def places(tracks: Sequence[Track], count: int | None) -> tuple[NDArray[np.int64
 
 
 def _spread(track: Track, count: int) -> tuple[Array, Array]:
-    """Return poses [count, 3] along a track, and the way from its finish to each of them in m."""
+    """Return poses [count, 3] along a track, and the distance of each from its finish in m."""
     middle = track.middle()
     middle = np.roll(middle, -int(((middle - track.finish) ** 2).sum(1).argmin()), axis=0)
     middle = resample(middle, PLACE_SPACING)
     at = ((np.arange(count) + 0.5) * GOLDEN_RATIO % 1 * len(middle)).astype(int)
     forward = (np.roll(middle, -1, axis=0) - np.roll(middle, 1, axis=0))[at]
-    driven = np.concatenate([[0.0], np.linalg.norm(np.diff(middle, axis=0), axis=1).cumsum()])
-    return np.column_stack([middle[at], np.arctan2(forward[:, 1], forward[:, 0])]), driven[at]
+    poses = np.column_stack([middle[at], np.arctan2(forward[:, 1], forward[:, 0])])
+    return poses, _travelled(middle)[at]
 
 
 def resample(ring: Array, spacing: float) -> Array:
@@ -235,8 +236,7 @@ def resample(ring: Array, spacing: float) -> Array:
         ring: the line, [P, 2] m.
         spacing: m, approximate length of a step.
     """
-    closed = np.vstack([ring, ring[:1]])
-    travelled = np.concatenate([[0.0], np.linalg.norm(np.diff(closed, axis=0), axis=1).cumsum()])
+    closed, travelled = np.vstack([ring, ring[:1]]), _travelled(ring)
     at = np.linspace(0, travelled[-1], max(8, round(travelled[-1] / spacing)), endpoint=False)
     return np.stack([np.interp(at, travelled, axis) for axis in closed.T], axis=1)
 
@@ -270,8 +270,13 @@ def _check_cones(side: str, cones: Array) -> None:
 
 
 def _edges(ring: Array) -> Array:
-    """Return the way from each point of a ring [P, 2] to the next one."""
+    """Return the vectors from each point of a ring [P, 2] to the next one."""
     return np.roll(ring, -1, axis=0) - ring
+
+
+def _travelled(ring: Array) -> Array:
+    """Return the distance along a ring [P, 2] m to each point and back to the first: [P + 1] m."""
+    return np.concatenate([[0.0], np.linalg.norm(_edges(ring), axis=1).cumsum()])
 
 
 def _encloses(ring: Array, point: Array) -> bool:

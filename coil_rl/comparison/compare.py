@@ -1,4 +1,4 @@
-"""A comparison of a guide with what learns, with it and without it, in a few minutes."""
+"""A comparison of a guide with policies that learn with it and without it, in a few minutes."""
 
 import math
 import shlex
@@ -151,7 +151,6 @@ class Comparison:
             raise UserError(f"folder={folder} is a file; give a folder, or a name that is not used")
         self.given, self.folder, self.minutes, self.seed = given, folder, minutes, seed
         self.command = command
-        self.overhead = 0.0  # s, to prepare a training
 
     def run(self) -> Worth:
         """Compare, or go on with it, and return what was found; the page is written and printed.
@@ -163,13 +162,13 @@ class Comparison:
         start = time.process_time()
         config = self._checked()
         torch.set_num_threads(config.threads)  # as the trainings, whose steps are timed
-        self.overhead = time.process_time() - start
+        overhead = time.process_time() - start
         identity = identity_of(self.given, config, self.minutes, self.seed)
         plan = known_plan(self.folder, identity)
         if plan is not None:
             say(f"{self.folder} goes on. {plan.described(self.minutes)}", error=True)
         else:
-            plan = self._plan(config)
+            plan = self._plan(config, overhead)
         with locked(self.folder):  # nothing is made before there is a plan
             plan = known_plan(self.folder, identity) or plan
             keep_plan(self.folder, identity, plan)
@@ -197,7 +196,8 @@ class Comparison:
             )
         trust_own(anchored)
         check(anchored)
-        # What this arm does not read, none of them reads: it has a learner, advice and tests.
+        # A word that this arm does not read is read by no arm, as it has every part that one may
+        # have: a learner, advice and tests.
         check_read(anchored, self.given.words)
         if self.tunes:
             check(self._config(TUNE))
@@ -210,8 +210,13 @@ class Comparison:
         job = job_of(self.given, ARMS[name], self.seed, frames, short)
         return composed(job, self.folder / name)
 
-    def _plan(self, config: DictConfig) -> Plan:
-        """Return what is going to be done in a new comparison, and say it."""
+    def _plan(self, config: DictConfig, overhead: float) -> Plan:
+        """Return what is going to be done in a new comparison, and say it.
+
+        Args:
+            config: of plain PPO with its whole budget.
+            overhead: s, CPU time to prepare a training.
+        """
         if any(self.folder.rglob("config.yaml")):
             raise UserError(f"{self.folder} holds runs of something else; choose another folder")
         if self.command:
@@ -220,9 +225,10 @@ class Comparison:
         with quietly():
             arms = self._able(arms_for(env_maker(config).bare(1, TEST, None), tunes=self.tunes))
             plain = {PPO: config}
-            if any(arm.learner == SAC for arm in arms):  # whose first update is as long as others
+            if any(arm.learner == SAC for arm in arms):
+                # It is timed from its first update on, which takes as long as any other.
                 plain[SAC] = self._config(SAC, short=["learner.starts=1"])
-            pace = timing.measure(plain, self.overhead)
+            pace = timing.measure(plain, overhead)
         plan = timing.plan(plain, pace, arms, self.minutes)
         say(f"{pace.sentence}\n{plan.described(self.minutes)}", error=True)
         return plan
@@ -266,12 +272,11 @@ class Comparison:
         write_csv(outcome.rows, self.folder / TABLE)
         write_text(self.folder / PAGE, f"{page}\n")
         FOUND.write(self.folder, found.to_dict(command))
-        with decoration(f"the picture in {self.folder}"):
-            cases = base.evaluation.curve.num_envs
-            if outcome.runs:
-                draw(outcome, cases, self.folder / PICTURE)
-        report = shlex.join(["coil-report", f"folder={self.folder}"])
-        more = f"; {report} has more" if outcome.runs else ""
+        more = ""
+        if outcome.runs:
+            with decoration(f"the picture in {self.folder}"):
+                draw(outcome, base.evaluation.curve.num_envs, self.folder / PICTURE)
+            more = f"; {shlex.join(['coil-report', f'folder={self.folder}'])} has more"
         say(f"{page}\nSee {self.folder}{more}.")
         return Worth(self.folder, found, pd.DataFrame(outcome.rows), command, page)
 

@@ -1,9 +1,9 @@
 """Processes that each step some rows of a batch of envs.
 
-A plant that takes a millisecond a step keeps one core busy while the others wait. Here the rows are
+An env that takes a millisecond a step keeps one core busy while the others wait. Here the rows are
 spread over processes: each makes its own rows and keeps them, takes actions and returns the entries
-of its rows. The seeds of the episodes are drawn by the batch itself, so the digits are those of one
-process.
+of its rows. The seeds of the episodes are drawn by the batch itself, so the numbers are those of
+one process.
 
 The processes are forked, so that envs and controllers need not be pickled. They are made before any
 of their rows, and a row is only ever used in one process.
@@ -18,7 +18,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from itertools import pairwise
 from multiprocessing.connection import Connection, wait
 from multiprocessing.util import Finalize, register_after_fork
@@ -34,8 +34,8 @@ from coil_rl.foreign.rows import Entries, GymnasiumRows
 AUTO = "auto"
 SAVED = 2e-3  # seconds; a batched step of this length pays for the messages
 LEAST_STEPS, MOST_STEPS, LONGEST = 5, 30, 0.05  # of a timing, in steps and seconds
-FIRST = 10  # priority of what ends the processes, at the end of the program
-PATIENCE = 5.0  # seconds between two messages while processes start, and until one must have ended
+FIRST = 10  # exit priority: from 0 on it is before multiprocessing waits for its processes
+PATIENCE = 5.0  # seconds until a start is reported as slow, and until a process must have ended
 
 MakeRows = Callable[[range], GymnasiumRows]
 # What a process answers: a value, or an error in its place, and warnings.
@@ -55,7 +55,7 @@ def _spread(pids: Sequence[int]) -> None:
     cores = sorted(os.sched_getaffinity(0))
     if len(pids) != len(cores):
         return
-    with suppress(OSError):  # one that has died is named later
+    with suppress(OSError):  # a process has died: its missing answer is an error later
         for pid, core in zip(pids, cores, strict=True):
             os.sched_setaffinity(pid, {core})
 
@@ -213,26 +213,28 @@ def choose(
 
 
 def timed(make: MakeRows, draw: Callable[[], Any]) -> float | None:
-    """Return the shortest seconds of a step of one row, but the first; None if it fails.
+    """Return the duration of a step of one row in seconds; None if a step fails.
 
-    They are those of the processor and what even the fastest step waits, so that the load of the
-    machine decides nothing.
+    It is the shortest CPU time of some steps plus the shortest time that one of them waited, so
+    that a busy machine changes little. The first step is left out.
     """
-    with warnings.catch_warnings(), suppress(Exception):  # the same fault follows where it is told
-        warnings.simplefilter("ignore")
-        shard, taken, waits = make(range(1)), list[float](), list[float]()
+    with (
+        warnings.catch_warnings(action="ignore"),
+        suppress(Exception),  # the rows of the batch raise the same error
+        closing(make(range(1))) as shard,
+    ):
+        taken, waits = list[float](), list[float]()
         shard.begin({0: 0}, {})
         shard.step([draw()])
-        while len(taken) < MOST_STEPS and (
-            len(taken) < LEAST_STEPS or sum(taken + waits) < LONGEST
-        ):
+        for number in range(MOST_STEPS):
+            if number >= LEAST_STEPS and sum(taken + waits) >= LONGEST:
+                break
             began, own = time.perf_counter(), time.process_time()
             (entries,) = shard.step([draw()])
             taken.append(time.process_time() - own)
             waits.append(time.perf_counter() - began - taken[-1])
             if entries["done"].any():
                 shard.begin({0: len(taken)}, {})
-        shard.close()
         return min(taken) + max(min(waits), 0.0)
     return None
 

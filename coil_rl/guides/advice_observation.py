@@ -20,13 +20,15 @@ ADVICE = "guide_action"  # key of the advice in an observation of several entrie
 
 
 class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Any Gymnasium env whose observation has the advice of a controller in it: COIL elsewhere.
+    """Any Gymnasium env with the advice of a controller in its observation: COIL elsewhere.
 
-    The advice is what the networks of this package read: real numbers from -1 to 1 between the
-    bounds of the action (without a bound in the unit of the env), choices as one-hot vectors side
-    by side. It is appended to an observation that is a vector of real numbers. A Dict observation
+    The advice is a vector as in this package. Real numbers are normalised: -1 and 1 are the bounds
+    of the action; a number without bounds stays in the unit of the env. Choices are one-hot vectors
+    side by side.
+
+    The advice is appended to an observation that is a vector of real numbers. A Dict observation
     gets the entry `guide_action`; any other one becomes a Dict of `observation` and `guide_action`.
-    After a termination the advice is the last one.
+    The observation after a termination repeats the advice before it.
 
     Args:
         env: the env. Its actions are a Box, Discrete, MultiDiscrete or MultiBinary.
@@ -35,7 +37,7 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
             `THING(env, observation)`.
 
     Attributes:
-        advice: the present one, [A], as observed; None before the first reset.
+        advice: in the last observation, [A]; None before the first reset.
 
     Raises:
         ValueError: for an action space that is not supported, a controller that cannot be made, or
@@ -61,10 +63,11 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _advice_space(self) -> spaces.Box:
         """Return the space of the advice."""
         units, size = self.space.units, int(self.space.agents.numel()) * self.space.size
-        if units is None:
+        if units is None:  # choices
             return spaces.Box(0.0, 1.0, (size,), np.float32)
-        low, high = units.low.flatten().numpy(), units.high.flatten().numpy()
-        return spaces.Box(low, high, (size,), np.float32)
+        return spaces.Box(
+            units.low.flatten().numpy(), units.high.flatten().numpy(), (size,), np.float32
+        )
 
     def _with(self, space: spaces.Space[Any], advice: spaces.Box) -> spaces.Space[Any]:
         """Return the space of observations with advice."""
@@ -76,10 +79,8 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
             return spaces.Dict({**space.spaces, ADVICE: advice})
         if not _is_vector(space):
             return spaces.Dict({"observation": space, ADVICE: advice})
-        low, high = (
-            np.concatenate([own.astype(np.float32), more])
-            for own, more in ((space.low, advice.low), (space.high, advice.high))
-        )
+        low = np.concatenate([space.low.astype(np.float32), advice.low])
+        high = np.concatenate([space.high.astype(np.float32), advice.high])
         return spaces.Box(low, high, dtype=np.float32)
 
     def reset(

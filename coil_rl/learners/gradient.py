@@ -23,9 +23,6 @@ ENOUGH = 4_000  # steps of a run, for which compilation pays in the second run o
 class GradientStep(Stateful):
     """One step of Adam on the weighted losses of a minibatch.
 
-    Another value of `compile`, or true if the step cannot be compiled, is a `ValueError`. On a GPU
-    no step can be compiled.
-
     Args:
         losses: returns scalars by name for a minibatch, and other tensors that are reported.
         groups: parameters, grouped by learning rate.
@@ -36,9 +33,12 @@ class GradientStep(Stateful):
         max_grad_norm: gradients are scaled down to this norm, over all parameters together; None:
             they stay as they are.
         after: is called after each step.
-        compile: whether to compile the step, which changes the last digits; "auto": after the first
-            update with any steps, if the run will have `ENOUGH` steps or more.
-        compilable: whether the step can be compiled.
+        compile: whether to compile the step, which changes the last digits; "auto": from the second
+            update with steps on, if the run will have `ENOUGH` steps or more.
+        compilable: whether the step can be compiled on a CPU; on a GPU none can.
+
+    Raises:
+        ValueError: for another value of `compile`, and for true if the step cannot be compiled.
     """
 
     parts: ClassVar[tuple[str, ...]] = ("adam", "steps", "begun", "compile")
@@ -81,7 +81,7 @@ class GradientStep(Stateful):
         self.state: list[Tensor] = []  # all tensors that a step reads, besides its minibatch
 
     def begin(self, progress: float) -> None:
-        """Set the learning rates of an update; decide for "auto" at the second with any steps."""
+        """Set the learning rates of an update, and decide whether "auto" compiles from it on."""
         for group, rate in zip(self.adam.param_groups, self.rates(progress), strict=True):
             group["lr"] = rate
         if not self.steps:
@@ -92,8 +92,10 @@ class GradientStep(Stateful):
     def __call__(self, minibatch: Any, weights: Mapping[str, float]) -> dict[str, Tensor]:
         """Take a step on the sum of the losses times `weights`.
 
-        Returns what `losses` returns, detached. If `compile` is true and there is no C++ compiler,
-        that is a `UserError`.
+        Returns what `losses` returns, detached.
+
+        Raises:
+            UserError: if `compile` was given as true and there is no C++ compiler.
         """
         self.steps += 1
         if self.compile is True:
@@ -124,7 +126,7 @@ class GradientStep(Stateful):
 
     def minimise(self, loss: Any) -> None:
         """Take a step on a loss."""
-        for parameter in self.parameters:  # as `zero_grad`, which takes as long as the step
+        for parameter in self.parameters:  # `zero_grad` does the same, but is as slow as the step
             parameter.grad = None
         loss.backward()
         if self.max_grad_norm is not None:
@@ -142,11 +144,9 @@ class GradientStep(Stateful):
             if parameter not in state:  # as Adam does at the first step
                 moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
                 state[parameter] = {"step": torch.zeros((), device=parameter.device), **moments}
-        tensors: list[Tensor] = [*self.parameters]
-        for parameter in self.parameters:
-            tensors += state[parameter].values()
-        tensors += self.reads
-        return list({id(tensor): tensor for tensor in tensors}.values())
+        of_adam = [each for parameter in self.parameters for each in state[parameter].values()]
+        tensors = [*self.parameters, *of_adam, *self.reads]
+        return list({id(tensor): tensor for tensor in tensors}.values())  # each once
 
     def _on_tensors(self, numbers: Tensor, *tensors: Tensor) -> list[Tensor]:
         """Take a step on the entries of a minibatch, for compilation.

@@ -1,11 +1,14 @@
-"""What a run hands over: its last policy, an earlier one, or its guide, by a test that is counted.
+"""What a run hands over: its last policy, an earlier one, or its guide, by a test at the end.
 
 The last policy of a training need not be its best one, and may be worse than its guide. With
-`delivery=tested` a part of the frames is kept for a test at the end: the last policy, the kept one
-that had the highest return in training, and each guide act in the same new cases, and the one with
+`delivery=tested` a part of the frames is reserved for a test at the end. In it the last policy, the
+kept one with the highest return in training, and each guide act in the same new cases. The one with
 the highest mean return is handed over. A policy that holds a guide is compared with its own first
-policy instead. None of these cases is in the evaluation curve or in the table. Where no guide is
-held, none was ahead in the start test, and this has left no frames, the test is left out.
+policy instead of the guides. None of these cases is in the evaluation curve or in the table.
+
+The test is left out if its first cases do not fit into the frames that the start test has left. The
+start test's own frames do not count if it found a guide ahead without holding it. A run that holds
+a guide is always tested.
 """
 
 import copy
@@ -105,7 +108,7 @@ class Delivery:
             return self._affordable()
         if not self._fits():
             return 0
-        return max(self._affordable(), FIRST_CASES * self._compared() * self.cases.longest)
+        return max(self._affordable(), self._first_episodes() * self.cases.longest)
 
     def _fits(self) -> bool:
         """Return whether there is a test: its first cases fit into the frames, or a guide is held.
@@ -117,13 +120,13 @@ class Delivery:
             return True
         if self.cases.episodes:
             length = self.cases.steps / self.cases.episodes
-            return FIRST_CASES * self._compared() * length <= self._left()
-        return FIRST_CASES * self._compared() * self._length_in_training() <= self._affordable()
+            return self._first_episodes() * length <= self._left()
+        return self._first_episodes() * self._length_in_training() <= self._affordable()
 
     def _length_in_training(self) -> float:
-        """Return the mean length of the episodes of the training, 0 where it is not logged.
+        """Return the mean steps of an episode of the training, 0 where they are not logged.
 
-        Where none is finished it is the length of the training of a row.
+        If no episode has ended, they are the steps of a row in the whole training.
         """
         rows = [] if self.curve is None else self.curve.metrics.rows
         if not rows or FINISHED not in rows[-1]:
@@ -131,9 +134,9 @@ class Delivery:
         finished = sum(row[FINISHED] for row in rows if not math.isnan(row[FINISHED]))
         return rows[-1]["frames/rollout"] / max(finished, self.env.batch_size.numel())
 
-    def _compared(self) -> int:
-        """Return the smallest number of policies that act in the first cases."""
-        return 1 + len(self._guides_of_env())
+    def _first_episodes(self) -> int:
+        """Return the number of episodes of the last policy and the guides in the first cases."""
+        return FIRST_CASES * (1 + len(self._guides_of_env()))
 
     def _holds(self) -> bool:
         """Return whether the policy holds a guide."""
@@ -147,17 +150,14 @@ class Delivery:
     def _left(self) -> int:
         """Return the number of frames that the start test has left for the test at the end.
 
-        Where it found a guide ahead but too few cases to hold it, it has taken nothing: what is
-        handed over must not be worse than that guide.
+        If it found a guide ahead but had too few cases to hold it, its own frames do not count:
+        what is handed over must not be worse than that guide, so there must be a test.
         """
         taken = 0 if self.cases.guide_ahead else self.cases.steps
         return max(2 * self._share() - taken, 0)
 
     def _affordable(self) -> int:
-        """Return the frames that the test may take.
-
-        What the start test took beyond the same share is missing here.
-        """
+        """Return the frames that the test may take: its share, or what the start test has left."""
         return min(self._share(), self._left())
 
     def after_update(self, update: int) -> dict[str, float]:
@@ -204,7 +204,7 @@ class Delivery:
     def _guides(self) -> dict[str, Any]:
         """Return what stands for the guides: the first policy if it holds one, else their numbers.
 
-        The advice of a run without guides in its env does not exist, so there is nothing then.
+        There is nothing in a run whose env has no guides.
         """
         if self._holds() and self.curve is not None:
             return {"first": checkpoint.load(self.curve.file(0))}
@@ -231,12 +231,12 @@ class Delivery:
         for count in self.cases.blocks(FIRST_CASES, reserve):
             self.cases.renew(count)
             self._act(policies, returns)
-            if earlier is not None:
-                # It is as long as the others, as far as is known.
-                if (self.cases.steps - begun) * (1 + 1 / len(policies)) <= reserve:
-                    self._act({"earlier": earlier}, returns)
-                    policies["earlier"] = earlier
-                earlier = None
+            # The earlier policy is taken to need as many steps as each of the others.
+            needed = (self.cases.steps - begun) * (1 + 1 / len(policies))
+            if earlier is not None and needed <= reserve:
+                self._act({"earlier": earlier}, returns)
+                policies["earlier"] = earlier
+            earlier = None  # it joins in the first cases or not at all
         return returns
 
     def _act(self, policies: Mapping[str, Any], returns: dict[str, Tensor]) -> None:

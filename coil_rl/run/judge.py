@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -266,12 +267,10 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, said: Sequenc
         if heading := measure.heading(name):
             columns[name] = (heading, measure.format)
     count = len(trial.evaluation.cases)
-    pairs = list(zip(judgement.table, judgement.counts, strict=True))
-    if count > MAX_CASES:
-        pairs = [(row, counts) for row, counts in pairs if row["case"] == MEAN_CASE]
-    rows = [row for row, _ in pairs]
+    shown = [count <= MAX_CASES or row["case"] == MEAN_CASE for row in judgement.table]
+    rows, counts = (list(compress(each, shown)) for each in (judgement.table, judgement.counts))
     columns = fitted(rows, columns)
-    page = [markdown_table(with_shares(rows, [counts for _, counts in pairs], columns), columns)]
+    page = [markdown_table(with_shares(rows, counts, columns), columns)]
     page += SENTENCES.said("many_cases", cases=count, shown=MAX_CASES)
     if has_policy and count > 1 and trial.guides:
         # An env that fails with random actions costs this sentence, and not the results.
@@ -286,23 +285,28 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, said: Sequenc
 def not_worse(
     policy: EvaluationResult, guide: EvaluationResult, name: str, chance: float
 ) -> list[str]:
-    """Return the sentence whether a policy is not worse than a guide in the same cases.
+    """Return the sentence that says whether a policy is not worse than a guide in the same cases.
 
-    The answer is yes if the whole t interval of the difference is above minus 1 % of what the guide
-    earns more or less than random actions, no if it is below. It does not depend on the zero of the
-    rewards.
+    The allowed loss is 1 % of the distance between the mean rewards of the guide and of random
+    actions, so an offset of all rewards changes nothing. The answer is yes if even the lower end of
+    the t interval of the difference is within this loss, and no if even the upper end is beyond it.
 
     Args:
+        policy: its episodes.
         guide: its episodes, in the same cases.
+        name: of the guide.
+        chance: mean reward of random actions.
     """
     mine, theirs = policy.rewards, guide.rewards
     found = difference(mine, theirs)
     allowed = ALLOWED_LOSS * abs(guide.mean_reward - chance)
-    answer = "undecided, but worse" if found.high < 0 else "undecided"
+    answer = "undecided"
     if found.low >= -allowed:
         answer = "yes"
     elif found.high < -allowed:
         answer = "no"
+    elif found.high < 0:
+        answer = "undecided, but worse"
     return SENTENCES.said(
         "not_worse",
         name=name,
@@ -327,9 +331,9 @@ def watching(
         rows: of each policy; the first one drives the first case.
     """
     present = [picture for picture in pictures if picture.watches]
+    firsts = {name: part.start or 0 for name, part in rows.items()}
 
     def watch(running: Tensor, before: TensorDictBase, after: TensorDictBase) -> None:
-        firsts = {name: part.start or 0 for name, part in rows.items()}
         shown = {name: row for name, row in firsts.items() if running[row]}
         for picture in list(present):
             present.remove(picture)

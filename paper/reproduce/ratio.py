@@ -9,7 +9,7 @@ import pandas as pd
 from coil_rl import Measure
 from coil_rl.report import Comparison, Group
 
-NEXT_TO_NOTHING = 0.01  # for a guide in a case, of its mean over the others
+NEXT_TO_NOTHING = 0.01  # of a guide's mean reward over its other cases: too little to divide by
 EARNED = "earned"  # measure of a group with fractions: the reward itself
 HEADING = "reward / guide's"
 
@@ -61,35 +61,35 @@ def _divided(group: Group, references: References) -> Group:
 
 
 def _reference(guide: Group) -> np.ndarray | None:
-    """Return the rewards of a guide in each case that others are divided by; None for no such.
+    """Return the rewards of a guide to divide by, one for each case; None if it has none.
 
-    In a case where it crashes or earns nothing, or next to nothing, its mean over the other cases
-    is taken: a ratio to such a reward would be all of a mean. There is none for a guide that earns
-    nothing in any case, or loses too much in one for a ratio.
+    In a case where it crashes, or earns nothing or next to nothing, its mean over the other cases
+    is taken: the ratio to so small a reward would dominate the mean of all ratios. A guide has none
+    if it earns nothing in every case, or if it loses too much in one of them.
     """
     rewards = guide.by_seed("reward").mean()
-    earned, crashed = rewards[rewards > 0], rewards.iloc[:0]
+    crashes = pd.Series(False, rewards.index)
     if guide.has("crashed"):
-        crashed = rewards[(guide.by_seed("crashed") > 0).any()]
-        earned = earned.drop(crashed.index, errors="ignore")
+        crashes = (guide.by_seed("crashed") > 0).any()
+    earned = rewards[(rewards > 0) & ~crashes]
     if len(earned) > 1:
         others = (earned.sum() - earned) / (len(earned) - 1)
         earned = earned[earned >= NEXT_TO_NOTHING * others]
-    if not len(earned) or _loses(rewards, crashed, earned.mean()):
+    if not len(earned) or _loses(rewards, crashes, earned.mean()):
         return None
-    filled: np.ndarray = rewards.where(rewards.index.isin(earned.index), earned.mean()).to_numpy()
-    return filled
+    return np.asarray(rewards.where(rewards.index.isin(earned.index), earned.mean()))
 
 
-def _loses(rewards: pd.Series, crashed: pd.Series, earned: float) -> bool:
-    """Return whether a guide loses so much in a case that its rewards have no zero to divide by.
+def _loses(rewards: pd.Series, crashes: pd.Series, earned: float) -> bool:
+    """Return whether a guide loses too much in a case for its rewards to be divided by.
 
-    That is more than next to nothing of what it earns, and in a crash, which may be punished, more
-    than all of it.
+    The limit is `NEXT_TO_NOTHING` of `earned`. It is all of `earned` where the guide crashes, as a
+    crash may be punished.
 
     Args:
-        crashed: those of the cases in which it crashes.
-        earned: its mean over the cases in which it earns something.
+        rewards: of each case.
+        crashes: whether the guide crashes in each case.
+        earned: its mean reward over the cases in which it earns something.
     """
-    driven = rewards.drop(crashed.index)
-    return bool((driven < -NEXT_TO_NOTHING * earned).any() or (crashed < -earned).any())
+    limits = np.where(crashes, 1.0, NEXT_TO_NOTHING) * earned
+    return bool((rewards < -limits).any())

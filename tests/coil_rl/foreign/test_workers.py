@@ -240,8 +240,8 @@ for program in programs:
 class Simulator(Plant):
     """The plant with something that it must release, here a file that it removes."""
 
-    def __init__(self, file):
-        super().__init__()
+    def __init__(self, file, fails=None):
+        super().__init__(fails)
         self.file = file.with_suffix(f".{os.getpid()}_{id(self)}")
         self.file.touch()
 
@@ -250,9 +250,10 @@ class Simulator(Plant):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [0, 2, "auto"])
-def test_envs_are_closed_in_their_processes(workers, tmp_path) -> None:
-    env = GymnasiumEnv(Simulator, 3, options={"file": tmp_path / "licence"}, workers=workers)
+@pytest.mark.parametrize(("workers", "fails"), [(0, None), (2, None), ("auto", None), ("auto", 1)])
+def test_envs_are_closed_in_their_processes(workers, fails, tmp_path) -> None:
+    options = {"file": tmp_path / "licence", "fails": fails}
+    env = GymnasiumEnv(Simulator, 3, options=options, workers=workers)
     env.reset()
     assert len(list(tmp_path.iterdir())) >= 3
     env.close()
