@@ -24,7 +24,7 @@ START = "car_start"
 def is_of_simulator(header: Sequence[str]) -> bool:
     """Return whether the columns of a CSV are those of a simulator."""
     columns = [name.casefold() for name in header]
-    return columns[0] in KINDS and {"x", "y"} <= set(columns)
+    return bool(columns) and columns[0] in KINDS and {"x", "y"} <= set(columns)
 
 
 def simulator_track(
