@@ -38,7 +38,8 @@ GlobalNumbers = tuple[Any, list[Tensor], bytes, float | None]  # of NumPy, torch
 def _state_of(generator: Any) -> Any:
     """Return the state of a generator of Python in place: 624 numbers of four bytes, and an index.
 
-    Its `getstate` takes fifty times as long, because it makes an object of each number.
+    It is the generator's own memory, so it is valid as long as the generator lives. `getstate`
+    takes fifty times as long, because it makes an object of each number.
     """
     return (ctypes.c_char * (4 * 625)).from_address(id(generator) + object.__basicsize__)
 
@@ -157,8 +158,8 @@ class Numbers:
             return
         seed %= SEEDS
         states = [torch.Generator().manual_seed(seed).get_state()]
-        python = _state_of(random.Random(seed)).raw
-        self.own: GlobalNumbers = np.random.MT19937(seed), states, python, None
+        python = random.Random(seed)  # it must live while its state is read in place
+        self.own: GlobalNumbers = np.random.MT19937(seed), states, _state_of(python).raw, None
 
     def __enter__(self) -> None:
         self.first = [] if self.used else _plain(self.own)
@@ -217,7 +218,7 @@ def _plain(numbers: GlobalNumbers) -> list[Any]:
 
 
 def _of_torch() -> list[Tensor]:
-    """Return the states of torch's generators, of the CPU first."""
+    """Return the states of torch's random generators, that of the CPU first."""
     states = [torch.default_generator.get_state()]
     if torch.cuda.is_initialized():
         states += [generator.get_state() for generator in torch.cuda.default_generators]
