@@ -48,6 +48,10 @@ from coil_rl.transforms.guide_memory import primer_of
 from coil_rl.transforms.hosted import HostedGuide
 from coil_rl.transforms.normalised_action import in_unit_of
 
+LONGEST_CHAIN = 4  # learned guides of learned guides
+# Number of runs that are being loaded, each of which is a guide of the one before.
+_DEPTH: ContextVar[int] = ContextVar("depth", default=0)
+
 
 def assemble(config: DictConfig, folder: Path | None = None) -> Run:
     """Return the run that a configuration describes; nothing is built or written yet.
@@ -190,11 +194,6 @@ def run_configured(
             return run.finish_begun()
         run.begin()
         return run.finish()
-
-
-LONGEST_CHAIN = 4  # learned guides of learned guides
-# Number of runs that are being loaded, each of which is a guide of the one before.
-_DEPTH: ContextVar[int] = ContextVar("depth", default=0)
 
 
 class LearnedGuide(HostedGuide):

@@ -65,6 +65,33 @@ KINDS = {
     "guides": ("improves its guides", "dynamic_coil"),
 }
 WATCHED = ("episode", "step")  # groups of `watch`
+EPISODE_REWARD = "episode_reward"  # written by a transform of every env
+# Nodes that other values refer to, and that nothing else reads.
+REFERRED = (
+    "preset",
+    "track",
+    "recording",
+    "training.learning_rate",
+    "training.imitation_env",
+    "budget.minibatches",
+)
+NOISE = "training.noise_correlation"
+NEEDS_GUIDE = "method.needs_guide"  # a fact about the method, not a choice
+OF_A_LEARNER = (
+    *("learner", "network", "checkpoint_every", "evaluation.repeats"),
+    *("budget.num_envs", "budget.steps", "training.normalise", "training.scale_rewards"),
+)
+OF_A_TRAINING = (
+    *("training", "budget", "logger", "watch", "observes", "action", "compile"),
+    *("evaluation.curve", "evaluation.guides", "evaluation.policy"),
+)
+# The packages of TorchRL's loggers, which are extras of this one.
+PACKAGES = {
+    "MLFlowLogger": "mlflow",
+    "TensorboardLogger": "tensorboard",
+    "TrackioLogger": "trackio",
+    "WandbLogger": "wandb",
+}
 
 
 def check(config: DictConfig) -> None:
@@ -389,9 +416,6 @@ def _check_pass(config: DictConfig, env: Any, episodes: int) -> None:
         )
 
 
-EPISODE_REWARD = "episode_reward"  # written by a transform of every env
-
-
 def check_measures(measures: Any, env: EnvBase) -> None:
     """Raise a `UserError` for a measure of an entry that is missing or not one number per row.
 
@@ -513,27 +537,6 @@ def dotted(key: str | Iterable[Any]) -> str:
     return key if isinstance(key, str) else ".".join(map(str, key))
 
 
-# Nodes that other values refer to, and that nothing else reads.
-REFERRED = (
-    "preset",
-    "track",
-    "recording",
-    "training.learning_rate",
-    "training.imitation_env",
-    "budget.minibatches",
-)
-NOISE = "training.noise_correlation"
-NEEDS_GUIDE = "method.needs_guide"  # a fact about the method, not a choice
-OF_A_LEARNER = (
-    *("learner", "network", "checkpoint_every", "evaluation.repeats"),
-    *("budget.num_envs", "budget.steps", "training.normalise", "training.scale_rewards"),
-)
-OF_A_TRAINING = (
-    *("training", "budget", "logger", "watch", "observes", "action", "compile"),
-    *("evaluation.curve", "evaluation.guides", "evaluation.policy"),
-)
-
-
 def check_read(config: DictConfig, task: Iterable[str]) -> None:
     """Refuse a word of the command line that a run does not read.
 
@@ -600,15 +603,6 @@ def _adds_noise(config: DictConfig) -> bool:
         return False
     env = env_maker(config)()
     return bool(env.full_action_spec[env.action_key].dtype.is_floating_point)
-
-
-# The packages of TorchRL's loggers, which are extras of this one.
-PACKAGES = {
-    "MLFlowLogger": "mlflow",
-    "TensorboardLogger": "tensorboard",
-    "TrackioLogger": "trackio",
-    "WandbLogger": "wandb",
-}
 
 
 def check_logger(node: Mapping[str, Any]) -> None:

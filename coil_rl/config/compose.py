@@ -35,6 +35,9 @@ from coil_rl.plain_yaml import entries
 from coil_rl.ranges import validation_message
 
 REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
+LARGEST_BATCH = 2**28  # frames
+ANY_ENV = ("fmu", "gym", "torchrl")  # files of conf/env that stand for any env
+FRAMES = 100_000  # 3.5 minutes of the processor with SAC, where the steps of an env are fast
 
 
 def keep_written(
@@ -89,9 +92,9 @@ def key_of(text: str) -> str:
 
 
 def quoted(text: str) -> str:
-    """Return a text as Hydra reads it: a plain name as it is, others in quotes.
+    """Return a text as a value in a word of the command line: in quotes unless it is a plain name.
 
-    In these a backslash is special before a quote only.
+    In quotes Hydra reads a backslash as special before a quote only.
 
     Args:
         text: a value for an override on the command line.
@@ -175,9 +178,6 @@ def _own_hydra() -> Iterator[None]:
         GlobalHydra.instance().hydra = outer
 
 
-LARGEST_BATCH = 2**28  # frames
-
-
 def check_values(config: DictConfig) -> None:
     """Check the values of the configuration of any program.
 
@@ -237,16 +237,12 @@ def _adapter(schema: type) -> TypeAdapter[Any]:
 def _unknown_key(config: DictConfig, *path: str) -> str:
     *parents, key = path
     name = ".".join(parents)
-    node = OmegaConf.select(config, name) if name else config
-    known = [field.name for field in fields(OmegaConf.get_type(node)) if field.name != "defaults"]  # type: ignore[arg-type]
+    schema: Any = OmegaConf.get_type(OmegaConf.select(config, name) if name else config)
+    known = [field.name for field in fields(schema) if field.name != "defaults"]
     return (
         f"there is no key {key}; {name or 'the configuration'} has {', '.join(known)}"
         f"{similar(key, known)}"
     )
-
-
-ANY_ENV = ("fmu", "gym", "torchrl")  # files of conf/env that stand for any env
-FRAMES = 100_000  # 3.5 minutes of the processor with SAC, where the steps of an env are fast
 
 
 def default_learner(

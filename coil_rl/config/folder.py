@@ -30,6 +30,21 @@ from coil_rl.run.folder import CODE, CODE_BEFORE, CONFIG, check_same, is_begun
 PREFIX = "pretrained:"
 CHECKSUMS, CARD = "checksums.json", "card.md"
 LARGEST = 200_000  # bytes of a file of a shipped policy
+# Parts that moved, by the names that older run folders have for them.
+OLD_NAMES = {
+    "coil_rl.config.given.kept": "coil_rl.config.nodes.kept",
+    "coil_rl.envs.EnvBatch": "coil_rl.foreign.torchrl_env.EnvBatch",
+    "coil_rl.envs.gymnasium_env.GymnasiumEnv": "coil_rl.foreign.gymnasium_env.GymnasiumEnv",
+    "coil_rl.guides.RecordingGuide": "coil_robot.RecordingGuide",
+    "coil_rl.guides.cone_planner.ConePlannerGuide": "coil_rl.cones.ConePlannerGuide",
+    "coil_rl.guides.learned.LearnedGuide": "coil_rl.LearnedGuide",
+    "coil_rl.learners.Advisor": "coil_studies.Advisor",
+    "coil_rl.learners.IBRL": "coil_studies.IBRL",
+    "coil_rl.listening.TrackSections": "coil_studies.listening.TrackSections",
+    "coil_rl.listening.WholeEpisode": "coil_studies.listening.WholeEpisode",
+    "coil_rl.robot.classifier.load_classifier": "coil_robot.load_classifier",
+    "coil_rl.run.tuning.Search": "coil_rl.tune.Tuning",
+}
 
 
 def settings(config: DictConfig) -> dict[str, Any]:
@@ -199,23 +214,6 @@ def _checksums() -> Mapping[str, Mapping[str, str]]:
         read_text(_place() / CHECKSUMS, LARGEST_NUMBERS)
     )
     return found
-
-
-# Parts that moved, by the names that older run folders have for them.
-OLD_NAMES = {
-    "coil_rl.config.given.kept": "coil_rl.config.nodes.kept",
-    "coil_rl.envs.EnvBatch": "coil_rl.foreign.torchrl_env.EnvBatch",
-    "coil_rl.envs.gymnasium_env.GymnasiumEnv": "coil_rl.foreign.gymnasium_env.GymnasiumEnv",
-    "coil_rl.guides.RecordingGuide": "coil_robot.RecordingGuide",
-    "coil_rl.guides.cone_planner.ConePlannerGuide": "coil_rl.cones.ConePlannerGuide",
-    "coil_rl.guides.learned.LearnedGuide": "coil_rl.LearnedGuide",
-    "coil_rl.learners.Advisor": "coil_studies.Advisor",
-    "coil_rl.learners.IBRL": "coil_studies.IBRL",
-    "coil_rl.listening.TrackSections": "coil_studies.listening.TrackSections",
-    "coil_rl.listening.WholeEpisode": "coil_studies.listening.WholeEpisode",
-    "coil_rl.robot.classifier.load_classifier": "coil_robot.load_classifier",
-    "coil_rl.run.tuning.Search": "coil_rl.tune.Tuning",
-}
 
 
 def renamed(node: Any) -> Any:

@@ -43,6 +43,11 @@ from coil_rl.ranges import adapter, settings_of, validation_message, yaml_text
 PLAIN = (bool, int, float, str, NoneType)
 HOLDERS = (np.ndarray, tuple, list, Sequence)  # of numbers, in annotations
 _TARGET = object()
+TARGET = "coil_rl.config.nodes.kept"
+PLACES = {"env": ("env.id", "env.of", "env"), "guide": ("guide.controller.of",)}
+_objects: dict[str, Any] = {}  # by the name in a configuration
+# Parts of a configuration on which the numbers of a run depend, besides its evaluation.
+PARTS = ["env", "training", "guide", "method", "learner", "degrade", "disturb", "action"]
 
 
 def build(node: Any, name: str, expected: type | None = None, **arguments: Any) -> Any:
@@ -340,11 +345,6 @@ def _signature(function: Callable[..., Any]) -> inspect.Signature:
         return inspect.signature(function)
 
 
-TARGET = "coil_rl.config.nodes.kept"
-PLACES = {"env": ("env.id", "env.of", "env"), "guide": ("guide.controller.of",)}
-_objects: dict[str, Any] = {}  # by the name in a configuration
-
-
 def keep(name: str, thing: Any) -> dict[str, str]:
     """Keep an object under a name, and return the node of a configuration that stands for it."""
     _objects[name] = thing
@@ -416,10 +416,6 @@ def import_path(thing: Any) -> str | None:
     for part in name.split("."):
         found = getattr(found, part, None)
     return f"{module}:{name}" if found is thing else None
-
-
-# Parts of a configuration on which the numbers of a run depend, besides its evaluation.
-PARTS = ["env", "training", "guide", "method", "learner", "degrade", "disturb", "action"]
 
 
 def identity_of(thing: Any) -> str:

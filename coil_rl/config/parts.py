@@ -53,6 +53,8 @@ from coil_rl.transforms.normalised_action import in_unit_of
 # `method.transforms`.
 NOT_OBSERVED = ("info", "controller")  # of an env: for evaluation, and of what acts beside it
 READERS = ["observes", "method", "watch", "learner", "degrade", "action", "evaluation"]
+PROXIES = "proxies"  # subfolder of a run with the networks that replace guides without parameters
+FILES = ("config.yaml", "policy_last.pt")  # files of a run that are needed to load its policy
 
 
 def build_evaluation(
@@ -385,7 +387,7 @@ class OwnRun(ABC):
 
     @abstractmethod
     def maker(self, config: DictConfig) -> "Callable[..., Run]":
-        """Return what makes the run; its arguments are those of `Run`."""
+        """Return a function that makes the run; it takes the arguments of `Run`."""
 
     def found(self, config: DictConfig, folder: Path) -> DictConfig:
         """Return the configuration with what the run in a folder has found so far.
@@ -402,10 +404,6 @@ def own_run(config: DictConfig) -> OwnRun | None:
         return None
     own: OwnRun = build(config.method.run, "method.run", OwnRun)
     return own
-
-
-PROXIES = "proxies"  # subfolder of a run with the networks that replace guides without parameters
-FILES = ("config.yaml", "policy_last.pt")  # files of a run that are needed to load its policy
 
 
 def guides_without_parameters(guides: Mapping[str, nn.Module]) -> list[str]:
@@ -451,7 +449,7 @@ def _drawn_anew(nodes: Mapping[str, Any], seed: int) -> dict[str, Any]:
 
 
 def _hash_of_user(config: DictConfig, name: str) -> list[str]:
-    """Return a hash of what is a user's in a guide and an env; none if there is nothing."""
+    """Return one hash of a user's code and objects in a guide and an env; empty without any."""
     guide = config.guide[name]
     things = kept_objects(config, "env")
     if find_target(guide.get("_target_"), f"guide.{name}") is ControllerGuide:
