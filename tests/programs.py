@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from unittest.mock import patch
 
+from hydra import compose, initialize_config_module
 from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 
@@ -46,6 +47,22 @@ TINY = [
     "logger=none",
 ]
 
+# Episodes of a second on one track.
+ONE_SECOND = [
+    "track=generated",
+    "track.train.count=1",
+    "track.test.count=1",
+    "env.laps=1",
+    "env.time_limit=1",
+    "evaluation.curve.env.time_limit=1",
+    "evaluation.repeats=1",
+    "evaluation.gif=false",
+    "logger=none",
+    "budget.num_envs=4",
+    "budget.steps=16",
+    "budget.frames=128",
+]
+
 # One arm of an experiment on tasks of Gymnasium.
 TINY_ARM = [
     "budget.frames=300",
@@ -73,6 +90,12 @@ TINY_SWEEP = [
     "proxy.budget.num_envs=2",
     "proxy.budget.steps=16",
 ]
+
+
+def composed(*words, name="train", **options):
+    """Return the configuration of a program for some words."""
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose(name, [*words], **options)
 
 
 def shipped(group):

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 from drives import drive
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from programs import ROOT
+from programs import ONE_SECOND, ROOT, composed
 from run_folders import make_untrained_run
 from torchrl.data import Bounded, Categorical, Unbounded
 
@@ -23,33 +22,13 @@ from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.testing import check_guide
 from coil_rl.transforms.action_space import ActionSpace
 
-TINY = [
-    "track=generated",
-    "track.train.count=1",
-    "track.test.count=1",
-    "env.laps=1",
-    "env.time_limit=1",
-    "evaluation.curve.env.time_limit=1",
-    "evaluation.repeats=1",
-    "evaluation.gif=false",
-    "logger=none",
-    "budget.num_envs=4",
-    "budget.steps=16",
-    "budget.frames=128",
-]
-
-
-def composed(*overrides, name="train"):
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return compose(name, [*overrides])
-
 
 @pytest.fixture(
     scope="module", params=["ppo", "coil action=choices", "residual_coil", "jump_start"]
 )
 def run(request, tmp_path_factory):
     return make_untrained_run(
-        tmp_path_factory.mktemp("runs") / "run", *TINY, *f"method={request.param}".split()
+        tmp_path_factory.mktemp("runs") / "run", *ONE_SECOND, *f"method={request.param}".split()
     )
 
 
@@ -59,7 +38,7 @@ def test_guide_drives_as_the_policy_in_its_own_env(run):
     env = opened.make_env(3, "evaluation", count=3)
     policy = evaluate_policy(env, opened.policy(env))
     guided = composed(
-        *TINY, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
+        *ONE_SECOND, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
     )
     guided_env = env_maker(guided)(3, "evaluation", count=3)
     learned = evaluate_policy(guided_env, build_guides(guided)["learned"])
@@ -68,13 +47,13 @@ def test_guide_drives_as_the_policy_in_its_own_env(run):
 
 @pytest.mark.slow
 def test_guide_is_deterministic_and_advises_another_agent(run):
-    env = env_maker(composed(*TINY, "method=ppo", "run_dir=unused"))()
+    env = env_maker(composed(*ONE_SECOND, "method=ppo", "run_dir=unused"))()
     data, guide = env.rollout(5, break_when_any_done=False)[:, -1], LearnedGuide(str(run))
     check_guide(guide, data, tolerance=1e-6)
     assert not any(p.requires_grad for p in guide.parameters())
     assert set(guide(data.select(*guide.in_keys)).keys()) == {*guide.in_keys, "action"}
     config = composed(
-        *TINY, "method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
+        *ONE_SECOND, "method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
     )
     step = env_maker(config)().rollout(5, break_when_any_done=False)[:, -1]
     # Not to the bit: some processors round other numbers of rows differently.
@@ -83,7 +62,7 @@ def test_guide_is_deterministic_and_advises_another_agent(run):
 
 
 def test_run_without_an_agent_is_refused(tmp_path):
-    run = make_untrained_run(tmp_path / "guide", *TINY, "method=guide")
+    run = make_untrained_run(tmp_path / "guide", *ONE_SECOND, "method=guide")
     with pytest.raises(
         ValueError, match="trained no agent: its method is guide; name its guide instead"
     ):
@@ -103,12 +82,12 @@ def test_policy_with_a_past_acts_as_in_its_own_env(options, tmp_path):
     (tmp_path / "actions.csv").write_text("0.1\n0.2\n-0.3\n")
     if "guide=recorded" in options:
         options = [*options, f"guide.recorded.file={tmp_path / 'actions.csv'}"]
-    run = make_untrained_run(tmp_path / "run", *TINY, "learner.action_gain=3", *options)
+    run = make_untrained_run(tmp_path / "run", *ONE_SECOND, "learner.action_gain=3", *options)
     opened = open_run(run)
     env = opened.make_env(3, "evaluation", count=3)
     policy = evaluate_policy(env, opened.policy(env))
     guided = composed(
-        *TINY, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
+        *ONE_SECOND, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
     )
     learned = evaluate_policy(*env_maker(guided).guided(3, "evaluation", count=3))
     assert [row["reward"] for row in learned.episodes] == pytest.approx(
@@ -127,7 +106,7 @@ def guided_by(run, guide):
 @pytest.mark.slow
 @pytest.mark.parametrize("length", [1, 3, LONGEST_CHAIN + 1])
 def test_run_that_is_its_own_guide_is_refused(length, tmp_path):
-    make_untrained_run(tmp_path / "0", *TINY, "method=coil")
+    make_untrained_run(tmp_path / "0", *ONE_SECOND, "method=coil")
     for number in range(1, length):
         shutil.copytree(tmp_path / "0", tmp_path / str(number))
     for number in range(length):

@@ -9,10 +9,9 @@ import odd_parts
 import pytest
 import torch
 from gymnasium import spaces
-from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
-from programs import SHORT_LAP, called, shipped
+from programs import SHORT_LAP, called, composed, shipped
 
 import coil_rl
 from coil_rl.config.check import check, check_read
@@ -55,9 +54,7 @@ def on(observation):
 def checked(method, tmp_path, *words):
     env = ["env=gym", f"env.id={__name__}:Switches", "evaluation.cases=2"]
     guide = ["guide=controller", f"guide.controller.of={__name__}:on"]
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("train", [*env, *guide, f"method={method}", f"run_dir={tmp_path}", *words])
-    check(config)
+    check(composed(*env, *guide, f"method={method}", f"run_dir={tmp_path}", *words))
 
 
 @pytest.mark.fast(2)

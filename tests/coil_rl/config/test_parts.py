@@ -9,9 +9,8 @@ from pathlib import Path
 import gymnasium
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from programs import shipped
+from programs import ONE_SECOND, composed, shipped
 from torchrl.envs import RenameTransform
 
 from coil_rl.config.assemble import load_guides
@@ -53,15 +52,14 @@ SMALL = [
 ]
 
 
-def composed(*overrides, name="train"):
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return compose(name, [*SMALL, *overrides])
+def small(*overrides):
+    return composed(*SMALL, *overrides)
 
 
 @pytest.mark.fast(1)
 @pytest.mark.parametrize(("method", "preset"), [*product(shipped("method"), shipped("preset"))])
 def test_env_of_every_method_passes_check_env(method, preset):
-    env = env_maker(composed(f"preset={preset}", f"method={method}"))()
+    env = env_maker(small(f"preset={preset}", f"method={method}"))()
     check_env(env, steps=3)
     assert env.rate == {"default": 12, "paper": 24, "authors": 60}[preset]
 
@@ -94,7 +92,7 @@ OF_OTHER_ENVS = {
     "guide", sorted({*shipped("guide")} - {"none", *NOT_ALONE, *OF_OTHER_ENVS})
 )
 def test_every_guide_acts_on_the_observations_of_the_env(guide):
-    config = composed(f"guide={guide}")
+    config = small(f"guide={guide}")
     (guide_module,), env = build_guides(config).values(), build_bare_env(config)
     if guide in WITH_MEMORY:
         check_guide(guide_module, env)
@@ -106,7 +104,7 @@ def test_every_guide_acts_on_the_observations_of_the_env(guide):
 
 
 def test_override_with_another_target_replaces_all_arguments():
-    config = composed("env=simulated_robot")
+    config = small("env=simulated_robot")
     tracks = {"_target_": "coil_rl.envs.robot_tracks", "scale": 1.0}
     env = build_bare_env(config, {"tracks": tracks, "reward": {"finish": 1.0}, "num_envs": 2})
     assert (env.batch_size, config.budget.num_envs) == ((2,), 4)
@@ -129,7 +127,7 @@ def test_long_message_of_a_part_is_cut():
 
 
 def test_guide_drives_with_degraded_advice():
-    config = composed("guide=constant", "guide.constant.value=0.4", "degrade=[undertuned,biased]")
+    config = small("guide=constant", "guide.constant.value=0.4", "degrade=[undertuned,biased]")
     env, policy = env_maker(config).guided(4, TRAIN)
     step = env.step(policy(env.reset()))
     torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.4 * 0.5 + 0.2))
@@ -137,7 +135,7 @@ def test_guide_drives_with_degraded_advice():
 
 def test_advice_of_a_method_without_any_is_not_degraded():
     view = "{_target_: coil_rl.transforms.ObservationNoise, sigma: 0.1, seed: 0}"
-    config = composed(
+    config = small(
         "method=ppo", f"+method.transforms.view={view}", "degrade=[random]", "run_dir=unused"
     )
     transforms = build_transforms(config)
@@ -146,7 +144,7 @@ def test_advice_of_a_method_without_any_is_not_degraded():
 
 
 def test_advice_is_degraded_after_the_transforms_of_the_method():
-    config = composed(
+    config = small(
         "method=residual", "guide=constant", "guide.constant.value=0.4", "degrade=[zeroed]"
     )
     env = env_maker(config)()
@@ -157,7 +155,7 @@ def test_advice_is_degraded_after_the_transforms_of_the_method():
 @pytest.mark.fast(2)
 @pytest.mark.parametrize("learner", shipped("learner"))
 def test_every_learner_is_built(learner):
-    config = composed(f"learner={learner}")
+    config = small(f"learner={learner}")
     env = env_maker(config)()
     built = build_learner(
         config, env, guides_with_untrained_proxies(config) if trains_guides(config) else None
@@ -168,8 +166,7 @@ def test_every_learner_is_built(learner):
 @pytest.mark.slow
 @pytest.mark.parametrize("track", sorted({*shipped("track")} - {"folder"}))
 def test_every_track_group_has_tracks(track):
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        node = compose("train", [f"track={track}", "run_dir=unused"]).track
+    node = composed(f"track={track}", "run_dir=unused").track
     fewest = 1 if track == "robot" else 3
     assert min(len(build(node.train, "track.train")), len(build(node.test, "track.test"))) >= fewest
 
@@ -178,8 +175,7 @@ def test_every_track_group_has_tracks(track):
     ("env", "key"), [("cone_track", "starts"), ("simulated_robot", "starts"), ("pendulum", "cases")]
 )
 def test_cases_of_several_drivers_are_the_same_ones(env, key):
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        evaluation = compose("train", [f"env={env}", "run_dir=unused"]).evaluation
+    evaluation = composed(f"env={env}", "run_dir=unused").evaluation
     # In the file of a run all references are resolved.
     stored = OmegaConf.create({"evaluation": OmegaConf.to_container(evaluation, resolve=True)})
     node = cases_node(stored, 6, "selection", 3)
@@ -187,9 +183,9 @@ def test_cases_of_several_drivers_are_the_same_ones(env, key):
 
 
 def test_disturbances_hold_in_training_and_evaluation_unless_one_of_them_has_its_own():
-    both = composed("disturb=[observation_delay]")
+    both = small("disturb=[observation_delay]")
     assert disturbances(both, TRAIN) == disturbances(both, TEST)
-    longer = composed(
+    longer = small(
         "disturb=[observation_delay,action_delay]",
         "+evaluation.disturb.observation_delay.max_lag=7",
         "+training.disturb.action_delay=null",
@@ -203,7 +199,7 @@ def test_disturbances_hold_in_training_and_evaluation_unless_one_of_them_has_its
 
 
 def test_disturbances_come_before_the_guides_and_only_in_the_own_env_of_a_run():
-    config = composed("disturb=[observation_delay,action_delay]", "method=coil")
+    config = small("disturb=[observation_delay,action_delay]", "method=coil")
     make_env = env_maker(config)
     for env in (make_env(), make_env.guided(2, TEST)[0]):
         kinds = [type(part) for part in env.transform]
@@ -213,12 +209,12 @@ def test_disturbances_come_before_the_guides_and_only_in_the_own_env_of_a_run():
 
 
 def test_the_authors_observe_late_in_their_world_and_nowhere_else():
-    assert disturbances(composed("preset=authors"), TRAIN)["late"]["min_lag"] == 1
-    assert not disturbances(composed("env=simulated_robot", "preset=authors"), TRAIN)
+    assert disturbances(small("preset=authors"), TRAIN)["late"]["min_lag"] == 1
+    assert not disturbances(small("env=simulated_robot", "preset=authors"), TRAIN)
 
 
 def test_the_view_of_the_agent_alone_is_late_behind_the_guides():
-    config = composed("+disturb@method.transforms.view=observation_delay", "method=coil")
+    config = small("+disturb@method.transforms.view=observation_delay", "method=coil")
     kinds = [type(part) for part in env_maker(config)().transform]
     assert kinds.index(GuideActions) < kinds.index(ObservationDelay)
 
@@ -244,8 +240,7 @@ BESIDE = [
 
 
 def composed_beside(*overrides):
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return compose("train", [*BESIDE, *overrides])
+    return composed(*BESIDE, *overrides)
 
 
 def beside(env):
@@ -289,18 +284,7 @@ def test_name_inside_of_another_word_is_no_reader():
 
 
 TINY = [
-    "track=generated",
-    "track.train.count=1",
-    "track.test.count=1",
-    "env.laps=1",
-    "env.time_limit=1",
-    "evaluation.curve.env.time_limit=1",
-    "evaluation.repeats=1",
-    "evaluation.gif=false",
-    "logger=none",
-    "budget.num_envs=4",
-    "budget.steps=16",
-    "budget.frames=128",
+    *ONE_SECOND,
     "proxy.budget.frames=256",
     "proxy.budget.num_envs=4",
     "proxy.budget.steps=16",
@@ -310,8 +294,7 @@ TINY = [
 
 def composed_of_proxy(*overrides, name="train"):
     tiny = TINY[:5] if name == "evaluate" else TINY
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return compose(name, [*tiny, *overrides])
+    return composed(*tiny, *overrides, name=name)
 
 
 class Gain:
@@ -432,9 +415,8 @@ def test_proxy_in_an_env_is_another_one_after_a_change_of_its_code(words, tmp_pa
         (tmp_path / "changing.py").write_text(PLANT.format(gain=gain))
         monkeypatch.delitem(sys.modules, "changing", raising=False)
         monkeypatch.delitem(gymnasium.registry, "Changing-v0", raising=False)
-        with initialize_config_module("coil_rl.conf", version_base="1.3"):
-            given = ["env=gym", *words, "guide=constant", "method=dynamic_coil_sequential"]
-            config = compose("train", [*given, "run_dir=unused"])
+        given = ["env=gym", *words, "guide=constant", "method=dynamic_coil_sequential"]
+        config = composed(*given, "run_dir=unused")
         folders.append(proxy_config(config, "constant").run_dir)
     assert folders[0] == folders[1] != folders[2]
 

@@ -1,14 +1,9 @@
 import pytest
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
+from programs import composed
 
 from coil_rl.config.compose import compose_train
 from coil_rl.config.schema import fingerprint
-
-
-def composed(*overrides, **options):
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return compose("train", list(overrides), **options)
 
 
 @pytest.mark.fast(4)

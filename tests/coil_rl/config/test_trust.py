@@ -9,9 +9,8 @@ from itertools import zip_longest
 import hydra.utils
 import pytest
 import yaml
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from programs import CONF, shipped
+from programs import CONF, composed, shipped
 
 from coil_rl.config import assemble as assembling
 from coil_rl.config import nodes, trust
@@ -55,16 +54,15 @@ def forget():
 def saved(tmp_path_factory):
     """Return the configuration of a run as coil-train saves it."""
     folder = tmp_path_factory.mktemp("saved") / "run"
-    config = composed(folder)
+    config = begun(folder)
     # The first reading of a process imports what the others need.
     trust._shipped_targets()
     read_config(folder, "run")
     return config
 
 
-def composed(folder, *overrides):
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("train", [*overrides, f"run_dir={folder}"])
+def begun(folder, *overrides):
+    config = composed(*overrides, f"run_dir={folder}")
     folder.mkdir()
     begin(folder, settings(config))
     return OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
@@ -325,7 +323,7 @@ def test_every_choice_of_the_configuration_can_be_saved_and_read(tmp_path, monke
     choices = [[*filter(None, row), *MISSING] for row in zip_longest(*columns)]
     choices += [[f"env={name}", *OF_ENV.get(name, [])] for name in files("env")]
     for number, overrides in enumerate(choices):
-        composed(tmp_path / str(number), *overrides)
+        begun(tmp_path / str(number), *overrides)
         assert read_config(tmp_path / str(number), "run").label
 
 
@@ -387,7 +385,7 @@ def test_trusted_package_may_be_used_and_nothing_that_it_imports(package, saved,
 def test_folder_cannot_grant_itself_trust_and_a_run_does_not_save_it(package, saved, tmp_path):
     with pytest.raises(UserError, match=r"allow it with trust=\[their_package\]"):
         read(tmp_path, with_target(saved, "their_package.TheirGuide", trust=["their_package"]))
-    assert "trust" not in composed(tmp_path / "run", "trust=[their_package]")
+    assert "trust" not in begun(tmp_path / "run", "trust=[their_package]")
 
 
 def test_installed_package_with_an_entry_point_is_trusted(package, saved, tmp_path):
