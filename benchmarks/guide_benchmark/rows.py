@@ -182,7 +182,7 @@ def _of_run(run: Run) -> dict[str, float]:
 
 
 def check_row(row: Mapping[str, str]) -> dict[str, Any]:
-    """Return a row of the table, as it is in the file, with numbers in place of their text.
+    """Check a row as it is in the file, and return it with its cells as numbers.
 
     Args:
         row: its cells by column; `reached` may be missing, as in older tables.

@@ -104,9 +104,10 @@ def export_policy(
 def _possible(
     run: Run, controller: Controller, recording: Recording
 ) -> tuple[PolicyStep, dict[str, bytes], Parity, str | None]:
-    """Return what `_written` does, with the guides inside where that is possible.
+    """Export a policy with its guides in the file if that is possible, and else without them.
 
-    The last one is why they are outside; None if they are not.
+    Returns:
+        What `_written` returns, and why the guides are not in the file; None if they are.
 
     Raises:
         NotExportableError: if the policy cannot be exported.

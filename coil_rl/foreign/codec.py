@@ -197,9 +197,9 @@ class Entry:
         Returns:
             The index of the number in the entry, its value, and its bounds.
         """
-        if not self.bounds:
+        if not (bounds := self.bounds):
             return None
-        low, high = (bound.ravel().astype(np.float64) for bound in self.bounds)
+        low, high = (bound.ravel().astype(np.float64) for bound in bounds)
         numbers = values.reshape(len(values), -1).astype(np.float64)
         excess = np.maximum(low - numbers, numbers - high)
         if not excess.size or excess.max() <= 0:

@@ -300,9 +300,9 @@ def _of_object(thing: Any, title: str, keys: list[NestedKey] | None) -> TensorDi
     role, read = role_of(thing), keys or ["observation"]
     if role == "predict":
         return _of_model(thing, title, keys)
-    if role == "guide" and keys is not None:
-        raise ValueError(f"of={title} has its own in_keys={thing.in_keys}; leave in_keys out")
     if role == "guide":
+        if keys is not None:
+            raise ValueError(f"of={title} has its own in_keys={thing.in_keys}; leave in_keys out")
         return hold(thing)
     if role == "network":
         return NetworkGuide(thing, read, title)

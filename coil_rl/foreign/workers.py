@@ -280,7 +280,8 @@ def _serve(pipe: Connection, make: MakeRows, own: range) -> None:
 
 def _caught(call: Callable[..., Any], *arguments: Any) -> Reply:
     """Return the reply for a call."""
-    value, error = None, None  # type: Any, Exception | None
+    value: Any = None
+    error: Exception | None = None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         try:

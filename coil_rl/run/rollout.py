@@ -103,7 +103,7 @@ class Rollout:
         carrier = acting = self.acting if lean is None else lean.carry(self.acting)
         try:
             for _ in range(self.steps):
-                acting = carrier
+                acting = carrier  # of the step that fails, for the check of its numbers
                 acting = self.acts(acting)
                 step, carrier = take(acting)
                 for key in self.keys or step.keys(True, True):
