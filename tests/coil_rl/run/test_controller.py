@@ -8,7 +8,10 @@ import torch
 from learned_runs import ON_POLICY, OPTIONS, STEPS, TINY, learned
 from outside_package.install import SOURCE
 from programs import shipped
-from torchrl.envs import ExplorationType, set_exploration_type
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import Compose, EnvBase, ExplorationType, TransformedEnv, set_exploration_type
 
 import coil_rl
 from coil_rl.run.controller import Controller
@@ -136,3 +139,49 @@ def test_cone_world_is_sent_its_steering(tmp_path):
         controller.act(observation.exclude("cones"))
     with pytest.raises(ValueError, match="observation holds a number that is not finite"):
         controller.act(observation.clone().set("observation", observation["observation"] / 0))
+
+
+class Tank(EnvBase):
+    """An env with one observation, which is inside of another entry."""
+
+    def __init__(self):
+        super().__init__(batch_size=[1])
+        self.observation_spec = Composite(
+            tank=Composite(level=Unbounded((1, 1)), shape=[1]), shape=[1]
+        )
+        self.action_spec = Bounded(-10, 10, (1, 1))
+        self.reward_spec = Unbounded((1, 1))
+
+    def _set_seed(self, seed):
+        pass
+
+    def _reset(self, tensordict):
+        return self.observation_spec.zero()
+
+    def _step(self, tensordict):
+        raise NotImplementedError  # a controller never steps its env
+
+
+def doubling():
+    """Return a controller that acts twice the level."""
+    policy = TensorDictModule(lambda level: 2 * level, [("tank", "level")], ["action"])
+    return Controller(TransformedEnv(Tank(), Compose()), policy)
+
+
+@pytest.mark.parametrize(
+    "observation",
+    [
+        [3.0],
+        {("tank", "level"): [3.0]},
+        {"tank": {"level": [3.0]}, "other": {"level": [4.0]}},
+        TensorDict({"tank": {"level": torch.tensor([3.0])}}),
+    ],
+    ids=["alone", "flat", "nested", "tensordict"],
+)
+def test_observation_inside_of_an_entry_is_given_in_any_form(observation):
+    assert doubling().act(observation).tolist() == [6.0]
+
+
+def test_missing_observation_inside_of_an_entry_is_named():
+    with pytest.raises(ValueError, match=r"'level'.* is missing, which the policy or its guide"):
+        doubling().act({"tank": {"pressure": [3.0]}})
