@@ -39,9 +39,10 @@ from coil_rl.comparison.page import command_of, delayed_sentence, draw, page_of
 from coil_rl.comparison.same import identity_of, keep_plan, known_plan
 from coil_rl.comparison.timing import Plan
 from coil_rl.comparison.verdict import NOTHING, Verdict, verdict
-from coil_rl.config.check import check, check_read
+from coil_rl.config.check import check_read
+from coil_rl.config.compose import Composed
 from coil_rl.config.parts import env_maker
-from coil_rl.config.python import Named, composed, named, new_folder
+from coil_rl.config.python import Named, checked, composed, named, new_folder
 from coil_rl.config.trust import trust_own
 from coil_rl.errors import UserError
 from coil_rl.files import FAILED_JOBS, write_text
@@ -175,7 +176,7 @@ class Comparison:
             (self.folder / FAILED_JOBS).unlink(missing_ok=True)
             short = short_words(self.given.words, config, plan.cases)
             with quietly():
-                base = self._config(ANCHORED, plan.frames[ANCHORED], short)
+                base = self._composed(ANCHORED, plan.frames[ANCHORED], short).config
                 measure_baselines(base, self.folder)
             failed = run_jobs(self._jobs(plan, short), self.folder)
             return self._judge(plan, base, failed)
@@ -187,7 +188,8 @@ class Comparison:
 
     def _checked(self) -> DictConfig:
         """Return the configuration of plain PPO with its whole budget, after a check of all."""
-        anchored = self._config(ANCHORED)
+        made = self._composed(ANCHORED)
+        anchored = made.config
         if len(anchored.guide) != 1:
             found = ", ".join(map(str, anchored.guide)) or "none"
             raise UserError(
@@ -195,17 +197,17 @@ class Comparison:
                 "or guide=controller guide.controller.of=MODULE:NAME"
             )
         trust_own(anchored)
-        check(anchored)
+        checked(made)
         # A word that this arm does not read is read by no arm, as it has every part that one may
         # have: a learner, advice and tests.
         check_read(anchored, self.given.words)
         if self.tunes:
-            check(self._config(TUNE))
-        return self._config(PPO)
+            checked(self._composed(TUNE))
+        return self._composed(PPO).config
 
-    def _config(
+    def _composed(
         self, name: str, frames: int | None = None, short: Sequence[str] = ()
-    ) -> DictConfig:
+    ) -> Composed:
         """Return the configuration of an arm, by default with the whole budget."""
         job = job_of(self.given, ARMS[name], self.seed, frames, short)
         return composed(job, self.folder / name)
@@ -227,7 +229,7 @@ class Comparison:
             plain = {PPO: config}
             if any(arm.learner == SAC for arm in arms):
                 # It is timed from its first update on, which takes as long as any other.
-                plain[SAC] = self._config(SAC, short=["learner.starts=1"])
+                plain[SAC] = self._composed(SAC, short=["learner.starts=1"]).config
             pace = timing.measure(plain, overhead)
         plan = timing.plan(plain, pace, arms, self.minutes)
         say(f"{pace.sentence}\n{plan.described(self.minutes)}", error=True)
@@ -239,7 +241,7 @@ class Comparison:
         for arm in arms:
             try:
                 if arm.learner == SAC:  # the others are checked already
-                    check(self._config(arm.name))
+                    checked(self._composed(arm.name))
             except UserError as error:
                 say(f"coil-compare: {arm.name} is left out: {error}", error=True)
             else:

@@ -16,7 +16,7 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
 
 from coil_rl.config.messages import SEVERAL, sentence, similar
-from coil_rl.config.schema import WRITTEN, shipped_places
+from coil_rl.config.schema import shipped_places
 from coil_rl.errors import UserError
 from coil_rl.measures import measures_of
 from coil_rl.output import say
@@ -42,7 +42,7 @@ FRAMES = 100_000  # 3.5 minutes of the processor with SAC, where the steps of an
 
 def keep_written(
     config: DictConfig, hydra: Any, task: Sequence[str], others: Sequence[str] = ()
-) -> None:
+) -> dict[str, str]:
     """Put the values of users' files into their places, after Hydra has composed all files.
 
     The order of Hydra's defaults list cannot say it: a method is meant to replace what a shipped
@@ -52,6 +52,9 @@ def keep_written(
         config: composed by a Hydra that is initialised; it is changed in place.
         task: overrides of the command line for the program.
         others: overrides of the command line for Hydra.
+
+    Returns:
+        The file of a user by each key that it gives.
 
     Raises:
         UserError: for a word that chooses several files of a group that takes one.
@@ -66,20 +69,21 @@ def keep_written(
                 f"{text} chooses several files of a group that takes one; for a run with each "
                 f"write -m {group}={value.strip('[]')}"
             )
-    WRITTEN.clear()
     places = [f"{place.schema}://{place.path}" for place in hydra.runtime.config_sources]
     # To look for files of users takes as long as to compose all files.
     if all(place.startswith(shipped_places()) for place in places):
-        return
+        return {}
     name, words = hydra.job.config_name, [*task, *others]
     defaults = loader.compute_defaults_list(name, words, RunMode.RUN).defaults
     # A choice of a file, such as method=coil, gives no value.
     typed = [key for key in map(key_of, task) if key not in groups]
+    files = {}
     with open_dict(config):
         for key, value, file in _written(defaults, places):
-            WRITTEN[key] = file
+            files[key] = file
             if not any(covers(each, key) for each in typed):
                 OmegaConf.update(config, key, value, merge=False, force_add=True)
+    return files
 
 
 def key_of(text: str) -> str:
@@ -138,6 +142,13 @@ def _file(place: str, name: str) -> Traversable:
     return Path(where) / name
 
 
+class Composed(NamedTuple):
+    """A configuration, and where its values are from."""
+
+    config: DictConfig
+    files: dict[str, str]  # of users, by the keys that they give
+
+
 def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConfig:
     """Return the configuration that `coil-train` composes from the words of its command line.
 
@@ -149,15 +160,21 @@ def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConf
     Raises:
         UserError: for words that do not fit the configuration, with one sentence.
     """
+    return compose_with_files(words, with_hydra=with_hydra).config
+
+
+def compose_with_files(words: Sequence[str], *, with_hydra: bool = False) -> Composed:
+    """Return the configuration as `compose_train` does, and the files of users in it."""
     try:
         with _own_hydra():
             config = compose("train", list(words), return_hydra_config=True)
             task = [word for word in words if not word.startswith("hydra.")]
-            keep_written(config, config.hydra, task, [w for w in words if w not in task])
+            others = [word for word in words if word not in task]
+            files = keep_written(config, config.hydra, task, others)
             if not with_hydra:
                 with open_dict(config):
                     del config["hydra"]
-            return config
+            return Composed(config, files)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(sentence(error)) from error
 

@@ -4,7 +4,8 @@ import errno
 import re
 import sys
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -57,6 +58,37 @@ SEVERAL = ("guide", "disturb", "degrade")  # groups of which several files may b
 OF_ENVS = {"env.id": "gym", "env.of": "torchrl", "env.options": "gym", "env.wrappers": "gym"}
 ELSEWHERE = ("hydra", "defaults", "proxy", "preset")  # nodes with keys that a hint leaves out
 MOST = 2  # places that a hint names
+
+
+class UnknownArgumentError(UserError):
+    """A node of a configuration gives an argument that its class or function does not take.
+
+    Args:
+        message: the sentence.
+        key: full key of the argument.
+    """
+
+    def __init__(self, message: str, key: str) -> None:
+        super().__init__(message)
+        self.key = key
+
+
+@contextmanager
+def naming_files(files: Mapping[str, str]) -> Iterator[None]:
+    """Begin the sentence on an unknown argument with the file of the user that gives it.
+
+    Args:
+        files: by the keys that they give.
+    """
+    try:
+        yield
+    except UserError as error:
+        # A sentence on the bounds of a guide that is tuned contains that on the guide.
+        unknown = error if isinstance(error, UnknownArgumentError) else error.__cause__
+        if not isinstance(unknown, UnknownArgumentError) or unknown.key not in files:
+            raise
+        named = f"{files[unknown.key]}: {unknown}"
+        raise UserError(str(error).replace(str(unknown), named)) from error
 
 
 def is_no_bug(error: BaseException) -> bool:

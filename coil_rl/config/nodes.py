@@ -32,8 +32,8 @@ from pydantic_core import SchemaError
 from torch import Tensor, nn
 from torchrl.envs import Transform
 
-from coil_rl.config.messages import similar
-from coil_rl.config.schema import WRITTEN, packages
+from coil_rl.config.messages import UnknownArgumentError, similar
+from coil_rl.config.schema import packages
 from coil_rl.config.trust import import_paths
 from coil_rl.errors import UserError
 from coil_rl.foreign.host import is_of_user
@@ -197,10 +197,9 @@ def check_arguments(
     for key in sorted(given.keys() - known):
         if not accepts_any or key.startswith("_"):
             takes = ", ".join(known) or "nothing"
-            file = WRITTEN.get(f"{name}.{key}")
-            raise UserError(
-                f"{f'{file}: ' if file else ''}{name}: {title} takes no {key}; it takes {takes}"
-                f"{similar(key, known)}"
+            raise UnknownArgumentError(
+                f"{name}: {title} takes no {key}; it takes {takes}{similar(key, known)}",
+                f"{name}.{key}",
             )
     missing = [
         key for key, p in known.items() if p.default is p.empty and key not in {*given, *program}

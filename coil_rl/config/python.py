@@ -18,8 +18,9 @@ from torchrl.envs import EnvBase
 
 from coil_rl.config.assemble import assemble
 from coil_rl.config.check import check, check_read
-from coil_rl.config.compose import compose_train, default_learner, quoted
+from coil_rl.config.compose import Composed, compose_with_files, default_learner, quoted
 from coil_rl.config.folder import PREFIX, make_folder, read_config, run_folder
+from coil_rl.config.messages import naming_files
 from coil_rl.config.nodes import give, import_path, keep
 from coil_rl.config.schema import method_for, packages
 from coil_rl.config.trust import trust_own, trust_packages
@@ -135,7 +136,7 @@ def prepare(
     words = [*given.words, *([] if method is None else [f"method={method}"])]
     words += [] if frames is None else [f"budget.frames={frames}"]
     words += default_learner(
-        [*words, *overrides], lambda of_env: composed(Named(of_env, given.nodes), folder)
+        [*words, *overrides], lambda of_env: composed(Named(of_env, given.nodes), folder).config
     )
     if method is None:
         words.append(f"method={method_for(guide)}")
@@ -184,9 +185,9 @@ def prepared(given: Named, folder: str | Path) -> Run:
     Raises:
         UserError: for a mistake.
     """
-    config = composed(given, folder)
-    trust_own(config)
-    check(config)
+    made = composed(given, folder)
+    trust_own(made.config)
+    config = checked(made)
     if not given.shared:
         check_read(config, given.words)
     make_folder(Path(config.run_dir))
@@ -195,17 +196,28 @@ def prepared(given: Named, folder: str | Path) -> Run:
     return run
 
 
-def composed(given: Named, folder: str | Path) -> DictConfig:
+def composed(given: Named, folder: str | Path) -> Composed:
     """Return the configuration of a run.
 
     Raises:
         UserError: for words that do not fit.
     """
-    config = compose_train([*given.words, f"run_dir={quoted(str(folder))}"])
-    with open_dict(config):
+    made = compose_with_files([*given.words, f"run_dir={quoted(str(folder))}"])
+    with open_dict(made.config):
         for place, node in given.nodes.items():
-            OmegaConf.update(config, place, node, merge=False, force_add=True)
-    return config
+            OmegaConf.update(made.config, place, node, merge=False, force_add=True)
+    return made
+
+
+def checked(made: Composed) -> DictConfig:
+    """Return a configuration after its check.
+
+    Raises:
+        UserError: for a mistake; the sentence on an unknown argument names the file that gives it.
+    """
+    with naming_files(made.files):
+        check(made.config)
+    return made.config
 
 
 def new_folder(program: str) -> Path:

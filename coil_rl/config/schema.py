@@ -24,8 +24,6 @@ from pydantic import ConfigDict, Field, GetPydanticSchema
 from pydantic_core import core_schema
 
 CORE = "coil_rl.conf"  # the package of our own files, and the group of the entry points
-# Of the last composition: the file of a user by each key that it gives.
-WRITTEN: dict[str, str] = {}
 LARGEST = 2**63 - 1
 GRU = "coil_rl.learners.Gru"
 # Keys in which two runs with the same numbers may differ.

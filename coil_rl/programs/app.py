@@ -38,7 +38,7 @@ import coil_rl.config  # noqa: F401  registers the root configurations
 from coil_rl import programs
 from coil_rl.config.compose import keep_written, key_of
 from coil_rl.config.folder import make_folder
-from coil_rl.config.messages import is_no_bug, refuse
+from coil_rl.config.messages import is_no_bug, naming_files, refuse
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import NO_SPACE, UserError
 from coil_rl.output import SafeStream
@@ -268,17 +268,18 @@ def _do(
     _draw_into_files()
     if is_sweep() and "existing" in config:
         config.existing = "resume"  # so that a sweep goes on by the same command
-    keep_written(config, HydraConfig.get(), *typed())
+    files = keep_written(config, HydraConfig.get(), *typed())
     trust_packages(config.get("trust", []), config)
     has_folder = bool(config.get("run_dir"))
     made = _missing(Path(config.run_dir).absolute()) if has_folder else []
     try:
-        check(config)
-        if has_folder:
-            make_folder(Path(config.run_dir))
-        if signals.received:
-            raise KeyboardInterrupt
-        return task(config)
+        with naming_files(files):
+            check(config)
+            if has_folder:
+                make_folder(Path(config.run_dir))
+            if signals.received:
+                raise KeyboardInterrupt
+            return task(config)
     except Exception:
         for folder in made:
             with contextlib.suppress(OSError):  # it is not empty, or was not made

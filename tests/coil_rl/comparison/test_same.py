@@ -28,7 +28,7 @@ class Local:
 def identity(folder, *words, guide="swing_up", env="pendulum"):
     given = named(env, guide, str(folder))
     given = Named([*given.words, *words], given.nodes)
-    config = composed(Named([*given.words, "method=ppo"], given.nodes), folder / "ppo")
+    config = composed(Named([*given.words, "method=ppo"], given.nodes), folder / "ppo").config
     return identity_of(given, config, 2.0, 0)
 
 

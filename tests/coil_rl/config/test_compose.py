@@ -300,6 +300,30 @@ def test_mistake_in_a_file_of_the_user_names_the_file(file, tmp_path):
     assert said in done.stderr
 
 
+UNKNOWN = "guide/mine.yaml: guide.mine: ClassicGuide takes no foo; it takes "
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], UNKNOWN),
+        (
+            ["method=tune", "tune={weights.0: [0, 1]}"],
+            f"tune: a bound is no value of .*: {UNKNOWN}",
+        ),
+    ],
+    ids=["driving", "tuned"],
+)
+def test_file_of_an_unknown_argument_is_named_in_python(words, said, tmp_path):
+    (tmp_path / "guide").mkdir()
+    text = (CONF / "guide" / "linear_feedback.yaml").read_text()
+    text = text.replace("guide.linear_feedback", "guide.mine", 1) + "foo: 1\n"
+    (tmp_path / "guide" / "mine.yaml").write_text(text)
+    words = [f"hydra.searchpath=[file://{tmp_path}]", *words]
+    with pytest.raises(UserError, match=f"^{said}"):
+        python.prepare("cart_pole", guide="mine", folder=tmp_path / "run", overrides=words)
+
+
 def test_key_of_a_swept_file_says_how_to_write_it(tmp_path):
     words = ["-m", "env=pendulum,cart_pole", "env.workers=0", "seed=0,1"]
     done = called("train", *words, cwd=tmp_path, code=2)

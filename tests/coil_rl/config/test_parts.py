@@ -362,7 +362,7 @@ def test_proxy_is_trained_behind_the_delays_and_noise_of_the_run():
 def folder_of_proxy(guide):
     given = named("Pendulum-v1", guide, "place")
     words = [*given.words, "method=dynamic_coil_sequential"]
-    config = composed_in_python(Named(words, given.nodes), "unused")
+    config = composed_in_python(Named(words, given.nodes), "unused").config
     return proxy_config(config, "controller").run_dir
 
 

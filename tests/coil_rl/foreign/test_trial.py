@@ -161,7 +161,7 @@ def test_controller_is_asked_in_few_steps():
 @pytest.mark.parametrize(("of", "count"), [(Still, 0), (Unseeded, 1)])
 def test_run_warns_once_of_a_controller_by_its_name(of, count, tmp_path):
     given = named("Pendulum-v1", of, str(tmp_path))
-    config = composed(given, tmp_path)
+    config = composed(given, tmp_path).config
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check(config)
