@@ -97,8 +97,10 @@ class Critics(TensorDictModuleBase):
         network: architecture of each; convolutions are shared.
         count: how many they are.
         outputs: numbers that each gives for an action.
-        norm: of the hidden layers, before their activation; "batch" normalises the inputs too.
+        norm: "layer" normalises the hidden layers before their activation, "batch" what each layer
+            reads, the inputs among them.
         dropout: share of the numbers of a hidden layer that are left out in learning.
+        gain: factor of the numbers that each gives; a small one slows the last layer down.
         inputs: has written what they read in place of some of `in_keys` already.
     """
 
@@ -114,23 +116,24 @@ class Critics(TensorDictModuleBase):
         outputs: int = 1,
         norm: Norm = "none",
         dropout: float = 0.0,
+        gain: float = 1.0,
         inputs: Inputs | None = None,
     ) -> None:
         keys: list[NestedKey] = [*in_keys, "action"]
         self.in_keys = read_through(inputs, keys)
         self.out_keys: list[NestedKey] = [("next", "uncertainty")]
         super().__init__()
-        self.count, self.dropout = count, dropout
+        self.count, self.dropout, self.gain = count, dropout, gain
         self.concat = ConcatObservations(env, keys, {"action": action_shape(env)}, network)
         architecture, width = Mlp(network.hidden, network.activation), self.concat.width
         each = [architecture.layers(width, outputs, 1.0, env.device) for _ in range(count)]
         linear = [[layer for layer in mlp if isinstance(layer, nn.Linear)] for mlp in each]
         self.layers = nn.ModuleList(Layer(same) for same in zip(*linear, strict=True))
         self.activation = ACTIVATIONS[network.activation]()
-        norm = "layer" if network.layer_norm else norm
-        # Batches also at the input.
-        widths = {"none": [], "layer": network.hidden, "batch": [width, *network.hidden]}[norm]
-        kind = BatchNorm if norm == "batch" else LayerNorm
+        self.norm: Norm = "layer" if network.layer_norm else norm
+        hidden: Sequence[int] = network.hidden
+        widths = {"none": [], "layer": hidden, "batch": [width, *hidden]}[self.norm]
+        kind = BatchNorm if self.norm == "batch" else LayerNorm
         self.norms = nn.ModuleList(kind(count, each, env.device) for each in widths)
 
     def outputs(self, entries: Any, *, train: bool = False) -> Tensor:
@@ -142,15 +145,17 @@ class Critics(TensorDictModuleBase):
         """
         read = self.concat(*(entries[key] for key in self.in_keys))
         x = read.reshape(-1, read.shape[-1]).expand(self.count, -1, -1)
-        first = len(self.layers) - len(self.norms)  # place of the first norm
         for place, layer in enumerate(self.layers):
             if place and self.dropout and train:
                 x = F.dropout(x, self.dropout)
-            if place >= first:
-                x = self.norms[place - first](x, train)
+            if place and self.norm == "layer":
+                x = self.norms[place - 1](x, train)
             if place:
                 x = self.activation(x)
+            if self.norm == "batch":
+                x = self.norms[place](x, train)
             x = layer(x)
+        x = x if self.gain == 1 else x * self.gain
         return x.view(self.count, *read.shape[:-1], x.shape[-1])
 
     def values(self, entries: Any) -> Tensor:

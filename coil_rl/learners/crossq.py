@@ -5,9 +5,9 @@ the same statistics:
 
     y = r + gamma (min Q(s', b) - alpha log pi(b | s')),  b from pi(. | s')
 
-In the loss of the policy they are normalised by their running statistics. Two parts of the paper
-are left out: the policy is updated with each minibatch, not with each third, and its own layers are
-not normalised.
+In the loss of the policy they are normalised by their running statistics. Differences from the
+paper: the policy is updated with each minibatch, not with each third, its own layers are not
+normalised, and the last layer of the critics is slowed down (`gain`).
 """
 
 from collections.abc import Sequence
@@ -37,6 +37,7 @@ class CrossQ(SAC):
 
     betas = (0.5, 0.999)
     norm = "batch"
+    gain = 0.01  # with a fast last layer, and no target networks, values run away
 
     def __init__(
         self,

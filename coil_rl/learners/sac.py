@@ -102,6 +102,7 @@ class SAC(OffPolicy):
     betas = (0.9, 0.999)  # of Adam
     values_of_a_critic = 1
     norm: ClassVar[Norm] = "none"  # of the critics, without `critic_layer_norm`
+    gain: ClassVar[float] = 1.0  # of the critics
 
     def __init__(
         self,
@@ -157,6 +158,7 @@ class SAC(OffPolicy):
             outputs=self.values_of_a_critic,
             norm="layer" if critic_layer_norm else self.norm,
             dropout=dropout,
+            gain=self.gain,
             inputs=self.inputs,
         )
         self.target = copy.deepcopy(self.critics).requires_grad_(False)
