@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, ExplorationType, TensorDictPrimer, set_exploration_type
 
 from coil_rl.config.folder import holds, identity, read_config, run_folder, settings
-from coil_rl.config.nodes import code_of_run
+from coil_rl.config.nodes import build, code_of_run
 from coil_rl.config.parts import (
     PROXIES,
     advises,
@@ -298,8 +298,6 @@ def make_logger(node: Any) -> Any:
     Raises:
         UserError: for whatever the logger raises, such as without a log-in or a server.
     """
-    from coil_rl.config.nodes import build  # imports torch
-
     try:
         return build(node, "logger")
     except UserError:

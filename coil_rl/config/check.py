@@ -6,56 +6,40 @@ to them.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
+from torchrl.data import Composite
+from torchrl.envs import EnvBase, TransformedEnv
 
 from coil_rl.config import parts
-from coil_rl.config.compose import check_values
+from coil_rl.config.compose import REFERENCE, check_values, covers, key_of
 from coil_rl.config.folder import run_folder
 from coil_rl.config.nodes import build, build_all, check_node
-from coil_rl.config.parts import (
-    frames_of_proxies,
-    guides_with_untrained_proxies,
-    guides_without_parameters,
-    own_run,
-    proxy_config,
-)
 from coil_rl.config.schema import TrainConfig, passive
 from coil_rl.errors import UserError, did_you_mean
+from coil_rl.extras import require
+from coil_rl.foreign.batch import optional_entries
+from coil_rl.foreign.faults import ForeignError
+from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.off_policy import OffPolicy
+from coil_rl.measures import measures_of
 from coil_rl.output import say
+from coil_rl.plain_yaml import is_part, leaves
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, transformed, try_out
 from coil_rl.run.training import INIT
-from coil_rl.transforms.action_space import nested_key
-
-if TYPE_CHECKING:
-    pass
-from collections.abc import Iterator, Mapping, Sequence
-
-import torch
-from torchrl.data import Composite
-from torchrl.envs import TransformedEnv
-
-from coil_rl.config.compose import REFERENCE, covers, key_of
-from coil_rl.config.parts import advises, env_maker, learner_kind, trains_guides
-from coil_rl.extras import require
-from coil_rl.foreign.batch import optional_entries
-from coil_rl.foreign.faults import ForeignError
-from coil_rl.guides.simple import FollowAdvice
-from coil_rl.measures import measures_of
-from coil_rl.plain_yaml import is_part, leaves
 from coil_rl.transforms import GuideActions
+from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.guide_actions import UnfitActionError
 
 # Kind of a learner: description and example.
@@ -143,7 +127,7 @@ def _check_kind(config: DictConfig) -> None:
 
 def _check_own_run(config: DictConfig) -> None:
     """Raise a `UserError` for what the own run of a method cannot do, or for `tune` without one."""
-    own = own_run(config)
+    own = parts.own_run(config)
     if own is not None:
         own.check(config)
     elif config.tune:
@@ -254,10 +238,10 @@ def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
             f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out"
         )
     guides = parts.build_guides(config) if trains else {}
-    replaced = guides_without_parameters(guides)
+    replaced = parts.guides_without_parameters(guides)
     check_proxies(config, replaced)
     _check_frames_of_proxies(config, replaced)
-    untrained = guides_with_untrained_proxies(config) if guides else None
+    untrained = parts.guides_with_untrained_proxies(config) if guides else None
     learner = parts.build_learner(config, env, untrained)
     for each in parts.build_beside(config):
         each.check(make_env, learner, Path(config.run_dir))
@@ -351,14 +335,14 @@ def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
     """Raise a `UserError` for the first mistake in the training of the proxies of guides."""
     for name in guides:
         try:
-            check(proxy_config(config, name))
+            check(parts.proxy_config(config, name))
         except UserError as error:
             raise UserError(f"proxy of guide.{name}: {error}") from error
 
 
 def _check_frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> None:
     """Raise a `UserError` if the proxies of guides take all frames of a run."""
-    taken, budget = frames_of_proxies(config, guides), config.budget
+    taken, budget = parts.frames_of_proxies(config, guides), config.budget
     if taken >= budget.frames:
         raise UserError(
             f"budget.frames={budget.frames} leaves nothing to the run, as the proxies of its "
@@ -367,15 +351,13 @@ def _check_frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> None:
         )
 
 
-def check_passive(config: DictConfig, make_env: "EnvMaker") -> None:
+def check_passive(config: DictConfig, make_env: EnvMaker) -> None:
     """Check a training in an env that does not react, and print what there is to learn from.
 
     Raises:
         UserError: for a method that needs the effect of its actions, for a budget that does not
             reach all steps, and if nothing can be learned.
     """
-    from coil_rl.run.parts import TRAIN  # imports torch
-
     kind = passive(config)
     if kind is None:
         return
@@ -579,9 +561,9 @@ def _unread_nodes(config: DictConfig) -> Iterator[str]:
         yield from (*OF_A_LEARNER, NOISE)
     if not (anchored or config.delivery == "tested"):
         yield "training.tests"
-    if not trains_guides(config):
+    if not parts.trains_guides(config):
         yield "proxy"
-    if not advises(config):
+    if not parts.advises(config):
         yield "evaluation.advice"
 
 
@@ -599,9 +581,9 @@ def _references(config: DictConfig, closed: Sequence[str]) -> Iterator[str]:
 
 def _adds_noise(config: DictConfig) -> bool:
     """Return whether noise is added to the actions of a training, which are numbers then."""
-    if learner_kind(config) == "imitation":
+    if parts.learner_kind(config) == "imitation":
         return False
-    env = env_maker(config)()
+    env = parts.env_maker(config)()
     return bool(env.full_action_spec[env.action_key].dtype.is_floating_point)
 
 

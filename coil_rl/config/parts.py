@@ -7,7 +7,10 @@ objects and code of a user, which the configuration only names, there is a secon
 its proxies into its own folder.
 """
 
+import hashlib
+import math
 import re
+import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
@@ -18,12 +21,23 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 
-from coil_rl.config.nodes import build, build_all, find_target
+from coil_rl.config.nodes import (
+    build,
+    build_all,
+    code_of_user,
+    find_target,
+    identity_of,
+    kept_objects,
+)
+from coil_rl.config.schema import TrainConfig, fingerprint
 from coil_rl.errors import UserError
+from coil_rl.files import temporary, whole_file
 from coil_rl.foreign.guard import hold
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
+from coil_rl.guides import ControllerGuide
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import MEAN_CASE, measures_of
 from coil_rl.plain_yaml import entries
@@ -34,20 +48,10 @@ from coil_rl.run.judge import Evaluation
 from coil_rl.run.parts import TEST, TESTS, TRAIN, EnvMaker
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
+from coil_rl.transforms.normalised_action import in_unit_of
 
 if TYPE_CHECKING:
     from coil_rl.run.run import Run
-import hashlib
-import math
-import shutil
-
-from torch import nn
-
-from coil_rl.config.nodes import code_of_user, identity_of, kept_objects
-from coil_rl.config.schema import TrainConfig, fingerprint
-from coil_rl.files import temporary, whole_file
-from coil_rl.guides import ControllerGuide
-from coil_rl.transforms.normalised_action import in_unit_of
 
 # Parts of a configuration that name entries of the env of a method; its guides are parts of
 # `method.transforms`.
