@@ -1,4 +1,4 @@
-"""A method that needs numbers as actions is refused where they are choices."""
+"""A mistake is found before a run starts, and so is a word that nothing reads."""
 
 import logging
 import warnings

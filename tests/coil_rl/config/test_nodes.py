@@ -1,4 +1,4 @@
-"""Objects of users are told apart by their file and their state."""
+"""Nodes are checked and built, and what they name of a user is told apart by file and state."""
 
 import importlib
 import os

@@ -1,4 +1,4 @@
-"""Controllers beside an env act only where something reads what they would do."""
+"""The parts of a configuration are those that it describes, and its proxies are trained once."""
 
 import csv
 import shutil

@@ -1,4 +1,4 @@
-"""Loggers of runs that go on: shipped ones by name, with nothing but plain names of a folder."""
+"""What a received run folder may name, and the logger that it may have."""
 
 import copy
 import importlib.resources
