@@ -128,9 +128,9 @@ def _written(defaults: Iterable[Any], places: Sequence[str]) -> Iterator[tuple[s
             continue
         content = OmegaConf.create(found[0][1].read_text(encoding="utf-8"))
         values: Any = OmegaConf.to_container(content, resolve=False)
+        values.pop("defaults", None)  # Hydra's list of files
         for key, _, value in entries(values, default.package or ""):
-            is_node = isinstance(value, Mapping)
-            if not is_node and key.partition(".")[0] not in ("hydra", "defaults"):
+            if not isinstance(value, Mapping) and key.partition(".")[0] != "hydra":
                 yield key, value, name
 
 

@@ -116,6 +116,15 @@ def test_every_value_of_a_users_part_survives_the_composition(group, method, tmp
     assert kept(composed(tmp_path, *words), written) == []
 
 
+def test_users_part_may_list_the_file_that_it_changes(tmp_path):
+    (tmp_path / "learner").mkdir()
+    text = "# @package learner\ndefaults: [ppo, _self_]\ngamma: 0.5\n"
+    (tmp_path / "learner" / "mine.yaml").write_text(text)
+    learner = composed(tmp_path, "env=gym", "guide=zero", "method=coil", "learner=mine")["learner"]
+    assert (learner["_target_"], learner["gamma"]) == ("coil_rl.learners.PPO", 0.5)
+    assert "defaults" not in learner
+
+
 def test_command_line_is_stronger_than_a_file(tmp_path):
     write(tmp_path, "env", {"learner": {"gamma": 0.5, "clip": 0.1}}, "gym")
     config = composed(tmp_path, "env=mine", "method=coil", "guide=zero", "learner.gamma=0.7")
