@@ -1,4 +1,4 @@
-"""Regressors for imitation: what each of them is, a neural network, and a linear function.
+"""Regressors for imitation: their interface, a neural network, and a linear function.
 
 Imitation needs few things of a regressor: it fits vectors to vectors from scratch, it predicts, and
 its fitted state can be saved. So the learner is the same for a network, a forest or a line.
