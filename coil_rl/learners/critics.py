@@ -130,7 +130,7 @@ class Critics(TensorDictModuleBase):
         linear = [[layer for layer in mlp if isinstance(layer, nn.Linear)] for mlp in each]
         self.layers = nn.ModuleList(Layer(same) for same in zip(*linear, strict=True))
         self.activation = ACTIVATIONS[network.activation]()
-        self.norm: Norm = "layer" if network.layer_norm else norm
+        self.norm: Norm = "layer" if norm == "none" and network.layer_norm else norm
         hidden: Sequence[int] = network.hidden
         widths = {"none": [], "layer": hidden, "batch": [width, *hidden]}[self.norm]
         kind = BatchNorm if self.norm == "batch" else LayerNorm

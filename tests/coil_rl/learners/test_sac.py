@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from torchrl.envs import GymEnv, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.learners import SAC, TQC, CrossQ
+from coil_rl.learners import SAC, TQC, CrossQ, Mlp
 from coil_rl.learners.policy import Entries
 from coil_rl.run.policy_batch import policy_batch
 from coil_rl.run.rollout import Rollout
@@ -249,6 +249,12 @@ def test_crossq_normalises_both_states_together_and_has_no_target_networks():
     sac.critics.values(data)  # as in the loss of the policy
     assert torch.equal(norm.mean, before)
     assert not any(part is sac.of_target.vector for part in sac.gradient.parameters)
+
+
+def test_critics_of_crossq_normalise_batches_also_with_layers_that_are_normalised():
+    network = Mlp([16], "relu", layer_norm=True)
+    assert make(CrossQ, network=network)[0].critics.norm == "batch"
+    assert make(SAC, network=network)[0].critics.norm == "layer"
 
 
 def test_tqc_leaves_out_the_largest_quantiles_of_all_critics():
