@@ -143,10 +143,10 @@ def _file(place: str, name: str) -> Traversable:
 
 
 class Composed(NamedTuple):
-    """A configuration, and where its values are from."""
+    """A composed configuration, and the files of users that give its values."""
 
     config: DictConfig
-    files: dict[str, str]  # of users, by the keys that they give
+    files: dict[str, str]  # by the keys that they give
 
 
 def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConfig:
@@ -164,7 +164,7 @@ def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConf
 
 
 def compose_with_files(words: Sequence[str], *, with_hydra: bool = False) -> Composed:
-    """Return the configuration as `compose_train` does, and the files of users in it."""
+    """Compose as `compose_train` does, and return the files of users too."""
     try:
         with _own_hydra():
             config = compose("train", list(words), return_hydra_config=True)

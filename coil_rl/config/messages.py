@@ -61,7 +61,7 @@ MOST = 2  # places that a hint names
 
 
 class UnknownArgumentError(UserError):
-    """A node of a configuration gives an argument that its class or function does not take.
+    """An argument in a configuration that its class or function does not take.
 
     Args:
         message: the sentence.
@@ -75,7 +75,7 @@ class UnknownArgumentError(UserError):
 
 @contextmanager
 def naming_files(files: Mapping[str, str]) -> Iterator[None]:
-    """Begin the sentence on an unknown argument with the file of the user that gives it.
+    """Name the user's file at the start of the message about an unknown argument.
 
     Args:
         files: by the keys that they give.
@@ -83,7 +83,7 @@ def naming_files(files: Mapping[str, str]) -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        # A sentence on the bounds of a guide that is tuned contains that on the guide.
+        # The message about the bounds of a tuned guide contains that about the guide.
         unknown = error if isinstance(error, UnknownArgumentError) else error.__cause__
         if not isinstance(unknown, UnknownArgumentError) or unknown.key not in files:
             raise

@@ -210,7 +210,7 @@ def composed(given: Named, folder: str | Path) -> Composed:
 
 
 def checked(made: Composed) -> DictConfig:
-    """Return a configuration after its check.
+    """Check a configuration, and return it.
 
     Raises:
         UserError: for a mistake; the sentence on an unknown argument names the file that gives it.
