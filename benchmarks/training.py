@@ -10,7 +10,7 @@ import time
 from argparse import Namespace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from hydra.utils import instantiate
@@ -23,6 +23,7 @@ from coil_rl.compiled import compile_steps
 from coil_rl.config.nodes import build
 from coil_rl.config.parts import build_bare_env, build_guides, build_learner, env_maker
 from coil_rl.learners.off_policy import OffPolicy
+from coil_rl.learners.ppo import PPO
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import read_runs
 from coil_rl.run.experiment import Experiment, watched_keys
@@ -148,12 +149,12 @@ def floor_rate(args: Namespace, frames: int) -> float:
     The speed of its largest matrices is measured.
     """
     config = train_config(args, "ppo")
-    learner: Any = build_learner(config, env_maker(config)(1))
+    learner = cast(PPO, build_learner(config, env_maker(config)(1)))  # see has_yardstick
     sizes = [parameter.numel() for parameter in learner.gradient.parameters if parameter.ndim == 2]
     # Of each weight a multiplication and an addition: forward, and twice backward; and once to act
     # and to value.
-    operations = 2 * sum(sizes) * (3 * learner.epochs + 1)
-    rows, width = max(frames // learner.minibatches, 1), config.learner.hidden[0]
+    operations = 2 * sum(sizes) * (3 * learner.sampler.epochs + 1)
+    rows, width = max(frames // learner.sampler.count, 1), config.learner.hidden[0]
     left = torch.ones(rows, width, device=args.device)
     right = torch.ones(width, width, device=args.device)
 
