@@ -32,41 +32,42 @@ settings.register_profile("deterministic", derandomize=True, deadline=None)
 settings.load_profile("deterministic")
 
 
-def parse_each_text_once(load):
-    """Return `yaml.load` with a memory, because Hydra reads the same files for every test."""
+def remembered(function, key_of):
+    """Return a function with a memory; it has none for what has no key, which is None."""
     known = {}
 
-    def load_known(stream, Loader):
-        text = stream if isinstance(stream, (str, bytes)) else stream.read()
-        key = (text, Loader.__module__, Loader.__qualname__)
+    def call(*arguments, **options):
+        key = key_of(*arguments, **options)
+        if key is None:
+            return function(*arguments, **options)
         if key not in known:
-            if stream is not text:
-                stream.seek(0)  # errors name the file
-            known[key] = pickle.dumps(load(stream, Loader))
+            known[key] = pickle.dumps(function(*arguments, **options))
         return pickle.loads(known[key])
 
-    return load_known
+    return call
 
 
-yaml.load = parse_each_text_once(yaml.load)
+def key_of_text(stream, Loader):
+    text = stream if isinstance(stream, (str, bytes)) else stream.read()
+    if stream is not text:
+        stream.seek(0)
+    return text, Loader.__module__, Loader.__qualname__
 
 
-def read_each_file_once(load):
-    """Return `ConfigRepository.load_config` with a memory of the files of this project."""
-    known = {}
-
-    def load_known(self, config_path):
-        if not all(each.full_path().startswith(OURS) for each in self.sources):
-            return load(self, config_path)
-        places = tuple(each.full_path() for each in self.sources)
-        if (config_path, places) not in known:
-            known[config_path, places] = pickle.dumps(load(self, config_path))
-        return pickle.loads(known[config_path, places])
-
-    return load_known
+def places_of(sources):
+    """Return the folders of a configuration; None if one is not of this project."""
+    places = tuple(each.full_path() for each in sources)
+    return places if all(place.startswith(OURS) for place in places) else None
 
 
-ConfigRepository.load_config = read_each_file_once(ConfigRepository.load_config)
+def key_of_file(self, config_path):
+    places = places_of(self.sources)
+    return places and (config_path, places)
+
+
+def key_of_list(self, defaults, repo):
+    places = places_of(repo.get_sources())
+    return places and (places, repr(defaults))
 
 
 def list_defaults_once(create):
@@ -77,8 +78,8 @@ def list_defaults_once(create):
     known = {}
 
     def create_known(repo, config_name, overrides, **options):
-        places = tuple(each.full_path() for each in repo.get_sources())
-        if not all(place.startswith(OURS) for place in places):
+        places = places_of(repo.get_sources())
+        if places is None:
             return create(repo, config_name, overrides, **options)
         values, groups = overrides.config_overrides, vars(overrides)
         overrides.config_overrides = []
@@ -93,25 +94,12 @@ def list_defaults_once(create):
     return create_known
 
 
-def merge_each_list_once(merge):
-    """Return `_compose_config_from_defaults_list` with a memory for the files of this project."""
-    known = {}
-
-    def merge_known(self, defaults, repo):
-        places = tuple(each.full_path() for each in repo.get_sources())
-        if not all(place.startswith(OURS) for place in places):
-            return merge(self, defaults, repo)
-        key = (places, repr(defaults))
-        if key not in known:
-            known[key] = pickle.dumps(merge(self, defaults, repo))
-        return pickle.loads(known[key])
-
-    return merge_known
-
-
+# Hydra reads and merges the same files for every test.
+yaml.load = remembered(yaml.load, key_of_text)
+ConfigRepository.load_config = remembered(ConfigRepository.load_config, key_of_file)
 defaults_list._create_defaults_list = list_defaults_once(defaults_list._create_defaults_list)
-ConfigLoaderImpl._compose_config_from_defaults_list = merge_each_list_once(
-    ConfigLoaderImpl._compose_config_from_defaults_list
+ConfigLoaderImpl._compose_config_from_defaults_list = remembered(
+    ConfigLoaderImpl._compose_config_from_defaults_list, key_of_list
 )
 base.parse = functools.lru_cache(maxsize=None)(base.parse)  # the trees of references are only read
 # Each export asks for the operations of PyTorch anew.

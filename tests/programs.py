@@ -1,10 +1,12 @@
 """Helpers that call the console programs, and the arguments of a very small run."""
 
 import contextlib
+import csv
 import importlib
 import io
 import logging
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -96,6 +98,17 @@ def composed(*words, name="train", **options):
     """Return the configuration of a program for some words."""
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         return compose(name, [*words], **options)
+
+
+def code_blocks(page):
+    """Return the blocks of code of a page of Markdown, each after its language."""
+    return re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+
+
+def read_csv(path):
+    """Return the rows of a table, each a dictionary of texts."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
 def shipped(group):

@@ -15,17 +15,16 @@ from try_wheel import NEED_A_CHECKOUT
 
 ROOT = Path(__file__).resolve().parents[1]
 UNPINNED = {"trackio"}  # extras that need other versions than the tested ones
-LINKS = {
-    "coil_rl/envs": "../envs",
-    "coil_rl/transforms": "../transforms",
-    "coil_rl/conf": "../conf",
-    "coil_fmu": "fmu",
-    "coil_paper": "paper",
-    "coil_studies": "studies",
-    "coil_robot": "robot",
+PACKAGES = {
+    "envs": "coil_rl/envs",
+    "transforms": "coil_rl/transforms",
+    "conf": "coil_rl/conf",
+    "fmu": "coil_fmu",
+    "paper": "coil_paper",
+    "studies": "coil_studies",
+    "robot": "coil_robot",
 }
-
-SHIPPED = (".md", ".csv", ".pt", ".yaml")  # files of the shipped policies
+SHIPPED = [f"policies/**/*{end}" for end in (".md", ".csv", ".pt", ".yaml")]
 
 
 def run(*command: str | Path, cwd: Path, pythonpath: Path | None = None) -> str:
@@ -50,12 +49,15 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ".*", "build", "dist", "outputs", "*.egg-info", "__pycache__", "site", "node_modules"
     )
     shutil.copytree(ROOT, tree, symlinks=True, ignore=ignore)
-    for name, target in LINKS.items():
+    for target, name in PACKAGES.items():
         link = tree / name
         link.unlink(missing_ok=True)
-        link.write_text(target)
-    planted_files = ["conf/planted.yaml", "conf/a/b/planted.yaml", "envs/tracks/a/planted.csv"]
-    for planted in [*planted_files, "paper/conf/a/planted.yaml"]:
+        link.write_text("../" * name.count("/") + target)
+    for planted in (
+        "conf/a/b/planted.yaml",
+        "envs/tracks/a/planted.csv",
+        "paper/conf/a/planted.yaml",
+    ):
         (tree / planted).parent.mkdir(parents=True, exist_ok=True)
         (tree / planted).write_text("")
     return tree
@@ -71,70 +73,28 @@ def wheel(tree: Path) -> Path:
 @pytest.fixture(scope="module")
 def installed(wheel: Path) -> Path:
     target = wheel.parent / "installed"
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "--no-index",
-        "--no-deps",
-        "--target",
-        target,
-    ]
-    run(*pip, wheel, cwd=wheel.parent)
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps"]
+    run(*pip, "--target", target, wheel, cwd=wheel.parent)
     return target
 
 
 @pytest.mark.slow
 def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Path) -> None:
-    patterns = {
-        "coil_rl": [
-            "*.py",
-            "*.html",
-            "*.j2",
-            "*.json",
-            "py.typed",
-            *(f"policies/**/*{end}" for end in SHIPPED),
-        ],
+    patterns = dict.fromkeys(("conf", "fmu", "paper", "studies"), ("*.py", "*.yaml"))
+    patterns |= {
+        "coil_rl": ["*.py", "*.html", "*.j2", "*.json", "py.typed", *SHIPPED],
         "envs": ["*.py", "*.json", "tracks/**/*.csv"],
-    }
-    patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"], "paper": ["*.py", "*.yaml"]}
-    patterns |= {"studies": ["*.py", "*.yaml"], "fmu": ["*.py", "*.yaml"]}
-    patterns["robot"] = ["*.py", "*.yaml", "*.json"]
-    installed_as = {
-        "fmu": "coil_fmu",
-        "coil_rl": "coil_rl",
-        "paper": "coil_paper",
-        "robot": "coil_robot",
-        "studies": "coil_studies",
+        "robot": ["*.py", "*.yaml", "*.json"],
+        "transforms": ["*.py"],
     }
     expected = set()
     for folder, globs in patterns.items():
-        package = installed_as.get(folder, f"coil_rl/{folder}")
+        package = PACKAGES.get(folder, folder)
         for path in chain.from_iterable((tree / folder).rglob(glob) for glob in globs):
             expected.add(f"{package}/{path.relative_to(tree / folder).as_posix()}")
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert names == expected
-    assert {
-        "coil_rl/py.typed",
-        "coil_rl/conf/a/b/planted.yaml",
-        "coil_rl/envs/tracks/a/planted.csv",
-        "coil_paper/conf/a/planted.yaml",
-        "coil_paper/conf/experiment/paper.yaml",
-    } <= names
-
-
-@pytest.mark.slow
-def test_wheel_has_three_import_names(wheel: Path) -> None:
-    top = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
-    assert {name for name in top if not name.endswith(".dist-info")} == {
-        "coil_rl",
-        "coil_fmu",
-        "coil_paper",
-        "coil_studies",
-        "coil_robot",
-    }
+    assert {"coil_rl/py.typed", "coil_rl/conf/a/b/planted.yaml"} <= names
 
 
 @pytest.mark.slow
@@ -143,34 +103,12 @@ def test_sdist_contains_everything_that_its_tests_need(tree: Path) -> None:
     [sdist] = tree.parent.glob("*.tar.gz")
     with tarfile.open(sdist) as file:
         names = {name.partition("/")[2] for name in file.getnames()}
-    folders = [
-        "benchmarks",
-        "coil_rl",
-        "conf",
-        "docs",
-        "envs",
-        "examples",
-        "fmu",
-        "paper",
-        "robot",
-        "tests",
-    ]
-    paths = [
-        path
-        for folder in [*folders, "tests", "transforms"]
-        for path in (tree / folder).rglob("*")
-        if path.is_file()
-    ]
-    needed = {path.relative_to(tree).as_posix() for path in paths} - {*LINKS}
-    files = {
-        "CONTRIBUTING.md",
-        "LICENSE",
-        "Makefile",
-        "README.md",
-        "constraints.txt",
-        "pyproject.toml",
-    }
-    assert (needed | files) - names == set()
+    folders = ("benchmarks", "coil_rl", "docs", "examples", "tests", *PACKAGES)
+    paths = chain.from_iterable((tree / folder).rglob("*") for folder in folders)
+    needed = {path.relative_to(tree).as_posix() for path in paths if path.is_file()}
+    needed |= {"CONTRIBUTING.md", "LICENSE", "Makefile", "README.md"}
+    needed |= {"constraints.txt", "pyproject.toml"}
+    assert needed - names - {*PACKAGES.values()} == set()
 
 
 @pytest.mark.slow

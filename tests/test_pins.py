@@ -4,14 +4,13 @@ After a change that is meant to alter numbers,
 `python tests/test_pins.py` writes the pins again, in that change's commit.
 """
 
-import csv
 import math
 import shutil
 import tempfile
 from pathlib import Path
 
 import pytest
-from programs import LAP, called
+from programs import LAP, called, read_csv
 
 PINS = Path(__file__).parent / "pins"
 FILES = ("metrics.csv", "evaluation.csv")
@@ -54,11 +53,6 @@ def run(name: str, folder: Path) -> Path:
     return folder / name
 
 
-def rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def same(one: str, other: str) -> bool:
     try:
         return one == other or math.isclose(
@@ -73,7 +67,7 @@ def same(one: str, other: str) -> bool:
 def test_short_run_gives_the_pinned_numbers(name: str, tmp_path: Path) -> None:
     folder = run(name, tmp_path)
     for file in FILES:
-        found, pinned = rows(folder / file), rows(PINS / name / file)
+        found, pinned = read_csv(folder / file), read_csv(PINS / name / file)
         assert [list(row) for row in found] == [list(row) for row in pinned], file
         wrong = []
         for number, (row, pin) in enumerate(zip(found, pinned, strict=True)):

@@ -1,6 +1,5 @@
 """README.md: its files are there, its commands and its Python run, at toy size."""
 
-import csv
 import re
 import shlex
 import sys
@@ -8,10 +7,10 @@ from collections import Counter
 
 import pandas
 import pytest
-from programs import ROOT, called
+from programs import ROOT, called, code_blocks, read_csv
 
 README = (ROOT / "README.md").read_text()
-BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
+BLOCKS = code_blocks(ROOT / "README.md")
 CONTROLLER, PROGRAM = (block for language, block in BLOCKS if language == "python")
 COMMANDS = [
     shlex.split(line)
@@ -76,8 +75,8 @@ TASKS = {
 
 
 def test_numbers_of_the_table_are_those_of_the_benchmark():
-    with (ROOT / "docs" / "guide_benchmark" / "rows.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["method"] == "coil_anchored"]
+    table = read_csv(ROOT / "docs" / "guide_benchmark" / "rows.csv")
+    rows = [row for row in table if row["method"] == "coil_anchored"]
     measured = {(row["task"], row["arm"]): row for row in rows}
     alone = pandas.read_csv(ROOT / "docs" / "methods" / "alone_runs.csv")
     sac = alone[alone["method"] == "sac"].groupby("task")["end"]

@@ -190,18 +190,3 @@ def test_code_keeps_the_rules_of_style(rule):
 )
 def test_a_rule_finds_what_breaks_it(rule, code):
     assert list(rule(*parsed(code)))
-
-
-@pytest.mark.parametrize(
-    ("rule", "code"),
-    [
-        (nested_conditionals, "x = (a if b else c) + (d if e else f)"),
-        (long_comprehensions, "x = [a for b in c for a in b]"),
-        (lets, "x = [y for y in [*z]] + [y for y in (1, 2)]"),
-        (formatter_switches, "x = '# fmt: off'"),
-        (glued_messages, "def f(a):\n    b = g(a)\n    raise E(f'{b} is none; ' f'give {a}')"),
-        (glued_messages, "def f(a):\n    b = 'x'\n    if a:\n        b = 'y'\n    raise E(f'{b}')"),
-    ],
-)
-def test_a_rule_leaves_plain_code_alone(rule, code):
-    assert not list(rule(*parsed(code)))

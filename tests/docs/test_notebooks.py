@@ -25,10 +25,6 @@ TOY = {
 }
 
 
-def test_each_notebook_is_tested():
-    assert {notebook.stem for notebook in NOTEBOOKS} == {*SHOWN}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=[notebook.stem for notebook in NOTEBOOKS])
 def test_it_runs_with_the_backend_that_a_notebook_sets(notebook, tmp_path, monkeypatch):

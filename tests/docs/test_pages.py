@@ -1,11 +1,13 @@
 """The README and the pages: links lead somewhere, code runs, programs exist, the index has all."""
 
 import re
+import subprocess
+import sys
 import tomllib
 from functools import cache
 
 import pytest
-from programs import ROOT
+from programs import ROOT, code_blocks, environment
 
 DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.rglob("*.md"), *(ROOT / "paper").rglob("*.md"), *ROOT.glob("*.md")])
@@ -26,9 +28,8 @@ def text_without_code(page):
 
 def code_of(page):
     """Return the blocks of a page, and what is code in its lines, a line each."""
-    blocks = re.findall(r"^```\w*\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     inline = re.findall(r"`([^`\n]+)`", page.read_text())
-    return "\n".join([*blocks, *inline])
+    return "\n".join([*(block for _, block in code_blocks(page)), *inline])
 
 
 @cache
@@ -83,15 +84,31 @@ def test_every_page_is_in_the_contents():
     assert {page for page in PAGES if page.parent != ROOT} - found - outside == set()
 
 
+def python_blocks(name, word):
+    """Return the blocks of Python of a page that have a word."""
+    blocks = [block for language, block in code_blocks(DOCS / name) if language == "python"]
+    return [block for block in blocks if word in block]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXECUTED)
 def test_code_runs_as_printed(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / name).read_text(), re.DOTALL | re.M)
-    blocks = [block for block in blocks if EXECUTED[name] in block]
+    blocks = python_blocks(name, EXECUTED[name])
     assert blocks
     found: dict = {}
     for block in blocks:
         exec(compile(block, name, "exec"), found)
     if name == "robot.md":
         assert found["steps"]["cone_count"].sum() > 200
+
+
+@pytest.mark.slow
+def test_distributed_collector_runs_a_learner(tmp_path):
+    (block,) = python_blocks("python.md", "DistributedCollector")
+    file = tmp_path / "distributed_coil.py"  # a file, which each process imports again
+    file.write_text(block)
+    command, options = [sys.executable, file], {"capture_output": True, "text": True}
+    done = subprocess.run(command, env=environment(tmp_path), timeout=600, check=True, **options)
+    updates = [line.split(":")[0] for line in done.stdout.splitlines()]
+    assert updates == [f"update {number}" for number in range(4)]
