@@ -44,6 +44,7 @@ def make_run(
     rows: Sequence[Row] | None,
     needs_guide: bool | None = True,
     guide: float = 300.0,
+    settings: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write a run; without rows it is not finished."""
     folder.mkdir(parents=True)
@@ -51,8 +52,9 @@ def make_run(
         "seed": seed,
         "label": label,
         "method": {"name": "any", "needs_guide": needs_guide},
+        "evaluation": {"measures": MEASURES},
+        **(settings or {}),
     }
-    config["evaluation"] = {"measures": MEASURES}
     (folder / "config.yaml").write_text(json.dumps(config))  # JSON is YAML
     (folder / "guide_return.json").write_text(json.dumps({"guide": guide}))
     frames = range(1000, 20_001, 1000)

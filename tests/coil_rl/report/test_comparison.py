@@ -11,6 +11,12 @@ from coil_rl.report.statistics import estimate
 CASES = {"a": 500.0, "b": 600.0}
 
 
+def run_of(folder, label, seed=0, rewards=CASES, guide=CASES, **measures):
+    """Write a run of a policy and its guide."""
+    rows = driven("guide", guide) + driven(label, rewards, **measures)
+    make_run(folder / f"{label}{seed}", label, seed, rows)
+
+
 def table(folder, against=None, actions="deterministic"):
     rows = compare(read_runs([folder]), actions).table(against)
     return {(row["driver"], row["advice"]): row for row in rows}
@@ -26,15 +32,11 @@ def sweep(tmp_path):
     return make_sweep(tmp_path / "sweep")
 
 
-def test_guides_come_first_then_agents_by_return_each_with_its_variants(sweep):
-    rows = table(sweep)
+def test_numbers_are_those_of_the_runs(sweep):
+    rows = table(sweep, against="ppo")
     assert list(rows) == [("guide", ""), ("ppo", ""), ("coil", ""), ("coil", "zeroed")]
     assert [row["seeds"] for row in rows.values()] == [None, 3, 3, 3]
     assert [row["needs_guide"] for row in rows.values()] == [None, False, True, None]
-
-
-def test_numbers_are_those_of_the_runs(sweep):
-    rows = table(sweep, against="ppo")
     coil, zeroed = rows["coil", ""], rows["coil", "zeroed"]
     assert coil["reward"] == pytest.approx(571)
     means = [570 + seed for seed in range(3)]
@@ -44,11 +46,7 @@ def test_numbers_are_those_of_the_runs(sweep):
     assert (coil["smoothness"], coil["lap_time"], coil["completed"]) == (pytest.approx(0.2), 50, 1)
     assert math.isnan(zeroed["lap_time"])
     assert math.isnan(rows["guide", ""]["low"])
-    assert (coil["better"], rows["guide", ""]["better"], rows["ppo", ""]["better"]) == (
-        0,
-        None,
-        None,
-    )
+    assert [row["better"] for row in rows.values()] == [None, None, 0, 0]
     assert coil["difference"] == pytest.approx(-20)
     assert [row["better"] for row in table(sweep, against="guide").values()] == [None, 1, 1, 0]
     cases = compare(read_runs([sweep])).case_table()
@@ -62,23 +60,14 @@ def test_numbers_are_those_of_the_runs(sweep):
 
 
 def test_completion_ranks_before_the_mean(tmp_path):
-    rewards = {"a": 900.0, "b": 900.0}
-    make_run(
-        tmp_path / "0",
-        "fast",
-        0,
-        driven("guide", CASES) + driven("fast", rewards, completed=0.9, crashed=0.1),
-    )
-    make_run(tmp_path / "1", "safe", 0, driven("guide", CASES) + driven("safe", CASES))
+    run_of(tmp_path, "fast", rewards={"a": 900.0, "b": 900.0}, completed=0.9, crashed=0.1)
+    run_of(tmp_path, "safe")
     assert list(table(tmp_path)) == [("guide", ""), ("safe", ""), ("fast", "")]
 
 
 def test_clearance_is_the_smallest_and_lap_time_the_mean_of_completed_laps(tmp_path):
-    make_run(
-        tmp_path / "0", "coil", 0, driven("guide", CASES) + driven("coil", CASES, clearance=0.2)
-    )
-    slow = driven("coil", CASES, lap_time=math.nan, clearance=0.05, completed=0.0)
-    make_run(tmp_path / "1", "coil", 1, driven("guide", CASES) + slow)
+    run_of(tmp_path, "coil", 0, clearance=0.2)
+    run_of(tmp_path, "coil", 1, lap_time=math.nan, clearance=0.05, completed=0.0)
     row = table(tmp_path)["coil", ""]
     assert (row["clearance"], row["lap_time"], row["completed"]) == (0.05, 50, 0.5)
 
@@ -86,10 +75,8 @@ def test_clearance_is_the_smallest_and_lap_time_the_mean_of_completed_laps(tmp_p
 def test_labels_are_appended_to_guides_of_the_same_name(tmp_path):
     worse = {case: reward - 100 for case, reward in CASES.items()}
     for index, label in enumerate("abcde"):
-        guide = driven("guide", worse if label == "e" else CASES)
-        make_run(
-            tmp_path / str(index), label, 0, guide + driven(label, {"a": 550.0 - index, "b": 0.0})
-        )
+        rewards = {"a": 550.0 - index, "b": 0.0}
+        run_of(tmp_path, label, rewards=rewards, guide=worse if label == "e" else CASES)
     rows = table(tmp_path)
     assert list(rows)[:3] == [("guide (a, b and 2 more)", ""), ("guide (e)", ""), ("a", "")]
     assert rows["e", ""]["guide"] == "guide (e)"
@@ -119,18 +106,16 @@ def guides_of_labels():
 def test_guides_are_told_apart_by_their_returns(guides, expected, last, tmp_path):
     for label, cases in zip("abc", guides, strict=False):
         returns = dict.fromkeys(cases, last if label == "c" else 1.0)
-        make_run(tmp_path / label, label, 0, driven("guide", cases) + driven(label, returns))
+        run_of(tmp_path, label, rewards=returns, guide=cases)
     found = [group.title for group in compare(read_runs([tmp_path])).guides]
     names = [f"guide ({labels})" if labels else "guide" for labels in expected]
     assert sorted(found) == names
 
 
 def test_guide_with_random_actions_has_an_interval_over_its_different_evaluations(tmp_path):
-    for index, (label, seed) in enumerate(
-        [("ppo", 0), ("ppo", 1), ("coil", 0), ("coil", 1), ("coil", 2)]
-    ):
-        guide = driven("guide", {case: reward + 10 * seed for case, reward in CASES.items()})
-        make_run(tmp_path / str(index), label, seed, guide + driven(label, CASES))
+    for label, seed in [("ppo", 0), ("ppo", 1), ("coil", 0), ("coil", 1), ("coil", 2)]:
+        guide = {case: reward + 10 * seed for case, reward in CASES.items()}
+        run_of(tmp_path, label, seed, guide=guide)
     guide = table(tmp_path)["guide", ""]
     assert guide["seeds"] == 3, "ppo has two of the three evaluations"
     assert guide["reward"] == pytest.approx(560)
@@ -159,29 +144,15 @@ def test_guide_with_random_actions_is_paired_with_the_policy_of_its_run(tmp_path
 
 def test_agents_and_guides_may_be_alone(tmp_path):
     make_run(tmp_path / "agents" / "0", "alone", 0, driven("alone", CASES), needs_guide=False)
-    guide = driven("guide", CASES)
-    rows = table(tmp_path / "agents", against="guide")
-    assert (
-        rows["alone", ""]["guide"],
-        rows["alone", ""]["better"],
-        rows["alone", ""]["seeds"],
-    ) == (None, None, 1)
-    make_run(tmp_path / "guides" / "0", "spline", 0, guide, needs_guide=None)
-    make_run(
-        tmp_path / "guides" / "1",
-        "zero",
-        0,
-        driven("guide", {"a": 1.0, "b": 2.0}),
-        needs_guide=None,
-    )
+    row = table(tmp_path / "agents", against="guide")["alone", ""]
+    assert (row["guide"], row["better"], row["seeds"]) == (None, None, 1)
+    for label, cases in {"spline": CASES, "zero": {"a": 1.0, "b": 2.0}}.items():
+        make_run(tmp_path / "guides" / label, label, 0, driven("guide", cases), needs_guide=None)
     assert list(table(tmp_path / "guides")) == [("guide (spline)", ""), ("guide (zero)", "")]
 
 
 def test_best_of_several_guides_is_the_reference(tmp_path):
-    good, bad = (
-        driven("guide spline", CASES),
-        driven("guide random", {case: -100.0 for case in CASES}),
-    )
+    good, bad = driven("guide spline", CASES), driven("guide random", {"a": -100.0, "b": -100.0})
     make_run(tmp_path / "multi", "multi", 0, bad + good + driven("multi", CASES))
     make_run(tmp_path / "other", "other", 0, good + driven("other", CASES))
     rows = table(tmp_path)
@@ -191,26 +162,18 @@ def test_best_of_several_guides_is_the_reference(tmp_path):
 
 def test_label_with_the_same_seed_twice_or_with_different_cases_is_an_error(tmp_path):
     for name in ("one", "two"):
-        make_run(
-            tmp_path / "same" / name, "coil", 7, driven("guide", CASES) + driven("coil", CASES)
-        )
-    with pytest.raises(UserError, match=r"one and .*two are both seed 7 of coil; remove one"):
+        run_of(tmp_path / "same" / name, "coil", 7)
+    with pytest.raises(UserError, match=r"coil7 and .*coil7 are both seed 7 of coil; remove one"):
         compare(read_runs([tmp_path / "same"]))
     for seed, case in enumerate("ab"):
-        make_run(
-            tmp_path / case, "coil", seed, driven("guide", {"a": 1.0}) + driven("coil", {case: 1.0})
-        )
-    with pytest.raises(
-        UserError, match=r"runs of coil were evaluated in different cases \(a, and b\)"
-    ):
-        compare(read_runs([tmp_path / "a", tmp_path / "b"]))
+        run_of(tmp_path / "other", "coil", seed, {case: 1.0}, {"a": 1.0})
+    with pytest.raises(UserError, match=r"runs of coil .* in different cases \(a, and b\)"):
+        compare(read_runs([tmp_path / "other"]))
 
 
 def test_labels_in_different_cases_are_not_compared(tmp_path):
     for label in "ab":
-        make_run(
-            tmp_path / label, label, 0, driven("guide", {label: 1.0}) + driven(label, {label: 1.0})
-        )
+        run_of(tmp_path, label, rewards={label: 1.0}, guide={label: 1.0})
     assert table(tmp_path, against="b")["a", ""]["better"] is None
     groups = groups_by_title(tmp_path)
     assert paired(groups["a"], groups["b"]) is None
@@ -237,9 +200,8 @@ def test_guide_is_paired_with_every_seed(sweep, tmp_path):
     assert paired(groups["coil"], groups["ppo"], "smoothness").difference.mean == pytest.approx(0.1)
     assert paired(groups["coil, zeroed"], groups["coil"], "lap_time") is None, "no completed lap"
     make_run(tmp_path / "other" / "9", "coil", 9, driven("coil", CASES))
-    assert paired(groups_by_title(tmp_path / "other")["coil"], groups["ppo"]) is None, (
-        "no common seed"
-    )
+    coil = groups_by_title(tmp_path / "other")["coil"]
+    assert paired(coil, groups["ppo"]) is None, "no common seed"
 
 
 def test_policy_whose_return_is_no_number_is_last_and_has_no_difference(tmp_path):

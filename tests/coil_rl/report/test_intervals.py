@@ -2,7 +2,7 @@ import math
 
 from matplotlib.figure import Figure
 
-from coil_rl.report.intervals import Interval, draw_intervals, draw_panel
+from coil_rl.report.intervals import Interval, draw_panel
 
 ROWS = [
     Interval("ppo", 660.0, 650.0, 670.0, [649.0, 660.0, 671.0], guide=630.0),
@@ -22,10 +22,3 @@ def test_panel_shows_the_given_values():
         "adjacent rows share the line of a guide"
     )
     assert any(math.isnan(x[0]) for x, _ in drawn), "no bar without an interval"
-
-
-def test_panels_share_their_rows(tmp_path):
-    draw_intervals(
-        {"one": ROWS, "other": ROWS[:2]}, tmp_path / "plot.png", measure="reward", title="Placebo"
-    )
-    assert (tmp_path / "plot.png").exists()

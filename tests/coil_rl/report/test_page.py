@@ -23,20 +23,10 @@ def cells(table):
 def test_section_has_a_table_of_drivers_and_one_of_cases(tmp_path):
     drivers, rewards = section(make_sweep(tmp_path / "sweep"), "ppo")
     titles, guide, ppo, coil, zeroed = cells(drivers)
-    assert titles[:8] == [
-        "driver",
-        "advice",
-        "seeds",
-        "cases",
-        "completed",
-        "seeds with a crash (95 %)",
-        "return (95 %)",
-        "95 % over cases",
-    ]
+    assert titles[:5] == ["driver", "advice", "seeds", "cases", "completed"]
+    assert titles[5:8] == ["seeds with a crash (95 %)", "return (95 %)", "95 % over cases"]
     assert guide[:7] == ["guide", "", "-", "2", "100%", "0 of 2 cases (0% to 84%)", "550.0"]
-    over_cases = coil.pop(7)
-    assert over_cases.partition(" to ")[1]
-    assert coil == [
+    assert coil[:7] == [
         "coil",
         "",
         "3",
@@ -44,20 +34,12 @@ def test_section_has_a_table_of_drivers_and_one_of_cases(tmp_path):
         "100%",
         "0 of 3 (0% to 71%)",
         "571.0 (568.5 to 573.5)",
-        "-20.0 (-20.0 to -20.0)",
-        "< 0.001",
-        "0%",
-        "50.00",
-        "0.200",
-        "0.30",
-        "yes",
     ]
-    assert (ppo[8:11], ppo[-1], zeroed[:2], zeroed[-1]) == (
-        ["-", "-", "-"],
-        "no",
-        ["coil", "zeroed"],
-        "-",
-    )
+    assert " to " in coil[7]
+    assert coil[8:11] == ["-20.0 (-20.0 to -20.0)", "< 0.001", "0%"]
+    assert coil[11:] == ["50.00", "0.200", "0.30", "yes"]
+    assert ppo[8:11] == ["-", "-", "-"]
+    assert (ppo[-1], zeroed[:2], zeroed[-1]) == ("no", ["coil", "zeroed"], "-")
     assert cells(rewards)[0] == ["mean reward", "a", "b"]
     assert cells(rewards)[-1] == ["coil, zeroed", "-100.0 (0% completed)", "-201.0 (0% completed)"]
 
@@ -76,46 +58,30 @@ def test_policies_without_a_common_seed_are_said(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("prefix", "guide", "shown"),
+    ("prefix", "guide", "title", "shown"),
     [
-        (
-            "reward_",
-            (2.0, -1.0),
-            ["term of the reward left right", "guide 2.00 -1.00", "coil 0.62 -0.12"],
-        ),
-        (
-            "per_step_",
-            (0.25, math.nan),
-            ["reward of a step left right", "guide 0.250 -", "coil 0.625 -0.125"],
-        ),
+        ("reward_", (2.0, -1.0), "term of the reward", ["guide 2.00 -1.00", "coil 0.62 -0.12"]),
+        ("per_step_", (0.25, math.nan), "reward of a step", ["guide 0.250 -", "coil 0.625 -0.125"]),
     ],
 )
-def test_parts_of_the_reward_have_their_own_table(prefix, guide, shown, tmp_path):
+def test_parts_of_the_reward_have_their_own_table(prefix, guide, title, shown, tmp_path):
     names = [f"{prefix}left", f"{prefix}right"]
     for seed, agent in enumerate([(0.5, -0.125), (0.75, -0.125)]):
         rows = driven("guide", {"a": 1.0}, **dict(zip(names, guide, strict=True)))
         rows += driven("coil", {"a": 2.0}, **dict(zip(names, agent, strict=True)))
         make_run(tmp_path / f"run_{seed}", "coil", seed, rows)
-    assert [" ".join(row) for row in cells(section(tmp_path)[1])] == shown
+    found = [" ".join(row) for row in cells(section(tmp_path)[1])]
+    assert found == [f"{title} left right", *shown]
 
 
 def test_returns_of_trained_guides_are_shown_before_and_after(tmp_path):
     for seed, label in enumerate(["dynamic", "dynamic", "coil"]):
-        run = make_run(
-            tmp_path / str(seed),
-            label,
-            seed,
-            driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0}),
-        )
+        rows = driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0})
+        run = make_run(tmp_path / str(seed), label, seed, rows)
         if label == "dynamic":
-            returns = [10.0 + seed, math.nan, 20.0 + seed, 40.0 + seed]
-            write_csv(
-                [
-                    {"frames": n, "guide/spline": value, "guide/calls": n}
-                    for n, value in enumerate(returns)
-                ],
-                run / "metrics.csv",
-            )
+            returns = enumerate([10.0 + seed, math.nan, 20.0 + seed, 40.0 + seed])
+            lines = [{"frames": n, "guide/spline": x, "guide/calls": n} for n, x in returns]
+            write_csv(lines, run / "metrics.csv")
     (table,) = page.guide_training(read_runs([tmp_path]))
     assert cells(table)[1:] == [["dynamic", "2", "10.5 to 40.5"]]
     assert page.guide_training(read_runs([tmp_path / "2"])) == []
@@ -126,15 +92,9 @@ def test_training_is_summarised_by_the_evaluation_curve(tmp_path):
     curves = {"late": [0.0, "nan", 100.0, 300.0], "early": [200.0, 250.0, 400.0, 300.0]}
     for label, returns in curves.items():
         folder = make_run(tmp_path / label, label, 0, rows, guide=200.0)
-        lines = [
-            {
-                "frames": 1000 * n,
-                "evaluation/return": x,
-                "selection/return": x if x == "nan" else -n,
-            }
-            for n, x in enumerate(returns)
-        ]
-        write_csv(lines, folder / "metrics.csv")
+        lines = ["frames,evaluation/return,selection/return"]
+        lines += [f"{1000 * n},{x},{x if x == 'nan' else -n}" for n, x in enumerate(returns)]
+        (folder / "metrics.csv").write_text("\n".join(lines))
     (tmp_path / "late" / "training_time.json").write_text('{"seconds": 12.4}')
     make_run(tmp_path / "never", "late", 1, rows, guide=1000.0)
     (table,) = page.training(read_runs([tmp_path / "late", tmp_path / "early"]))
@@ -155,9 +115,7 @@ def test_runs_without_a_test_at_their_end_are_counted_apart():
     assert tested.endswith(
         "best in a test at their end, whose steps are among their frames: last 2, guide 1."
     )
-    assert untested == (
-        "Of the runs of any 2 had no frames left for a test and handed over their last policy."
-    )
+    assert untested.startswith("Of the runs of any 2 had no frames left for a test")
     assert sentences(UNTESTED, UNTESTED) == [untested]
     assert sentences("last", "last", "guide", "") == [tested]
 

@@ -24,15 +24,10 @@ def test_every_run_of_a_folder_is_read(sweep):
         ("coil", "zeroed", "deterministic"),
     ]
     agent = drives.get_group(("coil", "", "deterministic"))
-    assert agent[["case", "reward", "smoothness"]].to_numpy().tolist() == [
-        ["a", 521, 0.2],
-        ["b", 621, 0.2],
-    ]
-    assert (runs[1].guide_returns, runs[1].curve[0]["frames"], len(runs[1].curve)) == (
-        {"guide": 300},
-        1000,
-        20,
-    )
+    columns = agent[["case", "reward", "smoothness"]]
+    assert columns.to_numpy().tolist() == [["a", 521, 0.2], ["b", 621, 0.2]]
+    assert runs[1].guide_returns == {"guide": 300}
+    assert (runs[1].curve[0]["frames"], len(runs[1].curve)) == (1000, 20)
 
 
 def test_numbers_keep_every_digit(tmp_path):
@@ -45,11 +40,8 @@ def test_runs_are_found_once_at_any_depth(sweep):
     (sweep / "0_coil" / ".hydra").mkdir()
     (sweep / "0_coil" / ".hydra" / "config.yaml").write_text("seed: 0")
     make_run(sweep / "0_coil" / "proxies" / "spline", "proxy", 0, None)
-    assert (
-        len(read_runs([sweep.parent]))
-        == len(read_runs([sweep, sweep / "0_coil", sweep.parent]))
-        == 8
-    )
+    assert len(read_runs([sweep.parent])) == 8
+    assert len(read_runs([sweep, sweep / "0_coil", sweep.parent])) == 8
     assert [run.label for run in read_runs([sweep / "3_ppo", sweep / "0_coil"])] == ["ppo", "coil"]
 
 
@@ -61,10 +53,8 @@ def test_guide_without_agent_has_no_curve(tmp_path):
     assert (list(found.curve), found.guide_returns, found.needs_guide) == ([], {}, None)
 
 
-ROW = (
-    "driver,advice,actions,case,reward,lap_time,smoothness,completed,crashed,clearance\n"
-    "guide,,sampled,a,"
-)
+HEAD = "driver,advice,actions,case,reward,lap_time,smoothness,completed,crashed,clearance\n"
+DRIVERS = "\n".join(f"guide {number},,deterministic,a,1,1,1,1,1,1" for number in range(201))
 
 
 @pytest.mark.parametrize(
@@ -73,40 +63,31 @@ ROW = (
         (
             "evaluation.csv",
             "",
-            r"is damaged \(No columns.*\); remove the file and write it again by coil-train",
+            r"\(No columns.*\); remove the file and write it again by coil-train",
         ),
-        ("evaluation.csv", ROW.splitlines()[0] + "\n", r"is damaged \(0 rows, not 1 to 50,000\)"),
-        (
-            "evaluation.csv",
-            ROW.splitlines()[0]
-            + "".join(f"\nguide {n},,deterministic,a,1,1,1,1,1,1" for n in range(201)),
-            r"is damaged \(201 drivers, not 1 to 200\)",
-        ),
+        ("evaluation.csv", HEAD, r"is damaged \(0 rows, not 1 to 50,000\)"),
+        ("evaluation.csv", HEAD + DRIVERS, r"is damaged \(201 drivers, not 1 to 200\)"),
         ("evaluation.csv", "driver,actions\nguide,sampled\n", r"is damaged \(it lacks advice\)"),
         (
             "evaluation.csv",
-            ROW.replace("lap_time,", "") + "1,1,1,1,1\n",
-            r"is damaged \(no column lap_time\)",
+            HEAD.replace("lap_", "") + "guide,,sampled,a,1,1,1,1,1,1",
+            "no column lap_",
         ),
-        ("evaluation.csv", ROW + "much,1,1,1,1,1\n", "could not convert .* 'much'"),
-        ("evaluation.csv", ROW + "1,1,1,1,1,1,1", "more values than columns"),
+        (
+            "evaluation.csv",
+            HEAD + "guide,,sampled,a,much,1,1,1,1,1\n",
+            "could not convert .* 'much'",
+        ),
+        ("evaluation.csv", HEAD + "guide,,sampled,a,1,1,1,1,1,1,1", "more values than columns"),
         ("evaluation.csv", b"\xff\xfe", "codec can't decode"),
         (
             "metrics.csv",
             "frames,evaluation/return\n1,2\n3,\n",
-            r"metrics.csv is damaged .*; put the file back",
+            "metrics.csv is damaged .*; put the file back",
         ),
-        (
-            "metrics.csv",
-            "1,2\n3,4\n",
-            r"metrics.csv is damaged \(not every row has its number of frames\)",
-        ),
+        ("metrics.csv", "1,2\n3,4\n", r"\(not every row has its number of frames\)"),
         ("guide_return.json", "[1", "guide_return.json is damaged"),
-        (
-            "config.yaml",
-            "seed: 0\n",
-            r"no valid label, seed and method.needs_guide \(Missing key label\)",
-        ),
+        ("config.yaml", "seed: 0\n", r"no valid label, seed and .* \(Missing key label\)"),
         ("config.yaml", "- 1\n", r"\(a list\); restore the file"),
         ("config.yaml", "seed: [\n", "remove the run from the folder"),
     ],
