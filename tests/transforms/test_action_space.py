@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
+from any_env import AnyEnv
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.nn.functional import one_hot
@@ -10,13 +10,12 @@ from torchrl.data import (
     Binary,
     Bounded,
     Categorical,
-    Composite,
     MultiCategorical,
     MultiOneHot,
     OneHot,
     Unbounded,
 )
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 
 from coil_rl.guides import FollowAdvice, RandomGuide
 from coil_rl.testing import check_env
@@ -31,53 +30,23 @@ from coil_rl.transforms import (
 from coil_rl.transforms.action_space import ActionSpace, random_action
 
 
-class Copies(EnvBase):
-    """B rows, or B rows of agents; the observation is a counter of the row."""
+class Copies(AnyEnv):
+    """Rows, or rows of agents, whose observation is their number; keeps the action it is given."""
 
-    def __init__(self, action, agents=0, dtype=torch.float32):
-        batch = action.shape[:1]
-        super().__init__(batch_size=batch)
-        lead = (*batch, agents) if agents else batch
-        self.path = ("agents",) if agents else ()
-        group = Composite(observation=Unbounded((*lead, 2), dtype=dtype), shape=lead)
-        flags = Binary(shape=(*batch, 1), dtype=torch.bool)
-        reward = Unbounded((*lead, 1), dtype=dtype)
-        if agents:
-            self.observation_spec = Composite(agents=group, shape=batch)
-            self.full_action_spec = Composite(
-                agents=Composite(action=action, shape=lead), shape=batch
-            )
-            self.full_reward_spec = Composite(
-                agents=Composite(reward=reward, shape=lead), shape=batch
-            )
-        else:
-            self.observation_spec, self.action_spec, self.reward_spec = group, action, reward
-        self.full_done_spec = Composite(
-            done=flags, terminated=flags.clone(), truncated=flags.clone(), shape=batch
-        )
-        self.received = None
+    def __init__(self, action, agents=False, dtype=torch.float32):
+        key, shape = (("agents", "observation"), (3, 2)) if agents else ("observation", (2,))
+        observation = {key: Unbounded(shape, dtype=dtype)}
+        super().__init__(action.shape[0], action[0], observation, dtype, agents)
 
-    def _data(self, **more):
-        data = TensorDict(
-            {**self.full_done_spec.zero(), **self.observation_spec.zero()}, self.batch_size
-        )
-        observation = data[(*self.path, "observation")]
-        observation += torch.arange(float(observation[..., 0].numel())).view(
-            *observation.shape[:-1], 1
-        )
-        for key, value in more.items():
-            data.set((*self.path, key), value)
-        return data
-
-    def _reset(self, tensordict=None, **_):
-        return self._data()
+    def observe(self):
+        ((key, spec),) = self.observation_spec.items(True, True)
+        numbers = torch.arange(spec.shape[:-1].numel(), dtype=spec.dtype)
+        return {key: numbers.view(*spec.shape[:-1], 1).expand(spec.shape)}
 
     def _step(self, tensordict):
-        self.received = tensordict[(*self.path, "action")]
-        return self._data(reward=self.full_reward_spec[(*self.path, "reward")].zero())
-
-    def _set_seed(self, seed):
-        pass
+        self.received = tensordict[self.key]
+        reward = self.full_reward_spec[self.reward].zero()
+        return self._reset().set(self.reward, reward)
 
 
 def guided(action, give, **options):
@@ -117,10 +86,7 @@ def test_discrete_advice_is_one_hot_in_whatever_form_a_guide_gives_it(spec, form
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_numbers_have_the_bounds_and_the_dtype_of_the_action(dtype):
-    low, high = (
-        torch.tensor([[-1.0, 0.0]] * 4, dtype=dtype),
-        torch.tensor([[1.0, 2.0]] * 4, dtype=dtype),
-    )
+    low, high = torch.tensor([[[-1.0, 0.0]], [[1.0, 2.0]]], dtype=dtype).expand(2, 4, 2)
     for network in (nn.Linear(2, 2), nn.Linear(2, 2).double()):
         nn.init.ones_(network.weight)
         nn.init.constant_(network.bias, -2)
@@ -128,51 +94,30 @@ def test_numbers_have_the_bounds_and_the_dtype_of_the_action(dtype):
         check_env(env, steps=2)
         expected = torch.tensor([[-1, 0], [0, 0], [1, 2], [1, 2]], dtype=dtype)
         assert torch.equal(env.reset()["guide_action"][:, 0], expected)
+        space = env.observation_spec["guide_action"].space
+        assert torch.equal(space.low[:, 0], low)
+        assert torch.equal(space.high[:, 0], high)
 
 
 @pytest.mark.parametrize(
     ("spec", "action", "message"),
     [
-        (
-            Unbounded((4, 1)),
-            torch.zeros(4),
-            r"the action of guide 'give' has the shape \[4\], but must have \[4, 1\]",
-        ),
-        (
-            Unbounded((4, 1)),
-            torch.full((4, 1), torch.nan),
-            "guide 'give' holds a number that is not finite",
-        ),
-        (
-            Categorical(3, (4,)),
-            torch.zeros(4, 2),
-            r"has the shape \[4, 2\], but must have \[4, 3\]",
-        ),
+        (Unbounded((4, 1)), torch.zeros(4), r"guide 'give' has the shape \[4\], .* have \[4, 1\]"),
+        (Unbounded((4, 1)), torch.full((4, 1), torch.nan), "a number that is not finite"),
+        (Categorical(3, (4,)), torch.zeros(4, 2), r"shape \[4, 2\], but must have \[4, 3\]"),
         (
             Categorical(3, (4,)),
             torch.tensor([0, 1, 2, 3]),
-            "'give' is neither an index below 3 nor a one-hot vector",
+            "neither an index below 3 nor a one-hot",
         ),
-        (
-            OneHot(3, (4, 3)),
-            torch.full((4, 3), 2.5),
-            "is neither an index below 3 nor a one-hot vector",
-        ),
-        (
-            Categorical(3, (4,)),
-            torch.zeros(4, 3),
-            "is no one-hot vector: it must have exactly one 1 for each choice",
-        ),
-        (
-            MultiCategorical([2, 2], (4, 2)),
-            torch.tensor([1.0, 0.0, 1.0, 1.0]).expand(4, 4),
-            "is no one-hot vector: it must have exactly one 1 for each choice",
-        ),
-        (Unbounded((4,)), torch.zeros(4), "advice needs a vector of real numbers or choices"),
+        (OneHot(3, (4, 3)), torch.full((4, 3), 2.5), "neither an index below 3 nor a one-hot"),
+        (Categorical(3, (4,)), torch.zeros(4, 3), "must have exactly one 1 for each choice"),
+        (MultiCategorical([2, 2], (4, 2)), torch.tensor([[1.0, 0, 1, 1]] * 4), "exactly one 1"),
+        (Unbounded((4,)), torch.zeros(4), "needs a vector of real numbers or choices"),
         (
             Bounded(0, 9, (4, 1), dtype=torch.int64),
             torch.zeros(4),
-            "advice needs a vector of real numbers or choices",
+            "needs a vector of real numbers",
         ),
     ],
 )
@@ -194,14 +139,10 @@ def test_advice_of_several_agents(number):
         out_keys=[("agents", "action")],
     )
     guides = GuideActions({"count": guide}, ["agents", "action"], ["agents", "advice"])
-    transforms = (
-        [ResidualAction(0.0, **KEYS), MixedAction(1.0, **KEYS)]
-        if number
-        else [Takeover(0.0, **KEYS)]
-    )
-    env = TransformedEnv(
-        Copies(spec, 3), Compose(guides, *transforms, RewardCoupling(1.0, **KEYS))
-    ).train()
+    mixed = [ResidualAction(0.0, **KEYS), MixedAction(1.0, **KEYS)]
+    transforms = mixed if number else [Takeover(0.0, **KEYS)]
+    agents = Copies(spec, agents=True)
+    env = TransformedEnv(agents, Compose(guides, *transforms, RewardCoupling(1.0, **KEYS))).train()
     check_env(env, steps=3)
     data = env.reset()
     expected = torch.arange(12).view(4, 3).clamp(max=4)
@@ -226,15 +167,12 @@ def test_removed_advice_is_the_last_action_of_several_choices():
     assert after["guide_action"][0, 0].tolist() == [0, 0, 1, 0, 1]
 
 
+UNLIMITED = torch.full((2, 1), torch.inf)
 RANGES = {
     "unit": (Bounded(-1, 1, (2, 1)), None, "from [-1.0] to [1.0]"),
     "wide": (Bounded(20, 80, (2, 1)), None, "from [20.0] to [80.0]"),
     "two": (Bounded(-1, 1, (2, 2)), None, "from [-1.0, -1.0] to [1.0, 1.0]"),
-    "no upper bound": (
-        Bounded(torch.full((2, 1), -1.0), torch.full((2, 1), torch.inf)),
-        None,
-        "from [-1.0] to [inf]",
-    ),
+    "no upper bound": (Bounded(-torch.ones(2, 1), UNLIMITED), None, "from [-1.0] to [inf]"),
     "free": (Unbounded((2, 1)), None, "from [-inf] to [inf]"),
     "choices": (Categorical(3, (2,)), None, "from [0.0] to [2.0] in whole numbers"),
     "more choices": (Categorical(4, (2,)), None, "from [0.0] to [3.0] in whole numbers"),
@@ -251,16 +189,12 @@ def test_actions_with_other_numbers_have_other_ranges(name):
     assert [each for each in ranges if ranges[name].same_as(ranges[each])] == [name]
 
 
-def test_ranges_are_told_apart_in_any_unit_and_equal_up_to_rounding():
+def test_ranges_are_equal_up_to_rounding_in_any_unit_and_in_any_encoding():
     unit = ActionSpace(Bounded(-1e-9, 1e-9, (2, 1)), 1).range
     assert not unit.same_as(ActionSpace(Bounded(0.0, 1e-9, (2, 1)), 1).range)
     assert unit.same_as(ActionSpace(Bounded(-1e-9, 1e-9 * (1 + 1e-7), (2, 1)), 1).range)
-
-
-def test_one_hot_choices_are_those_of_an_index():
-    assert ActionSpace(OneHot(3, (2, 3)), 1).range.same_as(
-        ActionSpace(Categorical(3, (2,)), 1).range
-    )
+    index, one_hot = Categorical(3, (2,)), OneHot(3, (2, 3))
+    assert ActionSpace(one_hot, 1).range.same_as(ActionSpace(index, 1).range)
 
 
 @pytest.mark.parametrize(

@@ -60,10 +60,7 @@ CASES = {
     "advice": (lambda: [], ["guide_action"]),
     "residual of a memory": (lambda: [ResidualAction(0.5), LastAction(2)], ["last_action"]),
     "adaptive mixing": (lambda: [AdaptiveMixedAction(warm_up=0)], ["agent_weight"]),
-    "jump start, dropout": (
-        lambda: [AdviceDropout(), JumpStart(3)],
-        ["advice_given", "guide_action"],
-    ),
+    "dropout": (lambda: [AdviceDropout(), JumpStart(3)], ["advice_given", "guide_action"]),
     "gradual, scaled": (lambda: [ScaledAdvice(0.5), GradualResidual(0.5)], ["guide_action"]),
     "delayed": (lambda: [DelayedAdvice(2)], ["guide_action"]),
     "removed": (lambda: [RemovedAdvice()], ["guide_action"]),

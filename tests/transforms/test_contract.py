@@ -6,7 +6,7 @@ import pytest
 import torch
 import worlds
 from tensordict import TensorDict
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, PendulumEnv, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import ConstantGuide, RandomGuide, SplineGuide, ZeroGuide
@@ -38,7 +38,6 @@ TRANSFORMS = {
     "biased": BiasedAdvice,
     "dropout": AdviceDropout,
     "delayed": lambda: DelayedAdvice(2),
-    "gradual residual": lambda: GradualResidual(0.2, probability=0.5),
     "jump start": lambda: JumpStart(4, random=True),
     "noisy": NoisyAdvice,
     "partial": lambda: PartialAdvice("left"),
@@ -51,7 +50,8 @@ TRANSFORMS = {
 }
 FOR_NUMBERS = {
     "adaptive mixing": lambda: AdaptiveMixedAction(warm_up=12),
-    "gradual residual": TRANSFORMS.pop("gradual residual"),
+    "gradual residual": lambda: GradualResidual(0.2, probability=0.5),
+    "residual": ResidualAction,
 }
 
 
@@ -67,16 +67,14 @@ def test_specs_hold_in_envs_with_continuous_actions(name):
     for world in (worlds.cones, worlds.pendulum):
         check_env(world(FOR_NUMBERS[name]()).train(), steps=4)
     with pytest.raises(ValueError, match="needs continuous actions, but this env has 2 discrete"):
-        worlds.carts(FOR_NUMBERS[name]()).observation_spec  # noqa: B018
+        worlds.carts(FOR_NUMBERS[name]()).train().reset()
 
 
 def test_specs_hold_with_several_guides_and_another_key():
     key, classes = ("advice", "middle"), (NoisyAdvice, ShuffledAdvice, DelayedAdvice, RemovedAdvice)
     guides = GuideActions({"constant": ConstantGuide(0.5), "spline": SplineGuide()}, out_key=key)
-    env = TransformedEnv(
-        ConeTrackEnv(shipped_tracks("test"), 6),
-        Compose(guides, *(make(key=key) for make in classes)),
-    )
+    degraded = Compose(guides, *(make(key=key) for make in classes))
+    env = TransformedEnv(ConeTrackEnv(shipped_tracks("test"), 6), degraded)
     check_env(env)
     assert env.reset()[key].eq(0).all()
 
@@ -113,9 +111,8 @@ def test_specs_hold_with_discrete_actions(transforms):
 def test_draws_continue_from_a_state_dict(transform):
     def env(seed):
         guide = GuideActions({"spline": SplineGuide()})
-        env = TransformedEnv(
-            ConeTrackEnv(shipped_tracks("test")[:1], 6), Compose(guide, transform(seed=seed))
-        ).train()
+        env = ConeTrackEnv(shipped_tracks("test")[:1], 6)
+        env = TransformedEnv(env, Compose(guide, transform(seed=seed))).train()
         set_progress(env, 0.0)
         return env
 
@@ -138,56 +135,26 @@ def degraded(transform):
     [
         (lambda: Guides({}), "at least one guide"),
         (lambda: Guides({"half": ZeroGuide()}), "'half' cannot be the name of a guide"),
-        (
-            lambda: Guides({"a": ZeroGuide(out_key="b")}),
-            r"'a' must write 'action'; it writes \['b'\]",
-        ),
+        (lambda: Guides({"a": ZeroGuide(out_key="b")}), r"must write 'action'; it writes \['b'\]"),
         (lambda: Guides({"zero": ZeroGuide()}, trainable=True), "guide 'zero' has no parameters"),
         (
-            lambda: worlds.cones(RewardCoupling(0.5, guide=1)).rollout(1),
-            "RewardCoupling reads row 1 of guide_action, but there is advice of 1 guides",
+            lambda: worlds.cones(RewardCoupling(1, guide=1)).rollout(1),
+            "reads row 1 of guide_action",
         ),
-        (
-            lambda: worlds.carts(ResidualAction()).rollout(1),
-            "needs continuous actions, but this env has 2 discrete",
-        ),
-        (
-            lambda: worlds.carts(DiscreteActions(5)).reset(),
-            "makes choices of one number, but the action of this env is choices already",
-        ),
-        (
-            lambda: AdaptiveMixedAction(low=0.4),
-            "low=0.4, warm_up_high=0.3 and high=1.0 must be in this order",
-        ),
-        (
-            lambda: AdaptiveMixedAction(certain=0.2),
-            "certain=0.2 at least 0 and less than uncertain=0.15",
-        ),
+        (lambda: worlds.carts(DiscreteActions(5)).reset(), "the action of this env is choices"),
+        (lambda: AdaptiveMixedAction(low=0.4), "low=0.4, .* must be in this order"),
+        (lambda: AdaptiveMixedAction(certain=0.2), "certain=0.2 .* less than uncertain=0.15"),
         (lambda: DiscreteActions(1), "choices=1 must be at least 2"),
         (lambda: DiscreteActions([0.5, 0.5]), "must be at least two increasing numbers"),
         (lambda: DiscreteActions([0.0, math.inf]), "must be finite"),
-        (
-            lambda: worlds.cones(DiscreteActions([0.0, 1.5])).reset(),
-            r"choices=\[0.0, 1.5\] must lie between the action's bounds -1.0 and 1.0",
-        ),
         (lambda: RandomAdvice(1.0, 0.5), r"low=1\.0 must be less than high=0\.5"),
         (lambda: BiasedAdvice(math.nan), "offset=nan must be a finite number"),
         (lambda: ScaledAdvice(math.inf), "gain=inf must be a finite number"),
         (lambda: degraded(DelayedAdvice()), "DelayedAdvice needs the previous steps"),
         (lambda: degraded(RemovedAdvice()), "RemovedAdvice needs the previous steps"),
-        (
-            lambda: worlds.cones(ShuffledAdvice(), cars=1).reset(),
-            "but the batch is one row; use more",
-        ),
-        (lambda: worlds.pendulum(ShuffledAdvice()).reset(), "but the batch is one row; use more"),
-        (
-            lambda: (
-                TransformedEnv(
-                    ConeTrackEnv(shipped_tracks("test"), 1), BiasedAdvice()
-                ).observation_spec
-            ),
-            "BiasedAdvice changes 'guide_action', but",
-        ),
+        (lambda: worlds.cones(ShuffledAdvice(), cars=1).reset(), "the batch is one row; use more"),
+        (lambda: worlds.pendulum(ShuffledAdvice()).reset(), "the batch is one row; use more"),
+        (lambda: check_env(TransformedEnv(PendulumEnv(), BiasedAdvice())), "behind GuideActions"),
     ],
 )
 def test_invalid_arguments_and_envs_are_refused(make, message):

@@ -47,9 +47,8 @@ class Counting(TensorDictModule):
 
 
 def cone_env(*degraders, guide=None):
-    return TransformedEnv(
-        WORLD, Compose(GuideActions({"guide": guide or SplineGuide()}), *degraders)
-    )
+    guides = GuideActions({"guide": guide or SplineGuide()})
+    return TransformedEnv(WORLD, Compose(guides, *degraders))
 
 
 def counting_env(*degraders):
@@ -142,11 +141,11 @@ def test_advice_of_choices_that_keeps_its_meaning_is_said_once(degrader, name):
     [
         lambda: ScaledAdvice(-1),
         lambda: ScaledAdvice(0),
-        lambda: DelayedAdvice(2),
-        lambda: NoisyAdvice(),
-        lambda: RandomAdvice(),
-        lambda: ShuffledAdvice(),
-        lambda: RemovedAdvice(),
+        DelayedAdvice,
+        NoisyAdvice,
+        RandomAdvice,
+        ShuffledAdvice,
+        RemovedAdvice,
     ],
 )
 def test_nothing_is_said_where_choices_are_degraded(make):
@@ -215,9 +214,8 @@ def test_advice_is_delayed_by_k_steps_after_the_first_advice():
     delayed = rollout(DelayedAdvice(3))
     assert delayed[0].tolist() == [0, 0, 0, 0, 1, 2, 3, 4]
     assert delayed[4].tolist() == [40, 40, 40, 40, 41, 42, 43, 44]
-    assert torch.equal(
-        rollout(DelayedAdvice(1), DelayedAdvice(2, memory_key="delayed_again")), delayed
-    )
+    twice = rollout(DelayedAdvice(1), DelayedAdvice(2, memory_key="delayed_again"))
+    assert torch.equal(twice, delayed)
     assert torch.equal(rollout(DelayedAdvice(0)), rollout())
 
 
@@ -263,11 +261,8 @@ def test_reset_and_stored_rows_are_shuffled_among_themselves():
     after = reset_rows(env, steps(env, env.reset(), 1), *range(CARS))
     assert sorted(hundredths(after).tolist()) == [2, 12, 22, 32, 42, 52]
     stored = TensorDict({"guide_action": torch.arange(24.0).view(2, 3, 2, 2)}, [2, 3])
-    shuffled = ShuffledAdvice()(stored.clone())
-    before, after = (
-        [row.flatten().tolist() for row in td["guide_action"].flatten(0, 1)]
-        for td in (stored, shuffled)
-    )
+    before = stored["guide_action"].view(6, 4).tolist()
+    after = ShuffledAdvice()(stored)["guide_action"].view(6, 4).tolist()
     assert sorted(before) == sorted(after)
     assert all(one != other for one, other in zip(before, after, strict=True))
 
@@ -287,12 +282,3 @@ def test_removed_advice_is_the_action_that_the_agent_chose_where_actions_are_lat
     data = env.rollout(5, lambda td: td.set("action", torch.rand(CARS, 1)))
     assert torch.equal(data["next", "guide_action"].squeeze(2), data["action"])
     assert not torch.equal(data["next", "steering"][:, 1:], data["action"][:, 1:])
-
-
-@pytest.mark.parametrize("categorical", [True, False])
-def test_previous_discrete_action_is_one_hot(categorical):
-    env = worlds.carts(RemovedAdvice(), categorical=categorical)
-    start = env.reset()
-    assert start["guide_action"].eq(0).all()
-    start["action"] = torch.tensor([0, 1]) if categorical else torch.eye(2, dtype=torch.int64)
-    assert torch.equal(env.step(start)["next", "guide_action"].squeeze(1), torch.eye(2))

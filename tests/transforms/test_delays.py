@@ -50,14 +50,10 @@ class Counter(EnvBase):
         self.count = torch.zeros(3, 1)
 
     def _shown(self, executed):
-        inner = TensorDict({"count": self.count.long()}, [3])
-        entries = {
-            "observation": self.count.expand(3, 2).clone(),
-            "inner": inner,
-            "info": TensorDict({"step": self.count.clone()}, [3]),
-            "executed": executed,
-        }
-        return TensorDict(entries, [3])
+        shown = TensorDict({"observation": self.count.expand(3, 2).clone()}, [3])
+        shown["inner", "count"] = self.count.long()
+        shown["info", "step"] = self.count.clone()
+        return shown.set("executed", executed)
 
     def _reset(self, tensordict=None, **_):
         mask = tensordict["_reset"] if tensordict is not None and "_reset" in tensordict else True
@@ -109,13 +105,11 @@ def test_actions_take_effect_after_the_lag_and_the_first_one_until_then(kind):
     data = driven(env)
     lags = set()
     for row in range(3):
-        begin = 0
         for step in range(24):
-            if data["info", "step"][row, step] == 0:
-                begin = step
             lag = int(data["late_actions", "lag"][row, step])
             lags.add(lag)
-            given = data["action"][row, max(begin, step - lag)]
+            of_episode = int(data["info", "step"][row, step])
+            given = data["action"][row, step - min(lag, of_episode)]
             assert torch.equal(data["next", "executed"][row, step], given)
     assert lags == {0, 1, 2, 3}
 
@@ -194,12 +188,13 @@ def test_a_guide_sees_what_comes_before_it_in_the_chain():
 
 
 def test_noise_has_its_standard_deviation_and_stays_within_the_bounds():
-    cars = ConeTrackEnv(shipped_tracks("test"), 64, assignment="cyclic")
-    plain = worlds.drive(cars, 8)[0]
-    cars = ConeTrackEnv(shipped_tracks("test"), 64, assignment="cyclic")
-    noisy = worlds.drive(TransformedEnv(cars, ObservationNoise(0.1)), 8)[0]
-    values = torch.stack([step["observation"] for step in plain])
-    noise = torch.stack([step["observation"] for step in noisy]) - values
+    def seen(*transforms):
+        cars = ConeTrackEnv(shipped_tracks("test"), 64, assignment="cyclic")
+        steps, _ = worlds.drive(TransformedEnv(cars, Compose(*transforms)), 8)
+        return torch.stack([step["observation"] for step in steps])
+
+    values = seen()
+    noise = seen(ObservationNoise(0.1)) - values
     assert abs(float(noise[values.abs() < 0.5].std()) - 0.1) < 0.003
     assert float((values + noise).abs().max()) <= 1
 
@@ -245,20 +240,16 @@ def test_noise_stays_within_the_bounds_of_a_gymnasium_env(lag):
 
 
 def test_noise_takes_no_bounds_for_those_of_a_changed_entry():
-    scaled = ObservationNorm(0.0, 100.0, in_keys=["x"])
-    env = TransformedEnv(
-        GymnasiumEnv(Ramp, 64, max_steps=20), Compose(scaled, ObservationNoise(0.5, ["x"]))
-    )
+    changed = Compose(ObservationNorm(0.0, 100.0, in_keys=["x"]), ObservationNoise(0.5, ["x"]))
+    env = TransformedEnv(GymnasiumEnv(Ramp, 64, max_steps=20), changed)
     assert float(env.reset()["x"].min()) < -1
 
 
 @pytest.mark.parametrize("key", ["choice", "pair", "flags"])
 def test_noise_on_choices_is_refused(key):
     env = TransformedEnv(GymnasiumEnv(Ramp, max_steps=20), ObservationNoise(0.5, [key]))
-    with pytest.raises(
-        ValueError, match=f"has '{key}', but the env writes these real numbers: 'x'"
-    ):
-        env.observation_spec  # noqa: B018  made of the transforms
+    with pytest.raises(ValueError, match=f"has '{key}', but .* these real numbers: 'x'"):
+        env.reset()
 
 
 @pytest.mark.parametrize(
@@ -270,24 +261,12 @@ def test_noise_on_choices_is_refused(key):
         (lambda: ObservationDelay(0, 0.5), "max_lag=0.5 must be a valid integer"),
         (lambda: ObservationNoise(0.1, []), "in_keys is empty"),
         (
-            lambda: TransformedEnv(Counter(), ObservationDelay(0, 1, ["scan"])).observation_spec,
-            "in_keys has 'scan', but the env writes these numbers: 'observation'",
+            lambda: TransformedEnv(Counter(), ObservationDelay(0, 1, ["scan"])).reset(),
+            "has 'scan', but the env writes these numbers: 'observation'",
         ),
         (
-            lambda: (
-                TransformedEnv(
-                    Counter(), ObservationNoise(0.1, [("inner", "count")])
-                ).observation_spec
-            ),
-            r"in_keys has \('inner', 'count'\), but the env writes these real numbers",
-        ),
-        (
-            lambda: (
-                TransformedEnv(
-                    Counter(), Compose(ActionDelay(0, 1), ActionDelay(0, 1))
-                ).observation_spec
-            ),
-            "keeps the past in 'late_actions', which exists already; give each delay a memory_key",
+            lambda: TransformedEnv(Counter(), Compose(ActionDelay(), ActionDelay())).reset(),
+            "'late_actions', which exists already; give each delay a memory_key",
         ),
         (lambda: ActionDelay()(TensorDict()), "ActionDelay needs the previous steps"),
     ],

@@ -1,14 +1,11 @@
 import pytest
 import torch
-import worlds
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torch.nn.functional import one_hot
 from torchrl.envs import TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import ConstantGuide, SplineGuide, ZeroGuide
-from coil_rl.testing import check_env
 from coil_rl.transforms.guide_actions import GuideActions, GuideCache
 
 
@@ -21,9 +18,7 @@ def test_advice_is_the_action_of_the_guide_for_the_same_step():
     rollout = env.rollout(100, break_when_any_done=False)
     expected = guide(rollout.select(*guide.in_keys).reshape(-1).clone())["action"].view(6, 100, 1)
     torch.testing.assert_close(rollout["guide_action"].squeeze(2), expected)
-    assert rollout["next", "done"].any(), (
-        "random driving should have crashed, so that resets are covered"
-    )
+    assert rollout["next", "done"].any(), "resets should be covered"
 
 
 def test_several_guides_keep_their_order_also_in_the_state():
@@ -35,20 +30,6 @@ def test_several_guides_keep_their_order_also_in_the_state():
     cone_env(guides).load_state_dict(env.state_dict())
     with pytest.raises(ValueError, match="guides right, straight, left, not left, straight, right"):
         cone_env(dict(reversed(guides.items()))).load_state_dict(env.state_dict())
-
-
-def test_advice_has_the_bounds_of_the_action():
-    spec = worlds.pendulum().observation_spec["guide_action"]
-    assert (spec.shape, spec.space.low, spec.space.high) == ((1, 1), -2, 2)
-
-
-@pytest.mark.parametrize("categorical", [True, False])
-def test_discrete_advice_is_one_hot(categorical):
-    env = worlds.carts(categorical=categorical)
-    check_env(env)
-    rollout = env.rollout(5)
-    leaning = (rollout["observation"][..., 2] > 0).long()
-    assert torch.equal(rollout["guide_action"].squeeze(-2), one_hot(leaning, 2).float())
 
 
 def test_guide_changes_no_other_entry():
@@ -77,9 +58,8 @@ def test_cached_advice_equals_the_function_and_the_cache_is_bounded():
         calls.clear()
         advice = [cache(data, function) for data in batches]
         called_with = sum(calls)
-        assert all(
-            torch.equal(one, function(data)) for one, data in zip(advice, batches, strict=True)
-        )
+        for one, data in zip(advice, batches, strict=True):
+            assert torch.equal(one, function(data))
         return called_with
 
     batches = [rows(1, 2, 1), rows(2), rows(3, 3, 1), rows(), rows(1, 2, 3)]
@@ -89,12 +69,7 @@ def test_cached_advice_equals_the_function_and_the_cache_is_bounded():
     assert len(small.index) == 3
 
 
-@pytest.mark.parametrize("change", [1e-3, 1e-6])
-def test_cache_tells_observations_apart_by_every_digit(change):
-    def advise(data):
-        return 1000 * data["observation"]
-
-    cache, first = GuideCache(), torch.tensor([[1.0], [1.0 + change]])
-    advice = cache(TensorDict({"observation": first}, [2]), advise)
-    assert torch.equal(advice, 1000 * first)
-    assert len(cache.index) == 2
+def test_cache_tells_observations_apart_by_every_digit():
+    near = TensorDict({"observation": torch.tensor([[1.0], [1.0 + 1e-6]])}, [2])
+    advice = GuideCache()(near, lambda data: 1000 * data["observation"])
+    assert torch.equal(advice, 1000 * near["observation"])

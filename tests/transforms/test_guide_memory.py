@@ -84,9 +84,7 @@ def episodes(rollout):
 def driven(env, steps=80):
     torch.manual_seed(1)
     rollout = env.rollout(steps, break_when_any_done=False)
-    assert rollout["next", "done"].sum() > 3, (
-        "random driving should have crashed, so that resets are covered"
-    )
+    assert rollout["next", "done"].sum() > 3, "resets should be covered"
     assert not rollout["next", "done"].all(1).any(), "rows should be reset one by one"
     return rollout
 
@@ -100,10 +98,8 @@ def test_memory_begins_anew_with_every_episode_of_every_row():
         torch.testing.assert_close(episode["guide_action"][:, 0], expected)
         torch.testing.assert_close(episode["guide_state", "sum", "total"], expected * 100)
     assert set(rollout["guide_state"].keys()) == {"sum"}
-    assert torch.equal(
-        rollout["guide_action"][:, :, 1],
-        driven(cones({"s": SplineGuide()}))["guide_action"][:, :, 0],
-    )
+    alone = driven(cones({"spline": SplineGuide()}))
+    assert torch.equal(rollout["guide_action"][:, :, 1], alone["guide_action"][:, :, 0])
 
 
 @pytest.mark.slow
@@ -133,9 +129,8 @@ def test_guide_is_told_first_step_row_and_the_action_that_the_env_was_given():
     first[:, 1:] = rollout["next", "done"][:, :-1].float()
     last = torch.cat([torch.zeros(6, 1, 1), given[:, :-1]], 1) * (1 - first)
     rows = torch.arange(6.0).view(6, 1, 1)
-    torch.testing.assert_close(
-        rollout["guide_action"][:, :, 1], (first + rows / 10 + last / 10) / 10
-    )
+    told = (first + rows / 10 + last / 10) / 10
+    torch.testing.assert_close(rollout["guide_action"][:, :, 1], told)
 
 
 class Speed(Integrator):
@@ -168,65 +163,46 @@ def test_memory_works_inside_and_around_an_env_of_several_envs(make):
     torch.testing.assert_close(
         rollout["guide_action"][..., 0, :], rollout["thdot"].cumsum(1).unsqueeze(-1) / 100
     )
-    before = rollout[:, -1]["next"].clone()
+    before, total = rollout[:, -1]["next"].clone(), ("guide_state", "sum", "total")
     mask = torch.tensor([[True], [False]])
-    after = env.reset(before.clone().set("_reset", mask), set_state=False)[
-        "guide_state", "sum", "total"
-    ]
-    assert after[1] == before["guide_state", "sum", "total"][1] != after[0]
-    assert after[0].abs() < 1.1, "the first speed is at most 1"
+    after = env.reset(before.clone().set("_reset", mask), set_state=False)
+    assert after[total][1] == before[total][1] != after[total][0]
+    assert after[total][0].abs() < 1.1, "the first speed is at most 1"
     env.close()
 
 
-def policy():
-    return TensorDictModule(
-        lambda observation: torch.tanh(observation[:, :1]), ["observation"], ["action"]
-    )
-
-
 def test_resumed_rollout_is_equal_to_the_bit():
+    policy = TensorDictModule(lambda seen: torch.tanh(seen[:, :1]), ["observation"], ["action"])
+
     def rollout(seed):
-        return Rollout(
-            cones({"memory": recurrent(LSTMModule), "sum": Integrator()}, seed=seed), policy(), 20
-        )
+        guides = {"memory": recurrent(LSTMModule), "sum": Integrator()}
+        return Rollout(cones(guides, seed=seed), policy, 20)
 
     expected, resumed = worlds.continued(rollout)
     assert (expected == resumed).all()
     assert expected["guide_state", "sum", "total"].abs().sum() > 0
 
 
-def test_rollout_of_chosen_keys_stores_no_memory():
-    keys = ["guide_action", ("next", "reward")]
-    batch = Rollout(cones({"sum": Integrator()}), policy(), 3, keys).collect()
-    assert set(batch.keys(True, True)) == {"guide_action", ("next", "reward")}
+FORGETS = TensorDictModule(nn.Linear(1, 2), ["a"], ["action", ("next", "b")])
+
+
+def alone(guide):
+    """Let a guide of an env act on data of one step."""
+    return cones({"guide": guide}).transform[0](worlds.cones().reset())
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (
-            lambda: GuideActions(
-                {"pi": TensorDictModule(nn.Linear(1, 2), ["a"], ["action", ("next", "b")])}
-            ),
-            r"guide 'pi' writes \['b'\] for its next step, but nothing",
-        ),
-        (
-            lambda: Guides({"pi": recurrent(GRUModule)}, trainable=True),
-            "guide 'pi' has a memory, and such a guide",
-        ),
-        (
-            lambda: cones({"pi": Integrator()}).transform[0](worlds.cones().reset()),
-            "GuideActions needs the previous steps",
-        ),
-        (
-            lambda: cones({"w": Witness()}).transform[0](worlds.cones().reset()),
-            "GuideActions needs the previous steps",
-        ),
+        (lambda: GuideActions({"pi": FORGETS}), r"'pi' writes \['b'\] for its next step, but"),
+        (lambda: Guides({"pi": recurrent(GRUModule)}, trainable=True), "'pi' has a memory, and"),
+        (lambda: alone(Integrator()), "GuideActions needs the previous steps"),
+        (lambda: alone(Witness()), "GuideActions needs the previous steps"),
         (
             lambda: cones(
-                {"pi": Integrator()}, GuideActions({"pi": Integrator()}, out_key="b")
+                {"a": Integrator()}, GuideActions({"a": Integrator()}, out_key="b")
             ).reset(),
-            "two guides 'pi' have a memory",
+            "two guides 'a' have a memory",
         ),
     ],
 )
