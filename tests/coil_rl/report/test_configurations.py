@@ -31,6 +31,11 @@ def runs(tmp_path):
     return make
 
 
+def typed(run, *words):
+    """Return a run with the words of its command."""
+    return replace(run, command=["coil-train", *words, f"seed={run.seed}"])
+
+
 def labels(runs):
     return [run.label for run in distinguish(runs)[0]]
 
@@ -85,10 +90,7 @@ def test_only_what_somebody_typed_is_said(runs):
     learner = {"lr": 1e-3, "gamma": 0.9, "buffer": {"size": 5}}
     read = runs({"learner": {"lr": 3e-4}}, {"learner": learner}, {"learner": learner | {"lr": 0.1}})
     words = ([], ["learner=sac", "label=x", "hydra.run.dir=x"], ["learner=sac", "learner.lr=0.1"])
-    read = [
-        replace(run, command=["coil-train", *typed, f"seed={run.seed}"])
-        for run, typed in zip(read, words, strict=True)
-    ]
+    read = [typed(run, *of_run) for run, of_run in zip(read, words, strict=True)]
     assert [row["differs"] for row in distinguish(read)[1]] == [
         "learner.lr=0.0003",
         "learner=sac, learner.lr=0.001",
@@ -134,11 +136,8 @@ def test_cases_belong_to_their_env(runs):
 def test_env_of_a_module_has_its_own_name_and_words_of_no_test_are_left_out(runs):
     one = {"env": {"id": "plants.tanks:Tank", "size": 1}, "learner": {"gamma": 0.9}}
     read = runs(one, {"env": {"id": "plants.tanks:Tank", "size": 2}})
-    read = [
-        replace(run, command=["coil-train", f"env.size={size}", f"learner.gamma=0.{size}"])
-        for size, run in enumerate(read, 1)
-    ]
-    envs, rows = by_test(read)
+    words = (["env.size=1", "learner.gamma=0.1"], ["env.size=2", "learner.gamma=0.2"])
+    envs, rows = by_test([typed(run, *of_run) for run, of_run in zip(read, words, strict=True)])
     assert list(envs) == ["Tank 1", "Tank 2"]
     assert [row["differs"] for row in rows] == ["env.size=1", "env.size=2"]
 

@@ -13,12 +13,8 @@ NAN = math.nan
 
 
 def run(seed, rows=40):
-    rng = np.random.default_rng(seed)
-    values = [300 * (1 - math.exp(-index / 10)) + float(rng.normal()) for index in range(rows)]
-    return [
-        {"frames": 50_000 * (n + 1), RETURN: value if n else math.nan}
-        for n, value in enumerate(values)
-    ]
+    values = [math.nan, *np.random.default_rng(seed).normal(300, size=rows - 1)]
+    return [{"frames": 50_000 * n, RETURN: value} for n, value in enumerate(values, 1)]
 
 
 @pytest.mark.parametrize("draw", [draw_learning_curves, draw_curve_grid])
@@ -45,10 +41,8 @@ def test_phases_are_drawn_for_guides_in_turn_and_together(tmp_path):
 
 
 def test_single_run_is_its_own_mean_and_interval():
-    rows = [
-        {"frames": f, RETURN: v}
-        for f, v in ((20, 2.0), (10, np.float32(1)), (30, math.nan), (40, 4.0))
-    ]
+    points = [(20, 2.0), (10, np.float32(1)), (30, math.nan), (40, 4.0)]
+    rows = [{"frames": frames, RETURN: value} for frames, value in points]
     frames, *curves = mean_curve([rows], RETURN)
     np.testing.assert_array_equal(frames, [10, 20, 40])
     for curve in curves:
@@ -60,10 +54,8 @@ def test_runs_are_averaged_over_their_common_frames():
     second = [{"frames": f, RETURN: 3.0 * f} for f in (5, 15, 25)]
     frames, mean, low, high = mean_curve([first, second, []], RETURN)
     np.testing.assert_array_equal(frames, [5, 10, 15, 20, 25])
-    half = t.ppf(0.975, 1) * frames
-    np.testing.assert_allclose(
-        [mean, low, high], [2 * frames, 2 * frames - half, 2 * frames + half]
-    )
+    middle, half = 2 * frames, t.ppf(0.975, 1) * frames
+    np.testing.assert_allclose([mean, low, high], [middle, middle - half, middle + half])
 
 
 def test_frames_until_a_level_are_interpolated():

@@ -7,28 +7,24 @@ from coil_rl.report.runs import Run
 NAN = float("nan")
 
 
-def run(label, seed=0, **columns):
-    """Return a run of four rows with some columns besides the frames."""
-    rows = [
-        {"frames": 100.0 * number}
-        | {name.replace("__", "/"): values[number] for name, values in columns.items()}
-        for number in range(4)
-    ]
+def run(label, column, values, seed=0):
+    """Return a run of four rows with a column besides the frames."""
+    rows = [{"frames": 100.0 * number, column: value} for number, value in enumerate(values)]
     return Run(None, label, seed, True, curve=rows)
 
 
 def test_weight_that_was_decided_before_the_training_lasts_for_the_run():
-    use = guide_use([run("coil_anchored", start__weight=[0.5, NAN, NAN, NAN])])
+    use = guide_use([run("coil_anchored", "start/weight", [0.5, NAN, NAN, NAN])])
     (curve,) = use["start/weight"]["coil_anchored"]
     assert curve.tolist() == [[0, 0.5], [300, 0.5]]
 
 
 def test_what_methods_log_of_their_guide_is_found_by_column_and_label():
     runs = [
-        run("kickstart", 0, learner__guide_weight=[NAN, 1.0, 0.5, 0.0]),
-        run("kickstart", 1, learner__guide_weight=[NAN, 1.0, 0.5, 0.0]),
-        run("ppo", learner__loss=[NAN, 1.0, 2.0, 3.0]),
-        run("cheq", train__agent_weight=[NAN] * 4),
+        run("kickstart", "learner/guide_weight", [NAN, 1.0, 0.5, 0.0], seed=0),
+        run("kickstart", "learner/guide_weight", [NAN, 1.0, 0.5, 0.0], seed=1),
+        run("ppo", "learner/loss", [NAN, 1.0, 2.0, 3.0]),
+        run("cheq", "train/agent_weight", [NAN] * 4),
         Run(None, "guide", 0, None),
     ]
     use = guide_use(runs)

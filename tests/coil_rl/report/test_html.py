@@ -54,11 +54,8 @@ def report(folder):
 def evil(tmp_path_factory):
     """Return the report of a run whose every text is an attack."""
     folder = tmp_path_factory.mktemp("evil")
-    rows = (
-        driven("guide", {EVIL: 1.0})
-        + driven(EVIL, {EVIL: 2.0})
-        + driven(EVIL, {EVIL: 1.0}, advice=EVIL)
-    )
+    rows = driven("guide", {EVIL: 1.0}) + driven(EVIL, {EVIL: 2.0})
+    rows += driven(EVIL, {EVIL: 1.0}, advice=EVIL)
     run = make_run(folder / "run", EVIL, 0, rows)
     (run / "episode.webp").write_bytes(WEBP + EVIL.encode())
     return report(folder)
@@ -77,16 +74,11 @@ def test_texts_of_run_folders_are_only_texts(evil):
 
 
 def test_page_needs_nothing_else(evil):
-    assert not re.findall(
-        r"https?:|//[a-z]|@import|url\((?!#)", evil.replace("</", "").replace("/>", "")
-    )
-    addresses = [
-        value for name, value in Reader(evil).attributes if name in ("src", "href", "data")
-    ]
-    assert {value[:1] if value.startswith("#") else value[:5] for value in addresses} <= {
-        "#",
-        "data:",
-    }
+    text = evil.replace("</", "").replace("/>", "")
+    assert not re.findall(r"https?:|//[a-z]|@import|url\((?!#)", text)
+    for name, value in Reader(evil).attributes:
+        if name in ("src", "href", "data"):
+            assert value.startswith(("#", "data:"))
 
 
 def test_cells_carry_the_numbers_that_rows_are_sorted_by():
@@ -123,9 +115,7 @@ def test_file_that_is_no_picture_is_refused(tmp_path):
     assert embedded(WEBP).startswith("data:image/webp;base64,")
     assert embedded(b"\x89PNG\r\n\x1a\n").startswith("data:image/png;base64,")
     assert embedded(b"GIF89a" + EVIL.encode()).startswith("data:image/gif;base64,")
-    folder = make_run(
-        tmp_path / "run", "coil", 0, driven("guide", {"a": 1.0}) + driven("coil", {"a": 2.0})
-    )
+    folder = make_run(tmp_path / "run", "coil", 0, driven("coil", {"a": 2.0}))
     (folder / "episode.webp").write_bytes(b"<svg onload=alert(1)>")
     with pytest.raises(UserError, match=r"episode.webp is damaged"):
         films(read_runs([tmp_path]))

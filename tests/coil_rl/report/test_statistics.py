@@ -22,11 +22,8 @@ def test_few_seeds_have_interval_and_p_of_a_t_test():
     expected = stats.ttest_1samp(values, 0)
     found = estimate(values)
     assert found[1:3] == pytest.approx(tuple(expected.confidence_interval(0.95)))
-    assert (found.mean, found.seeds, found.p) == (
-        pytest.approx(2.8),
-        5,
-        pytest.approx(expected.pvalue),
-    )
+    assert (found.mean, found.p) == pytest.approx((2.8, expected.pvalue))
+    assert found.seeds == 5
 
 
 @pytest.mark.parametrize("shift", [0.3, -0.6])
@@ -43,16 +40,13 @@ def test_p_of_many_seeds_is_reproducible():
 
 
 @pytest.mark.fast(1)
-@pytest.mark.parametrize("seeds", [3, 5, 12])
-def test_interval_has_its_coverage(seeds):
-    samples = np.random.default_rng(1).normal(7, size=(1000, seeds))
-    hits = sum(
-        low <= 7 <= high
-        for _, low, high, *_ in map(estimate, samples[: 100 if seeds >= 10 else 1000])
-    )
-    assert hits / (100 if seeds >= 10 else 1000) == pytest.approx(
-        0.95, abs=0.05 if seeds >= 10 else 0.02
-    )
+@pytest.mark.parametrize(
+    ("seeds", "samples", "within"), [(3, 1000, 0.02), (5, 1000, 0.02), (12, 100, 0.05)]
+)
+def test_interval_has_its_coverage(seeds, samples, within):
+    drawn = np.random.default_rng(1).normal(7, size=(samples, seeds))
+    hits = sum(low <= 7 <= high for _, low, high, *_ in map(estimate, drawn))
+    assert hits / samples == pytest.approx(0.95, abs=within)
 
 
 def test_estimates_without_spread_or_numbers():
@@ -60,12 +54,8 @@ def test_estimates_without_spread_or_numbers():
     assert estimate([0.0, 0.0]).p == 1
     single = estimate([2.0])
     assert (single.mean, single.seeds) == (2, 1)
-    assert all(
-        map(
-            math.isnan,
-            (single.low, single.high, single.p, estimate([]).mean, estimate([1.0, math.nan]).mean),
-        )
-    )
+    unknown = [single.low, single.high, single.p, estimate([]).mean, estimate([1, math.nan]).mean]
+    assert all(map(math.isnan, unknown))
 
 
 def test_difference_is_that_of_pairs():
