@@ -111,6 +111,8 @@ def test_mean_over_fewer_episodes_says_so():
     full = with_denominators(rows, counts)
     assert list(full[0]) == [*rows[0], "episodes", "lap_time_episodes"]
     assert (full[-1]["episodes"], full[-1]["lap_time_episodes"]) == (4, 2)
+    rows[-1]["lap_time"] = math.nan
+    assert with_shares(rows, counts, columns)[-1]["lap_time"] == "- (2 of 4)"
     complete = [{**episode, "lap_time": 1.0} for episode in episodes]
     rows, counts = summarise(complete, measures), denominators(complete, measures)
     assert with_denominators(rows, counts) == rows == with_shares(rows, counts, columns)

@@ -1,11 +1,9 @@
 """What envs and controllers of others do wrong is one sentence with its place, or no harm."""
 
 import asyncio
-import contextlib
 import csv
 import decimal
 import fractions
-import io
 import itertools
 import json
 import logging
@@ -14,12 +12,10 @@ import random
 import re
 import shlex
 import signal
-import struct
 import sys
 import time
 import warnings
 from functools import partial
-from importlib import metadata
 
 import gymnasium
 import numpy as np
@@ -27,7 +23,6 @@ import pytest
 import torch
 from gymnasium import spaces
 from gymnasium.wrappers import ClipReward
-from outside_package.install import SOURCE
 from programs import called
 from run_folders import driven, make_run
 from tensordict import TensorDict
@@ -37,10 +32,8 @@ from torchrl.envs import Compose, ExplorationType, TransformedEnv, set_explorati
 
 import coil_rl
 from coil_rl import GymnasiumEnv, compose_train
-from coil_rl.config.assemble import assemble
 from coil_rl.config.nodes import build
 from coil_rl.envs import gym
-from coil_rl.foreign import guard as guard_file
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.guard import SETTINGS, hold
 from coil_rl.foreign.trial import Trial
@@ -54,7 +47,6 @@ from coil_rl.guides import (
 )
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.normaliser import RawObservations, normaliser
-from coil_rl.measures import denominators, summarise, with_shares
 from coil_rl.report.configurations import distinguish
 from coil_rl.report.runs import read_runs
 from coil_rl.run.stopping import resume_command
@@ -126,36 +118,27 @@ def is_one_sentence(caught, length=400):
     [
         (lambda a: None, "step returned None, not the five of Gymnasium"),
         (lambda a: tuple(a[:4]), "step returned 4 values, not the five"),
-        (lambda a: (*a, 1), "step returned 6 values, not the five"),
         (lambda a: np.zeros(5), r"step returned \[0.0, 0.0, .*, not the five"),
         (lambda a: dict(enumerate(a)), "step returned {0: .*, not the five"),
         (lambda a: (a[0], a[1], a[4], a[2], a[3]), "info of step is False, not a dictionary"),
         (reward(None), "the reward is None, not one number"),
         (reward(np.zeros(1)), r"the reward is \[0.0\], not one number"),
-        (reward(torch.zeros(2)), r"the reward is \[0.0, 0.0\], not one number"),
         (reward("1.0"), "the reward is '1.0', not one number"),
-        (reward(b"a"), "the reward is b'a', not one number"),
-        (reward(1 + 2j), "the reward is .*, not one number"),
-        (reward({"a": 1}), "the reward is {'a': 1}, not one number"),
         (reward(10**400), "the reward is 1000.*, not one number"),
         (reward(NAN), "the reward is nan, not a finite number"),
-        (reward(-np.inf), "the reward is -inf, not a finite number"),
         (reward(1e300), r"the reward is 1e\+300, not a finite number of float32"),
         (end(None), "terminated is None, not True or False"),
         (end("False"), "terminated is 'False', not True or False"),
         (cut(0.5), "truncated is 0.5, not True or False"),
         (cut(np.array([True, False])), r"truncated is \[True, False\], not True"),
         (info(None), "info of step is None, not a dictionary"),
-        (info([("a", 1)]), "info of step is .*, not a dictionary"),
         (seen(None), f"the observation is None, {ARRAY}"),
         (seen(np.zeros((1, 2))), r"has the shape \[1, 2\], but its space has \[2\]"),
         (seen(0.5), r"the observation has the shape \[\]"),
         (seen(["a", "b"]), ARRAY),
         (seen([0.0, [1.0]]), ARRAY),
-        (seen(np.array([None, 1], object)), ARRAY),
         (seen(np.zeros(2, complex)), ARRAY),
         (seen(np.ma.array([0.0, 1.0], mask=[True, False])), ARRAY),
-        (seen({1}), ARRAY),
         (seen([0.0, NAN]), "the observation holds nan, not a finite number"),
         (seen([0.0, 1e300]), r"the observation holds 1e\+300, not a finite number of float32"),
         (fail(KeyError("pump")), "step raised KeyError: 'pump'"),
@@ -186,10 +169,8 @@ def test_exception_of_an_env_is_chained():
     [
         (lambda x: None, r"reset returned None, not the two of Gymnasium \(observation, info\)"),
         (lambda x: x, r"reset returned \[.*\], not the two"),  # two numbers, which would unpack
-        (lambda x: (x, {}, 1), "reset returned 3 values, not the two"),
         (lambda x: (x, 0.0), "info of reset is 0.0, not a dictionary"),
         (lambda x: (x[:1], {}), r"the observation has the shape \[1\]"),
-        (lambda x: (x * np.nan, {}), "the observation holds nan"),
         (fail(RuntimeError("no key")), "reset raised RuntimeError: no key"),
     ],
 )
@@ -202,16 +183,12 @@ def test_fault_in_a_reset_has_its_place(reset, message):
     ("space", "value", "message"),
     [
         (spaces.Box(-1, 1, (2, 3)), np.zeros((3, 2)), r"shape \[3, 2\], but .* has \[2, 3\]"),
-        (spaces.Box(-1, 1, (2, 3)), np.zeros(6), r"shape \[6\], but its space has \[2, 3"),
-        (spaces.Box(-1, 1, (3,)), np.zeros((3, 1)), r"has the shape \[3, 1\]"),
         (BYTES, [0.5, 0.25], "the observation holds 0.5, which is not"),
         (BYTES, [0, 256], "the observation holds 256, which is not"),
-        (BYTES, [0, -1], "the observation holds -1, which is not in"),
         (spaces.MultiBinary(2), [0, 2], "the observation holds 2, which is not in MultiBinary"),
         (spaces.Discrete(3), 3, "the observation holds 3, which is not in Discrete"),
         (spaces.Discrete(3, start=5), 2, "the observation holds 2, which is not in Discrete"),
         (spaces.Discrete(3), 1.5, "the observation holds 1.5, which is not in Discrete"),
-        (spaces.Discrete(3), [0, 1], r"has the shape \[2\], but its space has \[\]"),
         (spaces.MultiDiscrete([2, 3]), [2, 0], "the observation holds 2, which is not in Multi"),
         (DICT, {"a": np.zeros(2)}, r"observation.in.b is missing: the observation has \['a'\]"),
         (DICT, {"a": np.zeros(2), "in": {"c": 5}}, r"in.b is missing: .* has \['c'\], but .* 'b'"),
@@ -320,9 +297,9 @@ class Broken(Plant):
         (lambda: {}["valve"], "the env .* cannot be made: it raised KeyError: 'valve'"),
         (lambda: Broken(), "the env .* cannot be made: it raised NotImplementedError: later"),
         (lambda: sys.exit(3), "the env .* cannot be made: it raised SystemExit: 3"),
-        (gymnasium.Env, "the env Env has no action_space: set it in its __init__"),
         (lambda: Plant(space=None), "the env .* has no observation_space"),
         (lambda: Plant(space=[1]), r"the observation_space of .* is \[1\], not a space"),
+        (lambda: Plant(spaces.Box(-1, 1, (0,))), "which has no numbers; observe at least one"),
         (lambda: ONE, "the maker of .* returned one env twice"),
         (
             lambda: Plant(action=spaces.Box(-1, 1, (next(SIZES),))),
@@ -346,14 +323,21 @@ PICTURES = [np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8), np.zeros(7, np.u
 LATER = [np.zeros((4, 4, 3), np.uint8), np.zeros((5, 4, 3), np.uint8)]  # of another size
 
 
-@pytest.mark.parametrize("pictures", [*([each] for each in PICTURES), LATER])
+@pytest.mark.parametrize("pictures", [*([each] for each in PICTURES), LATER, []])
 def test_garbage_of_render_is_a_warning_and_the_env_runs_on(pictures, monkeypatch):
     given = iter(pictures)
-    monkeypatch.setattr(Plant, "render", lambda self: next(given), raising=False)
+
+    def render(self):
+        for picture in given:
+            return picture
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(Plant, "render", render, raising=False)
     env = GymnasiumEnv(Plant, render=True)
     env.reset()
     assert all(env.render() is not None for _ in pictures[1:])
-    with pytest.warns(UserWarning, match="no pictures of the env: render returned"):
+    fault = "render returned" if pictures else "no display"
+    with pytest.warns(UserWarning, match=f"no pictures of the env: {fault}"):
         assert env.render() is None
     assert env.render() is None
     env.rollout(3)
@@ -372,41 +356,42 @@ def test_env_that_cannot_be_closed_is_a_warning(monkeypatch):
         env.close()
 
 
-class Late:
-    """Acts well until a step."""
+class Gives:
+    """Gives some answers, one after the other, and then the last one; a function is called."""
 
-    def __init__(self, answer):
-        self.answer, self.calls = answer, -1
+    def __init__(self, *answers):
+        self.answers = answers
 
     def reset(self):
         self.calls = -1
 
     def act(self, observation):
         self.calls += 1
-        return self.answer() if self.calls == STEP else observation[:1]
+        answer = self.answers[min(self.calls, len(self.answers) - 1)]
+        return answer() if callable(answer) else answer
+
+
+WELL = [[0.5]] * STEP
 
 
 @pytest.mark.parametrize("beside", [False, True], ids=["guide", "beside its env"])
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (lambda: None, f"the action is None, {ARRAY}"),
-        (lambda: np.nan, r"the action is \[nan\], which is not finite"),
-        (lambda: "left", f"the action is 'left', {ARRAY}"),
-        (lambda: (np.zeros(1), None), "the action is the tuple .*; return the action alone"),
-        (lambda: (torch.zeros(1), ()), "the action is the tuple .*; return the action alone"),
-        (lambda: {"action": 1}, ARRAY),
-        (lambda: [0.5, [1.0]], ARRAY),
-        (lambda: 1j, f"the action is 1j, {ARRAY}"),
+        (None, f"the action is None, {ARRAY}"),
+        (np.nan, r"the action is \[nan\], which is not finite"),
+        ("left", f"the action is 'left', {ARRAY}"),
+        ((np.zeros(1), None), "the action is the tuple .*; return the action alone"),
+        (1j, f"the action is 1j, {ARRAY}"),
         (fail(IndexError("no joint 7")), "act raised IndexError: no joint 7"),
         (fail(SystemExit(1)), "act raised SystemExit: 1"),
-        (lambda: [0.5, 0.5], r"has the shape \[2\], but|returned \[0.5, 0.5\], no action of Box"),
-        (lambda: [], r"has the shape \[0\], but|returned \[\], no action of Box"),
+        ([0.5, 0.5], r"has the shape \[2\], but|returned \[0.5, 0.5\], no action of Box"),
+        ([], r"has the shape \[0\], but|returned \[\], no action of Box"),
     ],
 )
 def test_fault_of_a_controller_has_its_place(answer, message, beside):
-    makers = iter([Late(lambda: [0.5]), Late(answer)])
-    given = {"controllers": {"pid": Late(answer)}}
+    makers = iter([Gives(*WELL), Gives(*WELL, answer)])
+    given = {"controllers": {"pid": Gives(*WELL, answer)}}
     if not beside:
         given = {"guide": PerRow(lambda: next(makers), title="PID")}
     with pytest.raises(ForeignError, match=message) as caught:
@@ -430,14 +415,12 @@ class Raises(nn.Module):
         ("Pendulum-v1", lambda x: None, "the action is None"),
         ("Pendulum-v1", lambda x: (x[..., :1], None), "the action is the tuple"),
         ("Pendulum-v1", lambda x: x / "a", "it raised TypeError: "),
-        ("Pendulum-v1", lambda x: {}["gain"], "it raised KeyError: 'gain'"),
         ("Pendulum-v1", lambda x: x[..., :1] * np.nan, "is not finite"),
         ("Pendulum-v1", lambda x: x, r"has the shape \[2, 3\], but must have \[2, 1\]"),
         ("Pendulum-v1", nn.Identity(), r"Identity: its action has the shape .* but must have"),
         ("Pendulum-v1", Raises(), "Raises: it raised RuntimeError: no weights at"),
         ("CartPole-v1", lambda x: 2, "is neither an index below 2 nor a one-hot vector"),
         ("CartPole-v1", lambda x: 0.5, "is no whole number, but must be the number of a choice"),
-        ("CartPole-v1", lambda x: -1, "is neither an index below 2 nor a one-hot vector"),
     ],
 )
 def test_fault_of_what_all_rows_share_is_one_sentence(id, controller, message):
@@ -446,32 +429,18 @@ def test_fault_of_what_all_rows_share_is_one_sentence(id, controller, message):
     assert is_one_sentence(caught)
 
 
-class Gives:
-    def __init__(self, *answers):
-        self.answers = answers
-
-    def reset(self):
-        self.calls = -1
-
-    def act(self, observation):
-        self.calls += 1
-        return self.answers[min(self.calls, len(self.answers) - 1)]
-
-
 @pytest.mark.parametrize(
     ("action", "answers", "message"),
     [
         (PLANE, ([1.0, 2.0],), r"step 0\): act returned \[1.0, 2.0\], .* \[2\], but must have \[1"),
         (spaces.Discrete(2), (0, 1, 2), r"step 2\): act returned \[2\], which is neither an index"),
         (spaces.Discrete(3, start=5), (0.5,), r"neither a number from \[5\] to \[7\] nor a one-"),
-        (spaces.Discrete(3, start=-1), (7,), r"neither a number from \[-1\] to \[1\] nor a one-"),
         (spaces.MultiBinary(2), (6,), r"returned \[6\], which has the shape \[1\], but must have"),
         (
             spaces.MultiDiscrete([3, 2], start=[1, 10]),
             ([1, 1],),
             r"from \[1, 10\] to \[3, 11\] nor",
         ),
-        (spaces.Box(-2, 2, (2, 2)), ([1, 1],), r"has the shape \[2\], but must have \[2, 2\]"),
         (spaces.Box(-1, 1, (2, 3)), (np.zeros((3, 2)),), r"shape \[3, 2\], but must have \[2, 3\]"),
     ],
 )
@@ -485,8 +454,17 @@ def test_what_a_controller_does_with_its_observation_changes_nothing():
         given[-1][...] = 0.0
         return given[-1][..., :1]
 
-    data = stepped(ControllerGuide(spoils), controllers={"careless": spoils})
-    assert (data["observation"] != 0).all()
+    class Own(Plant):
+        def reset(self, **options):
+            self.state = np.zeros(2, np.float32)
+            return super().reset(**options)
+
+        def good(self):
+            self.state += 1
+            return self.state
+
+    data = stepped(ControllerGuide(spoils), id=lambda: Own(), controllers={"careless": spoils})
+    assert data["observation"][0, :, 0].tolist() == [1, 2, 3, 4, 5]
 
 
 def test_old_name_of_a_time_limit_beside_a_termination_is_said():
@@ -545,20 +523,6 @@ class SharesAttribute(SharesDefault):
         super().__init__(self.shared, **options)
 
 
-class SharesObjects(Drift):
-    """Is paid for what all objects of its class do."""
-
-    all = []  # noqa: RUF012
-
-    def __init__(self, **options):
-        super().__init__(**options)
-        self.all.append(self)
-
-    def step(self, action):
-        seen, reward, *ends = super().step(action)
-        return seen, reward + sum(each.time for each in self.all), *ends
-
-
 class Remembers:
     """A controller of each row alone; its variants share their memory."""
 
@@ -581,11 +545,6 @@ class OfClass(Remembers):
 
     def reset(self):
         pass
-
-
-class OfClassCleared(OfClass):
-    def reset(self):
-        self.memory.clear()
 
 
 class OfModule(OfClass):
@@ -620,16 +579,6 @@ class OfDate(OfClock):
         return self.output
 
 
-class OfBudget(Remembers):
-    """Stops after two seconds."""
-
-    def reset(self):
-        self.began = time.time()
-
-    def act(self, observation):
-        return [float(observation[0]) * (time.time() < self.began + 2)]
-
-
 class Slow(Drift):
     """Moves with the time that has passed."""
 
@@ -657,9 +606,7 @@ def findings(env=Drift, controller=None):
     [
         ({"env": SharesDefault}, "rows", "all rows share a default of SharesDefault.__init__; mak"),
         ({"env": SharesAttribute}, "rows", "all rows share SharesAttribute.shared; make it in __i"),
-        ({"env": SharesObjects}, "rows", "all rows share SharesObjects.all; make it in __init__"),
         ({"controller": OfClass}, "rows", "all rows share OfClass.memory; make it in __init__"),
-        ({"controller": OfClassCleared}, "rows", "all rows share OfClass.memory; make it in __"),
         ({"controller": OfModule}, "rows", r"all rows share .*test_faults\.MEMORY; make it in"),
         (
             {"controller": OfClock},
@@ -667,8 +614,6 @@ def findings(env=Drift, controller=None):
             "when time passes between two steps: it reads the clock",
         ),
         ({"controller": OfDate}, "clock", "the controller OfDate gives other actions when time"),
-        ({"controller": OfBudget}, "clock", "the controller OfBudget gives other actions when"),
-        ({"controller": OfClock()}, "clock", "the controller OfClock gives other actions when"),
         ({"env": Slow}, "clock", "observation of the env differs when time passes between two"),
     ],
 )
@@ -795,7 +740,7 @@ def acts_that(change):
         def forward(self, tensordict):
             return tensordict.set("action", function(tensordict["observation"]))
 
-    return {"act": Controller, "function": function, "module": Module, "held": hold(Module())}
+    return {"act": Controller, "function": function, "module": Module}
 
 
 ACTS = tuple(acts_that(None))
@@ -824,8 +769,7 @@ def process_after(change, place):
     seeded()
     env = GymnasiumEnv(Does, 2, first_seed=0)
     if place in ACTS:
-        acts = acts_that(change)[place]
-        guide = acts if place == "held" else ControllerGuide(acts)
+        guide = ControllerGuide(acts_that(change)[place])
         env = TransformedEnv(env, GuideActions({"theirs": guide}))
     carrier = env.reset()
     for _ in range(6):
@@ -872,13 +816,6 @@ def test_random_numbers_of_a_guide_are_its_own_and_in_its_state():
     again.calls = 0
     again.load_state_dict(saved)
     assert [float(again(data)["action"][0]) for _ in range(3)] == later
-
-
-def test_state_of_pythons_generator_is_where_it_is_looked_for():
-    random.seed(3)
-    random.random()
-    index, *numbers = struct.unpack("=i624I", guard_file._STATE.raw)
-    assert (*numbers, index) == random.getstate()[1]
 
 
 def test_foreign_code_finds_again_what_it_has_set():
@@ -967,44 +904,17 @@ class Mean(nn.Module):
         return observation - observation.mean(0)
 
 
-class Normalised(nn.Module):
-    def forward(self, observation):
-        return nn.functional.batch_norm(observation, None, None, training=True)
-
-
 class Ranks(nn.Module):
     def forward(self, observation):
         return observation.argsort(0)
 
 
-class Sorts(nn.Module):
-    def forward(self, observation):
-        return observation.sort(0).values
-
-
-@pytest.mark.parametrize("kind", [Mean, Ranks, Sorts])
+@pytest.mark.parametrize("kind", [Mean, Ranks])
 @pytest.mark.parametrize("rows", [[1.0], [0.5], [0.0, 0.0], [3.0, -1.0, 2.0]])
 def test_network_that_mixes_the_rows_is_refused(kind, rows):
     message = r"for an observation alone, but \[.*\] for it in a batch of 3: it mixes the rows"
     with pytest.raises(ForeignError, match=message):
         advice(ControllerGuide(kind()), rows)
-
-
-def test_network_that_normalises_by_the_batch_is_refused():
-    with pytest.raises(
-        ForeignError, match="Normalised: it raised ValueError: Expected more than 1"
-    ):
-        advice(ControllerGuide(Normalised()), [1.0, 2.0])
-
-
-def test_network_that_rounds_differently_in_a_batch_is_none_of_these():
-    torch.manual_seed(0)
-    network = nn.Sequential(nn.Linear(1, 300), nn.Tanh(), nn.Linear(300, 1)).half().float()
-    guide, rows = ControllerGuide(network), torch.randn(9, 50)
-    with torch.no_grad():
-        expected = [network(each[:, None]).flatten().tolist() for each in rows]
-        found = advice(guide, *(each.tolist() for each in rows))
-    assert found == expected
 
 
 class Beside(nn.Module):
@@ -1043,31 +953,20 @@ def test_check_asks_in_the_first_call_only(network):
     assert len(asked) == 100
 
 
-# The examples of the kinds that a whole run shows: what is found, and the right value.
-EXAMPLES = {}
+# What a whole run shows.
 TINY = ["budget.num_envs=2", "budget.steps=16", "evaluation.cases=2", "logger=none"]
 TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
 PPO = [*TINY, "learner=ppo", "learner.minibatches=2"]
-
-
-def example(right, *cases):
-    """Add examples by what they are asked for; a text must be a part of what is found."""
-
-    def add(find):
-        for case in cases or ["once"]:
-            EXAMPLES[f"{find.__name__} {case}"] = find, case, right
-        return find
-
-    return add
+PENDULUM = ["env=pendulum", "method=ppo", *PPO]
 
 
 class Valve(Plant):
     """Its best action is 0.3 + 0.2 x of its range, and it shows x in a unit."""
 
-    def __init__(self, low=0.0, high=1.0, unit=1.0, offset=0.0, action=None):
+    def __init__(self, low=0.0, high=1.0, unit=1.0, offset=0.0):
         self.low, self.span, self.unit, self.offset = low, high - low, unit, offset
-        action = action or spaces.Box(low, high, (1,), np.float32)
-        super().__init__(spaces.Box(-np.inf, np.inf, (1,)), action=action)
+        observed = spaces.Box(-np.inf, np.inf, (1,))
+        super().__init__(observed, action=spaces.Box(low, high, (1,), np.float32))
 
     def good(self):
         self.x = self.np_random.uniform(-1, 1)
@@ -1090,22 +989,11 @@ class Above:
         return [self.low + self.span * (0.35 + 0.2 * observation[0])]
 
 
-BOXES = {"0 to 1": (0, 1), "0 to 2000": (0, 2000), "200 to 1000": (200, 1000)}
-
-
 def run_of(folder, env, method, guide=None, words=(), frames=64):
     words = [*PPO, *words]
     return coil_rl.prepare(
         env, guide=guide, method=method, frames=frames, folder=folder, overrides=words
     )
-
-
-def first_return(run):
-    """Return what the first policy of a run earns in an episode."""
-    env = run.make_env(2).eval()
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        rewards = env.rollout(100, run.make_learner(env).policy)["next", "reward"]
-    return float(rewards.sum(1).mean())
 
 
 def got(space, guide, *transforms, rows=1, controllers=None):
@@ -1124,214 +1012,179 @@ def got(space, guide, *transforms, rows=1, controllers=None):
     return seen
 
 
-@example(pytest.approx(-0.5, abs=1e-4), *BOXES)
-def kind_1_residual_begins_as_its_guide_in(box, folder):
-    box = BOXES[box]
-    return first_return(run_of(folder, partial(Valve, *box), "residual", Above(*box)))
+def rows_of(folder):
+    return list(csv.DictReader((folder / "metrics.csv").open()))
 
 
-@example(pytest.approx(81.4, abs=2))  # over other days
-def kind_1_residual_begins_as_its_guide_in_rooms(_, folder):
-    search = f"hydra.searchpath=[file://{SOURCE}/thermostat/conf]"
-    words = [search, "env=rooms", "method=residual", f"run_dir={folder}", "budget.num_envs=2"]
-    return first_return(assemble(compose_train(words)))
+# Kind 1: actions in a unit and a numbering of the env.
 
 
-@example(0.0, "coil", "ppo")
-def kind_1_digits_do_not_depend_on_the_unit_of(method, folder):
+@pytest.mark.slow
+def test_residual_begins_as_its_guide(tmp_path):
+    run = run_of(tmp_path, partial(Valve, 200, 1000), "residual", Above(200, 1000))
+    env = run.make_env(2).eval()
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        rewards = env.rollout(100, run.make_learner(env).policy)["next", "reward"]
+    assert float(rewards.sum(1).mean()) == pytest.approx(-0.5, abs=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["coil", "ppo"])
+def test_digits_do_not_depend_on_the_unit_of_the_action(method, tmp_path):
     logs = []
-    for name in ("0 to 1", "0 to 2000"):
-        guide = Above(*BOXES[name]) if method == "coil" else None
-        run_of(folder / name, partial(Valve, *BOXES[name]), method, guide).train()
-        rows = csv.DictReader((folder / name / "metrics.csv").open())
-        logs.append([float(row["train/reward"]) for row in rows])
-    return round(float(np.nanmax(np.abs(np.subtract(*logs)))), 4)
+    for box in ((0, 1), (0, 2000)):
+        folder, guide = tmp_path / str(box[1]), Above(*box) if method == "coil" else None
+        run_of(folder, partial(Valve, *box), method, guide).train()
+        logs.append([float(row["train/reward"]) for row in rows_of(folder)])
+    assert round(float(np.nanmax(np.abs(np.subtract(*logs)))), 4) == 0
 
 
-@example("uniform", "200 to 1000", "0 to 4", "Discrete", "MultiDiscrete", "degraded MultiDiscrete")
-def kind_1_random_guide_in(name, _):
-    low, high = [float(part) for part in name.split(" to ")] if " to " in name else (0, 0)
-    space = spaces.Discrete(3, start=1) if name == "Discrete" else spaces.MultiDiscrete([3, 2])
-    space, degraded = spaces.Box(low, high, (1,)) if high else space, "degraded" in name
-    guide = [ZeroGuide(), RandomAdvice()] if degraded else [RandomGuide()]
+@pytest.mark.parametrize(
+    ("space", "guide"),
+    [
+        (spaces.Box(200, 1000, (1,)), [RandomGuide()]),
+        (spaces.Box(0, 4, (1,)), [RandomGuide()]),
+        (spaces.Box(-2, 2, (1,), np.int64), [RandomGuide()]),
+        (spaces.Discrete(3, start=1), [RandomGuide()]),
+        (spaces.MultiDiscrete([3, 2]), [RandomGuide()]),
+        (spaces.MultiDiscrete([3, 2]), [ZeroGuide(), RandomAdvice()]),
+    ],
+)
+def test_random_guide_is_uniform(space, guide):
     found = np.array(got(space, *guide, rows=60))
     _, counts = np.unique(found, axis=0, return_counts=True)
-    if high:
-        counts, _ = np.histogram(found, 6, (low, high))
+    if space.dtype == np.float32:
+        counts, _ = np.histogram(found, 6, (space.low[0], space.high[0]))
     assert counts.sum() == 600  # none beyond the bounds
     statistic = np.square(counts - 600 / len(counts)).sum() / (600 / len(counts))
-    return "uniform" if statistic < 20.5 else counts  # chi-square, 5 degrees, 0.1 %
+    assert statistic < 20.5  # chi-square, 5 degrees, 0.1 %
 
 
-@example([1.0, 5.0])
-def kind_1_advice_is_clamped_where_a_bound_is_finite(*_):
+def test_advice_is_clamped_where_a_bound_is_finite():
     space = spaces.Box(np.float32([-1, -np.inf]), np.float32([1, np.inf]))
-    return got(space, ConstantGuide([5.0, 5.0]))[0]
+    assert got(space, ConstantGuide([5.0, 5.0]))[0] == [1.0, 5.0]
 
 
-@example(True)
-def kind_1_actions_without_squash_are_not_all_at_the_bound(_, folder):
-    words = ["learner.squash=false"]
-    run = run_of(folder, partial(Valve, 200, 1000), "ppo", words=words)
+def test_actions_without_squash_are_not_all_at_the_bound(tmp_path):
+    run = run_of(tmp_path, partial(Valve, 200, 1000), "ppo", words=["learner.squash=false"])
     env = run.make_env(2)
     env.rollout(9, run.make_learner(env).policy)
-    return len(np.unique(np.stack(env.base_env.actions))) > 9
+    assert len(np.unique(np.stack(env.base_env.actions))) > 9
 
 
-WAYS = {
-    "constant": lambda: ConstantGuide(3),
-    "function": lambda: ControllerGuide(lambda seen: 3),
-    "controller beside its env": lambda: EntryGuide(["controller", "its"]),
-}
-
-
-@example([[3]] * 10, *WAYS)
-def kind_1_choices_have_the_numbers_of_the_env_for_a(way, _):
+@pytest.mark.parametrize(
+    "guide",
+    [ConstantGuide(3), ControllerGuide(lambda seen: 3), EntryGuide(["controller", "its"])],
+    ids=["constant", "function", "controller beside its env"],
+)
+def test_choices_have_the_numbers_of_the_env(guide):
     its = {"its": lambda env, seen: 3}
-    return got(spaces.Discrete(3, start=1), WAYS[way](), controllers=its)
+    assert got(spaces.Discrete(3, start=1), guide, controllers=its) == [[3]] * 10
 
 
-@example([-2, -1, 0, 1, 2])
-def kind_1_box_of_whole_numbers_is_choices(*_):
-    found = got(spaces.Box(-2, 2, (1,), np.int64), RandomGuide(), rows=20)
-    return sorted({int(each[0]) for each in found})
+# Kind 2: observations and rewards in a unit of the env.
 
 
-@example("normalise: observation is normalised: [0] mean", "ppo", "sac")
-def kind_2_physical_units_are_normalised_for(learner, folder):
-    said = io.StringIO()
+@pytest.mark.slow
+@pytest.mark.parametrize("learner", ["ppo", "sac"])
+def test_physical_units_are_normalised(learner, tmp_path, capsys):
     words = ["learner.starts=16", "learner.batch_size=8", *TINY] if learner == "sac" else PPO
     env, options = partial(Valve, unit=40.0, offset=322.0), [f"learner={learner}", *words]
-    run = coil_rl.prepare(env, method="ppo", frames=64, folder=folder, overrides=options)
-    with contextlib.redirect_stderr(said):
-        run.train()
+    run = coil_rl.prepare(env, method="ppo", frames=64, folder=tmp_path, overrides=options)
+    run.train()
+    assert "normalise: observation is normalised: [0] mean" in capsys.readouterr().err
     acts = run.controller()
     assert np.ptp([acts.act(np.float32([322 + 40 * x])) for x in (-1, 1)]) > 1e-4  # not saturated
-    return said.getvalue()
 
 
-@example("leave it out", "NormalizeObservation", "NormalizeReward")
-def kind_2_statistics_of_a_wrapper_are_refused(wrapper, _):
-    with pytest.raises(ValueError, match="statistics") as caught:
+@pytest.mark.parametrize("wrapper", ["NormalizeObservation", "NormalizeReward"])
+def test_statistics_of_a_wrapper_are_refused(wrapper):
+    with pytest.raises(ValueError, match=r"statistics.* leave it out"):
         GymnasiumEnv(lambda: ClipReward(getattr(gymnasium.wrappers, wrapper)(Valve()), -1, 1))
-    return str(caught.value)
 
 
-@example([True] * 3)
-def kind_2_rewards_are_scaled_for_every_method(*_):
-    words = [["method=ppo"], ["method=coil_anchored"], ["method=coil", "learner=sac"]]
-    return [compose_train([*each, "env=pendulum"]).learner.scale_rewards for each in words]
+@pytest.mark.parametrize(
+    "words", [["method=ppo"], ["method=coil_anchored"], ["method=coil", "learner=sac"]]
+)
+def test_rewards_are_scaled_for_every_method(words):
+    assert compose_train([*words, "env=pendulum"]).learner.scale_rewards
 
 
-@example("- (1 of 2)")
-def kind_4_mean_over_some_cases_says_so(*_):
-    episodes = [{"case": "a", "reward": 1.0}, {"case": "b", "reward": NAN}]
-    rows, counts = summarise(episodes, {}), denominators(episodes, {})
-    return with_shares(rows, counts, {"reward": ("reward", ".1f")})[-1]["reward"]
+@pytest.mark.parametrize(
+    ("holds", "space"),
+    [
+        ("it holds bytes, which", spaces.Box(0, 255, (4,), np.uint8)),
+        ("it is a picture", spaces.Box(0, 1, (8, 8, 3), np.float32)),
+        ("it holds choices", spaces.Discrete(3)),
+    ],
+)
+def test_normalising_is_said_to_leave_what_it_cannot_scale(holds, space):
+    with pytest.warns(UserWarning, match=f"leaves observation as it is: {holds}"):
+        normaliser(GymnasiumEnv(partial(Plant, space)), ["observation"], normalise=True)
 
 
-DIFFERING = {
-    "env.id": ({"env": {"id": "A"}}, {"env": {"id": "B"}}),
-    "learner.gamma": ({"learner": {"gamma": 0.1}}, {"learner": {"gamma": 0.001}}),
-    "budget.frames": ({"budget": {"frames": 10}}, {"budget": {"frames": 20}}),
-}
+def test_picture_of_real_numbers_up_to_255_is_named():
+    env = GymnasiumEnv(partial(Plant, spaces.Box(0, 255, (8, 8, 3), np.float32)), 2)
+    raw = RawObservations(env, ["observation"], None)
+    with pytest.warns(UserWarning, match=r"far out of scale.* needs a space of uint8, or a divis"):
+        raw.finish(env.rollout(4), 0.0)
 
 
-@example(["coil 1", "coil 2"], *DIFFERING)
-def kind_4_runs_are_pooled_only_if_they_are_equal_in(key, folder):
-    for seed, change in enumerate(DIFFERING[key]):
-        run = make_run(folder / str(seed), "coil", seed, driven("coil", {"a": 1.0}))
-        config = json.loads((run / "config.yaml").read_text()) | change
+# Kind 4: a table that pools what differs.
+
+
+def test_runs_of_other_lengths_are_not_pooled(tmp_path):
+    for seed, frames in enumerate((10, 20)):
+        run = make_run(tmp_path / str(seed), "coil", seed, driven("coil", {"a": 1.0}))
+        config = json.loads((run / "config.yaml").read_text()) | {"budget": {"frames": frames}}
         (run / "config.yaml").write_text(json.dumps(config))
-    runs, rows = distinguish(read_runs([folder]))
-    assert all(key in row["differs"] for row in rows)
-    return [run.label for run in runs]
+    runs, rows = distinguish(read_runs([tmp_path]))
+    assert all("budget.frames" in row["differs"] for row in rows)
+    assert [run.label for run in runs] == ["coil 1", "coil 2"]
 
 
-@example("2 of 3 runs that were started are finished")
-def kind_4_report_says_how_many_runs_were_started(_, folder):
-    for seed in range(3):
-        rows = driven("coil", {"a": 1.0}) if seed else None
-        make_run(folder / str(seed), "coil", seed, rows)
-    return called("report", f"folder={folder}").stdout
+# Kind 5: what a person writes into a file.
 
 
-FILES = {
-    "env": "defaults: [gym, _self_]\nlearner: {gamma: 0.5, normalise: true}\n",
-    "experiment": "learner: {gamma: 0.5, normalise: true}\n",
-}
+def test_file_that_is_no_yaml_is_named_with_its_line(tmp_path):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text("a: [1,\nb: }\n")
+    said = called("train", "--config-dir", str(tmp_path), "+experiment=mine", code=2).stderr
+    assert "mine.yaml, line 2: it is no YAML: " in said
 
 
-@example((0.5, True, 3), *FILES)
-def kind_5_file_of_a_user_is_not_overwritten_if_it_is_in(group, folder):
-    (folder / group).mkdir()
-    text = f"# @package _global_\n{FILES[group]}budget: {{num_envs: 3}}\n"
-    (folder / group / "mine.yaml").write_text(text)
-    word = "env=mine" if group == "env" else "+experiment=mine"
-    words = [f"hydra.searchpath=[file://{folder}]", word, "env.id=Pendulum-v1"]
-    words += [] if group == "env" else ["env=gym"]
-    config = compose_train([*words, "learner=sac", "guide=zero"])
-    return config.learner.gamma, config.learner.normalise, config.budget.num_envs
+# Kind 6: how a run goes on.
 
 
-@example("nothing in this run reads", "proxy.seed=3", "preset.perception.scale=2")
-def kind_5_word_without_effect_is_refused(word, _):
-    return called("train", "method=coil", word, code=2).stderr
+def test_command_that_goes_on_is_quoted_and_keeps_its_trust(tmp_path):
+    words = shlex.split(resume_command(tmp_path / "it's a run", ["one", "two"]))
+    assert words[1:] == [f"resume={tmp_path}/it's a run", "trust=[one,two]"]
 
 
-@example("mine.yaml, line 2: it is no YAML: ")
-def kind_5_file_that_is_no_yaml_is_named_with_its_line(_, folder):
-    (folder / "experiment").mkdir()
-    (folder / "experiment" / "mine.yaml").write_text("a: [1,\nb: }\n")
-    return called("train", "--config-dir", str(folder), "+experiment=mine", code=2).stderr
+# Kind 7: what a reader expects to work.
 
 
-@example("1 job of this sweep failed: job 0")
-def kind_6_failed_job_leaves_the_others_alone(_, folder):
-    words = ["-m", "env=pendulum", "method=ppo", *PPO, "budget.frames=32", "learner.gamma=7,0.9"]
-    said = called("train", *words, f"hydra.sweep.dir={folder}/sweep", cwd=folder, code=2).stderr
-    assert len(list(folder.rglob("evaluation.csv"))) == 1
-    return said
-
-
-@example("one two", "trust")
-def kind_6_command_that_goes_on_is_quoted_and_keeps_its(_, folder):
-    words = shlex.split(resume_command(folder / "it's a run", ["one", "two"]))
-    assert words[1] == f"resume={folder}/it's a run"
-    return words[2].removeprefix("trust=[").removesuffix("]").replace(",", " ")
-
-
-@example([3], "RescaleAction", "StickyAction")
-def kind_7_wrapper_of_gymnasium_is_used_from_yaml(wrapper, _):
-    given = {"min_action": -1, "max_action": 1}
-    if wrapper == "StickyAction":
-        given = {"repeat_action_probability": 0.5, "repeat_action_duration": [1, 3]}
-    node = {"_target_": f"gymnasium.wrappers.{wrapper}", "_partial_": True, **given}
+def test_wrapper_of_gymnasium_with_a_range_is_used_from_yaml():
+    given = {"repeat_action_probability": 0.5, "repeat_action_duration": [1, 3]}
+    node = {"_target_": "gymnasium.wrappers.StickyAction", "_partial_": True, **given}
     env = {"_target_": "coil_rl.GymnasiumEnv", "id": "Pendulum-v1", "wrappers": [node]}
-    return list(build(env, "env").rollout(3)["observation"].shape[2:])
+    assert list(build(env, "env").rollout(3)["observation"].shape[2:]) == [3]
 
 
-@example(64.0)
-def kind_7_several_choices_are_learned(_, folder):
-    env = partial(Valve, action=spaces.MultiDiscrete([3, 2]))
-    run_of(folder, env, "coil", lambda seen: np.array([1, 0])).train()
-    return float(list(csv.DictReader((folder / "metrics.csv").open()))[-1]["frames"])
-
-
-@example(["1", "2", "3", "a=b ü"])
-def kind_7_run_and_resume_take_one_spelling(_, folder):
-    words = ["env=pendulum", "method=ppo", *PPO, "budget.frames=32", "existing=resume"]
+@pytest.mark.slow
+def test_run_and_resume_take_one_spelling(tmp_path):
+    words = [*PENDULUM, "budget.frames=32", "existing=resume"]
     for number, quotes in enumerate(("", "'", '"'), 1):
         name = f"{quotes}a=b ü{quotes}"  # the first trains, the others find its run
-        called("train", *words, f"hydra.run.dir={name}", cwd=folder)
-        called("train", f"resume={name}", cwd=folder)
+        called("train", *words, f"hydra.run.dir={name}", cwd=tmp_path)
+        called("train", f"resume={name}", cwd=tmp_path)
         again = [f"hydra.run.dir={number}", "evaluation.gif=false"]
-        called("evaluate", f"run={name}", *again, cwd=folder)
-    return sorted(path.parent.name for path in folder.rglob("evaluation.csv"))
+        called("evaluate", f"run={name}", *again, cwd=tmp_path)
+    found = sorted(path.parent.name for path in tmp_path.rglob("evaluation.csv"))
+    assert found == ["1", "2", "3", "a=b ü"]
 
 
-@example([False, True, True, False])
-def kind_7_cars_of_the_vector_env_that_go_on_after_a_reset_of_others(*_):
+def test_cars_of_the_vector_env_go_on_after_a_reset_of_others():
     straight, mask = np.zeros((4, 1), np.float32), np.array([True, False, False, True])
     envs, alone = (gymnasium.make_vec(gym.ID, num_envs=4) for _ in range(2))
     for each in (envs, alone):
@@ -1341,97 +1194,48 @@ def kind_7_cars_of_the_vector_env_that_go_on_after_a_reset_of_others(*_):
     observation, _ = envs.reset(options={"reset_mask": mask})
     np.testing.assert_array_equal(observation[~mask], before[~mask])
     assert (observation[mask] != before[mask]).any(-1).all()
-    return (envs.step(straight)[0] == alone.step(straight)[0]).all(-1).tolist()
+    same = (envs.step(straight)[0] == alone.step(straight)[0]).all(-1)
+    assert same.tolist() == [False, True, True, False]
 
 
-@example("2.2")
-def kind_7_old_pandas_is_enough(*_):
-    (needed,) = (each for each in metadata.requires("coil-rl") if each.startswith("pandas"))
-    return needed
+# Kind 10: code that changes under a run.
 
 
-@example("goes on with another file of valve_of_mine", "changed=accept")
-def kind_10_changed_code_is_refused_at_a_resume_without(accept, folder):
-    source, words = folder / "valve_of_mine.py", [f"resume={folder}/run", "trust=[valve_of_mine]"]
+@pytest.mark.slow
+def test_changed_code_is_refused_at_a_resume_and_nothing_is_removed(tmp_path, monkeypatch):
+    source, run = tmp_path / "valve_of_mine.py", tmp_path / "run"
     text = "from tests_of_faults import Valve as Theirs\n\nclass Valve(Theirs):\n    pass\n"
-    sys.modules["tests_of_faults"] = sys.modules[__name__]
     source.write_text(text)
-    sys.path.insert(0, str(folder))
-    run_of(folder / "run", "valve_of_mine:Valve", "ppo").train()
+    monkeypatch.setitem(sys.modules, "tests_of_faults", sys.modules[__name__])
+    monkeypatch.syspath_prepend(tmp_path)
+    run_of(run, "valve_of_mine:Valve", "ppo").train()
+    words = [f"resume={run}", "trust=[valve_of_mine]", "budget.frames=128"]
     source.write_text(f"{text}\n# another reward\n")
-    refused = called("train", *words, "budget.frames=128", code=2).stderr
+    refused = called("train", *words, code=2).stderr
     assert "begun with another file of valve_of_mine" in refused
-    source.rename(folder / "aside.py")
-    called("train", *words, "budget.frames=128", code=2)
-    (folder / "aside.py").rename(source)
-    assert (folder / "run" / "evaluation.csv").exists()  # of what is refused, nothing is removed
-    return called("train", *words, "budget.frames=128", accept).stderr
+    source.rename(tmp_path / "aside.py")
+    called("train", *words, code=2)
+    (tmp_path / "aside.py").rename(source)
+    assert (run / "evaluation.csv").exists()
+    said = called("train", *words, "changed=accept").stderr
+    assert "goes on with another file of valve_of_mine" in said
 
 
-SPACES = {
-    "it holds bytes, which": spaces.Box(0, 255, (4,), np.uint8),
-    "it is a picture": spaces.Box(0, 1, (8, 8, 3), np.float32),
-    "it holds choices": spaces.Discrete(3),
-}
+# Kind 12: what is asked of a run that has begun.
 
 
-@example(1, *SPACES)
-def kind_12_normalising_is_said_to_leave_what(holds, _):
-    env = GymnasiumEnv(partial(Plant, SPACES[holds]))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        normaliser(env, ["observation"], normalise=True)
-    return sum(f"leaves observation as it is: {holds}" in str(each.message) for each in caught)
-
-
-@example("needs a space of uint8, or a divis")
-def kind_12_picture_of_real_numbers_up_to_255_is_named(*_):
-    env = GymnasiumEnv(partial(Plant, spaces.Box(0, 255, (8, 8, 3), np.float32)), 2)
-    raw = RawObservations(env, ["observation"], None)
-    with pytest.warns(UserWarning, match="far out of scale") as caught:
-        raw.finish(env.rollout(4), 0.0)
-    return str(caught[0].message)
-
-
-@example("128", "env.workers=2")
-def kind_12_resumed_run_takes(word, folder):
-    words = ["env=pendulum", "method=ppo", *PPO, "env.workers=0", f"hydra.run.dir={folder}/run"]
+@pytest.mark.slow
+def test_resumed_run_takes_another_number_of_processes(tmp_path):
+    words = [*PENDULUM, "env.workers=0", f"hydra.run.dir={tmp_path}/run"]
     called("train", *words, "budget.frames=64")
-    called("train", f"resume={folder}/run", word, "budget.frames=128")
-    return (folder / "run" / "metrics.csv").read_text().splitlines()[-1].split(",")[0]
+    called("train", f"resume={tmp_path}/run", "env.workers=2", "budget.frames=128")
+    assert float(rows_of(tmp_path / "run")[-1]["frames"]) == 128
 
 
-@example([True, False], "evaluation.gif")
-def kind_12_finished_run_is_drawn_by(word, folder):
-    words = ["env=pendulum", "method=ppo", *PPO, f"hydra.run.dir={folder}/run"]
-    called("train", *words, "budget.frames=32")  # without a film
+@pytest.mark.slow
+def test_finished_run_is_drawn_where_it_is_asked_for(tmp_path):
+    called("train", *PENDULUM, f"hydra.run.dir={tmp_path}/run", "budget.frames=32")
     for value in ("true", "false"):
-        again = [f"{word}={value}", "evaluation.repeats=1", f"hydra.run.dir={folder}/{value}"]
-        called("evaluate", f"run={folder}/run", *again)
-    return [(folder / value / "episode.webp").exists() for value in ("true", "false")]
-
-
-SLOW = (
-    kind_1_residual_begins_as_its_guide_in,
-    kind_1_residual_begins_as_its_guide_in_rooms,
-    kind_1_digits_do_not_depend_on_the_unit_of,
-    kind_2_physical_units_are_normalised_for,
-    kind_4_report_says_how_many_runs_were_started,
-    kind_5_word_without_effect_is_refused,
-    kind_6_failed_job_leaves_the_others_alone,
-    kind_7_several_choices_are_learned,
-    kind_7_run_and_resume_take_one_spelling,
-    kind_10_changed_code_is_refused_at_a_resume_without,
-    kind_12_resumed_run_takes,
-    kind_12_finished_run_is_drawn_by,
-)
-FAST = [name for name, (find, *_) in EXAMPLES.items() if find not in SLOW]
-
-
-@pytest.mark.fast(*FAST)
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_example_of_a_whole_run_has_its_right_value(name, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(SOURCE)
-    find, case, right = EXAMPLES[name]
-    found = find(case, tmp_path)
-    assert right in found if isinstance(right, str) else found == right
+        again = [f"evaluation.gif={value}", "evaluation.repeats=1"]
+        called("evaluate", f"run={tmp_path}/run", *again, f"hydra.run.dir={tmp_path}/{value}")
+        assert (tmp_path / value / "episode.webp").exists() == (value == "true")
