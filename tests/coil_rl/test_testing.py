@@ -85,11 +85,6 @@ class RowsInside(TensorDictModuleBase):
         return tensordict.set("action", self.total.clone())
 
 
-class NeverReset(OneNumber):
-    def reset(self):
-        pass
-
-
 class ForgetsAlone(TensorDictModuleBase):
     """Forgets at the start of an episode of all rows, not of some."""
 
@@ -142,19 +137,7 @@ def test_guides_with_a_memory_pass():
         (RandomGuide, "another one for the same history"),
         (Hidden, "another one for the same history; it draws, or remembers earlier episodes"),
         (RowsInside, "fails after a single row was reset, so it may remember in itself"),
-        (lambda: PerRow(NeverReset, ["steering"]), "another one for the same history"),
         (ForgetsAlone, "after the reset of a row depends on what was before it"),
-    ],
-    ids=[
-        "shape",
-        "dtype",
-        "bounds",
-        "nan",
-        "random",
-        "hidden memory",
-        "rows inside",
-        "no reset",
-        "whole batch",
     ],
 )
 def test_defect_of_a_guide_is_found(make, message):
@@ -273,11 +256,6 @@ def test_check_of_a_guide_says_how_to_make_more_rows():
     lean = PerRow(lambda: OneNumber(), ["level"])
     with pytest.raises(ValueError, match=r"not \[1\]; make it with more, .*num_envs=2\)"):
         check_guide(lean, GymnasiumEnv(Tank))
-
-
-def test_envs_with_and_without_a_batch_pass():
-    check_env(PendulumEnv(), steps=4)
-    check_env(cones(), steps=4)
 
 
 class Noise(Transform):

@@ -10,7 +10,6 @@ from torch import nn
 from torchrl.envs import TransformedEnv
 
 from coil_rl import AdviceObservation, ControllerGuide, GuideActions, GymnasiumEnv, prepare
-from coil_rl.guides import EntryGuide
 
 GAINS = np.array([0.3, -0.2, 0.1], np.float32)
 STEPS = 4
@@ -173,9 +172,3 @@ def test_what_cannot_act_is_refused_everywhere():
     for take in (in_a_transform, in_the_env, in_the_observation):
         with pytest.raises(ValueError, match="act"):
             take(object())
-
-
-def test_controller_beside_its_env_is_a_guide():
-    env = GymnasiumEnv("Pendulum-v1", first_seed=3, controllers={"it": of_env})
-    env = TransformedEnv(env, GuideActions({"it": EntryGuide(["controller", "it"])}))
-    torch.testing.assert_close(advice(env, "guide_action"), in_a_transform(brake))

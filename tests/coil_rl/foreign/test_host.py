@@ -18,8 +18,6 @@ from torchrl.envs import TransformedEnv
 from worlds import continued
 
 from coil_rl import GymnasiumEnv
-from coil_rl.foreign.faults import ForeignError
-from coil_rl.foreign.host import role_of
 from coil_rl.guides import ControllerGuide, FollowAdvice, PerRow
 from coil_rl.learners import PPO
 from coil_rl.run import checkpoint
@@ -27,16 +25,7 @@ from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
 SOURCE = """
-import torch
 from tensordict.nn import TensorDictModuleBase
-
-class Net(torch.nn.Module):
-    def __init__(self, size=1):
-        super().__init__()
-        self.layer = torch.nn.Linear(20, size)
-
-    def forward(self, x):
-        return torch.tanh(self.layer(x))
 
 class Guide(TensorDictModuleBase):
     in_keys, out_keys, pure = ["steering"], ["action"], True
@@ -87,20 +76,10 @@ def control(tmp_path_factory):
         yield importlib.import_module("my_control")
 
 
-def test_class_of_guides_is_the_guide():
-    rollout, advice = driven(cones(ControllerGuide("my_control:Guide", options={"gain": 0.5})))
-    assert torch.equal(advice, rollout["steering"] / 2)
-
-
-@pytest.mark.slow
-def test_network_and_function_act_on_the_batch():
-    guide = ControllerGuide("my_control:Net")
+@pytest.mark.parametrize(("name", "in_keys"), [("Guide", None), ("half", ["steering"])])
+def test_class_of_guides_and_function_act_on_their_entries_with_their_options(name, in_keys):
+    guide = ControllerGuide(f"my_control:{name}", in_keys, {"gain": 0.25})
     rollout, advice = driven(cones(guide))
-    with torch.no_grad():
-        torch.testing.assert_close(advice, guide.guide.module(rollout["observation"]))
-    rollout, advice = driven(
-        cones(ControllerGuide("my_control:half", ["steering"], {"gain": 0.25}))
-    )
     assert torch.equal(advice, rollout["steering"] / 4)
 
 
@@ -161,11 +140,6 @@ class Plain:
 def test_class_and_object_act_however_their_act_is_defined(of, options, action):
     guide = ControllerGuide(of, options=options)
     assert cones(guide).reset()["guide_action"].unique().tolist() == [action]
-
-
-def test_partial_of_a_class_with_a_wrong_argument_is_refused():
-    with pytest.raises(ValueError, match=r"^Plain takes \(gain, .*\(gian=\): .* mean gain"):
-        ControllerGuide(partial(Plain), options={"gian": 1})
 
 
 def test_object_without_reset_is_made_anew_for_each_episode():
@@ -243,67 +217,56 @@ def test_new_episodes_begin_if_a_controller_cannot_save_its_state():
     assert not guide.continues
 
 
+class Regressor:
+    """A model of a library whose `predict` is of another kind."""
+
+    def predict(self, x):
+        return x
+
+
 @pytest.mark.parametrize(
-    ("of", "options", "message"),
+    ("of", "given", "message"),
     [
         ("my_control", {}, "of=my_control must be MODULE:NAME, such as my_package.control:MyPID"),
-        (
-            "my_contrl:Net",
-            {},
-            "there is no module my_contrl; install its package, or add its folder to PYTHONPATH",
-        ),
+        ("my_contrl:Net", {}, "no module my_contrl; install its package, or add its folder to PYT"),
         ("my_needy:Net", {}, "my_needy needs no_such_package, which is missing; install it"),
-        (
-            "my_broken:Net",
-            {},
-            r"my_broken cannot be imported \(ZeroDivisionError: division by zero\)",
-        ),
+        ("my_broken:Net", {}, r"my_broken cannot be imported \(ZeroDivisionError: division by z"),
         ("my_control:Conter", {}, "my_control has no Conter; did you mean Counter"),
         ("my_control:number", {}, "my_control:number is int; name a class, a function, an object"),
-        (
-            "my_control:Other",
-            {},
-            r"is a class without act\(observation\); give it this method, or name a function",
-        ),
+        (Regressor(), {}, r"or a model with predict\(observation, deterministic=T"),
+        ("my_control:Other", {}, r"is a class without act\(observation\); give it this method, or"),
+        (Static(), {"options": {"gain": 1}}, "is an object, which takes no options"),
         (
             "my_control:Counter",
-            {"stpe": 1},
+            {"options": {"stpe": 1}},
             r"takes \(step=0.01\), but is called with \(stpe=\): .* mean step",
         ),
         (
+            partial(Plain),
+            {"options": {"gian": 1}},
+            r"^Plain takes \(gain, .*\(gian=\): .* mean gain",
+        ),
+        (
             "my_control:half",
-            {"k": 1},
+            {"options": {"k": 1}},
             r"takes \(observation, gain=0.5\), but is called with \(observation, k=\)",
         ),
         (
-            "my_control:Guide",
-            {"k": 1},
-            r"my_control:Guide takes \(gain=1.0\), but is called with \(k=\)",
-        ),
-    ],
-)
-def test_controller_that_cannot_be_used_is_refused_in_one_sentence(of, options, message):
-    with pytest.raises(ValueError, match=message) as error:
-        ControllerGuide(of, options=options)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("of", "message"),
-    [
-        (
             "my_control:Counter",
+            {"in_keys": ["a", "b"]},
             r"my_control:Counter.act takes \(self, observation\), but is called with \(a, b\)",
         ),
         (
             "my_control:Guide",
+            {"in_keys": ["a", "b"]},
             r"of=my_control:Guide has its own in_keys=\['steering'\]; leave in_keys out",
         ),
     ],
 )
-def test_entries_that_a_controller_does_not_take_are_refused(of, message):
-    with pytest.raises(ValueError, match=message):
-        ControllerGuide(of, ["a", "b"])
+def test_controller_that_cannot_be_used_is_refused_in_one_sentence(of, given, message):
+    with pytest.raises(ValueError, match=message) as error:
+        ControllerGuide(of, **given)
+    assert "\n" not in str(error.value)
 
 
 class Matrix(gymnasium.Env):
@@ -320,11 +283,8 @@ class Matrix(gymnasium.Env):
 
 
 class GivesMatrix:
-    def __init__(self, shape=(2, 3)):
-        self.shape = shape
-
     def act(self, observation):
-        return np.arange(6.0).reshape(self.shape) / 10
+        return np.arange(6.0).reshape(2, 3) / 10
 
 
 def test_matrix_of_a_controller_is_the_matrix_that_the_env_gets():
@@ -334,10 +294,6 @@ def test_matrix_of_a_controller_is_the_matrix_that_the_env_gets():
     for guide in (0, [0, 0]):
         stepped = env.step(FollowAdvice(env, guide)(data.clone()))
         assert stepped["next", "reward"].flatten().tolist() == pytest.approx([0.3, 0.3])
-    other = PerRow(partial(GivesMatrix, (3, 2)))
-    env = TransformedEnv(GymnasiumEnv(Matrix, 2), GuideActions({"theirs": other}))
-    with pytest.raises(ForeignError, match=r"has the shape \[3, 2\], but must have \[2, 3\]"):
-        env.reset()
 
 
 class Shelf(gymnasium.Env):
@@ -424,30 +380,23 @@ class Squeezed(nn.Module):
         return 2.0 * observation[..., 0]
 
 
-def predictor(targets):
-    x = np.eye(3)
-    return LinearRegression(fit_intercept=False).fit(x, 2.0 * x[:, :1].repeat(targets, 1)).predict
+def predicting(targets):
+    return LinearRegression(fit_intercept=False).fit(np.eye(3), targets).predict
 
 
 @pytest.mark.parametrize(
     "controller",
     [
-        LinearRegression(fit_intercept=False).fit(np.eye(3), [2.0, 0.0, 0.0]).predict,  # gives [B]
-        predictor(1),  # gives [B, 1]
+        predicting([2.0, 0.0, 0.0]),  # gives [B]
+        predicting([[2.0], [0.0], [0.0]]),  # gives [B, 1]
         Squeezed(),
         lambda x: 2.0 * x[..., 0],
     ],
 )
 def test_one_number_for_each_row_is_an_action_of_one_number(controller):
-    data = advised(ControllerGuide(controller), "Pendulum-v1")
+    data = advised(ControllerGuide(controller))
     expected = (2.0 * data["observation"][..., :1]).clamp(-2.0, 2.0)
     torch.testing.assert_close(data["guide_action"][..., 0, :], expected)
-
-
-def test_numbers_that_are_not_one_for_each_row_are_refused():
-    for controller in (predictor(2), predictor(3)):
-        with pytest.raises(ForeignError, match="but must have"):
-            advised(ControllerGuide(controller), "Pendulum-v1")
 
 
 @pytest.mark.parametrize(
@@ -545,17 +494,6 @@ def test_model_gets_choices_and_dictionaries_as_its_spaces_have_them():
     assert seen[1]["place"] == 5
 
 
-def test_object_with_a_predict_of_another_kind_is_refused():
-    class Regressor:
-        def predict(self, x):
-            return x
-
-    with pytest.raises(ValueError, match=r"or a model with predict\(observation, deterministic=T"):
-        ControllerGuide(Regressor())
-    with pytest.raises(ValueError, match="is an object, which takes no options"):
-        ControllerGuide(Model(), options={"gain": 1})
-
-
 def test_saved_model_of_stable_baselines3_is_a_guide(tmp_path):
     """Its advice is what the library itself computes."""
     sb3 = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
@@ -570,23 +508,3 @@ def test_saved_model_of_stable_baselines3_is_a_guide(tmp_path):
             assert advice.argmax(-1).tolist() == expected.tolist()
         else:
             np.testing.assert_allclose(advice.numpy(), expected, atol=1e-5)
-
-
-def test_model_with_predict_is_a_controller_beside_its_env():
-    env = GymnasiumEnv("Pendulum-v1", 2, max_steps=4, controllers={"model": Model()})
-    advice = env.rollout(6, break_when_any_done=False)["controller", "model"]
-    expected = torch.tensor([[0, 0.1, 0.2, 0.3, 0, 0.1]] * 2)
-    torch.testing.assert_close(advice[..., 0], expected)
-
-
-def test_only_models_with_deterministic_predict():
-    class Regressor:
-        def predict(self, x):
-            return x
-
-    class Both(Model):
-        def act(self, x):
-            return x
-
-    found = [role_of(each) for each in (Model(), Model, Regressor(), Both(), 3)]
-    assert found == ["predict", "predict", "", "act", ""]

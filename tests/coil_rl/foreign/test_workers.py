@@ -21,9 +21,7 @@ from coil_rl.run.parts import TEST, TRAIN
 class Plant(gymnasium.Env):
     """A drifting number; it may fail, die or be slow at a step."""
 
-    def __init__(self, fails=None, dies=None, most=9.0, ends=9, seconds=0.0, fails_to_begin=False):
-        if fails_to_begin:
-            raise RuntimeError("no licence")
+    def __init__(self, fails=None, dies=None, most=9.0, ends=9, seconds=0.0):
         self.fails, self.dies, self.most, self.ends = fails, dies, most, ends
         self.seconds = seconds
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float64)
@@ -151,11 +149,6 @@ def test_fault_of_a_late_row_names_that_row() -> None:
     carrier["action"][3] = 1.0
     with pytest.raises(ForeignError, match=r"row 3, .*: a fuse has blown"):
         env.step(carrier)
-
-
-def test_env_that_cannot_be_made_is_refused_at_once() -> None:
-    with pytest.raises(ValueError, match=r"the env Plant cannot be made: .*no licence"):
-        plants(2, fails_to_begin=True)
 
 
 @pytest.mark.parametrize("workers", [-1, 1.5, "many", True, 10_000])
