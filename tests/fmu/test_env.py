@@ -114,8 +114,14 @@ def test_a_course_may_be_ramps_or_a_column_of_a_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(rising[:6] / rising[0], [1, 1.2, 1.4, 1.6, 1.8, 2.0], rtol=1e-5)
 
 
-def test_failure_ends_the_episode_and_is_said_and_counted() -> None:
-    env = tank()
+def rising(now: Moment, before: Moment) -> np.float32:
+    rate = (now.outputs["level"] - before.outputs["level"]) / (now.time - before.time)
+    return np.float32(-rate.item())
+
+
+@pytest.mark.parametrize("settings", [{}, {"reward": rising, "setpoints": {}}])
+def test_failure_ends_the_episode_and_is_said_and_counted(settings: Any) -> None:
+    env = tank(**settings)
     with pytest.warns(UserWarning, match=r"tank.fmu failed after \S+ s .*overflows"):
         data = driven(env, 20, 0.5)["next"]
     ends = int(data["done"][0, :, 0].nonzero()[0])
@@ -126,20 +132,8 @@ def test_failure_ends_the_episode_and_is_said_and_counted() -> None:
     # Each step that is left counts as the worst one: to fail early is never worth it.
     worst = data["reward"][0, :ends].min().item()
     assert data["reward"][0, ends].item() == pytest.approx((20 - ends) * worst, rel=1e-5)
-    assert driven(tank(failure=-7.0), 20, 0.5)["next", "reward"][0, ends].item() == -7.0
-
-
-def rising(now: Moment, before: Moment) -> np.float32:
-    rate = (now.outputs["level"] - before.outputs["level"]) / (now.time - before.time)
-    return np.float32(-rate.item())
-
-
-def test_a_failure_is_worth_the_worst_of_any_number_of_a_user() -> None:
-    data = driven(tank(reward=rising, setpoints={}), 20, 0.5)["next"]
-    ends = int(data["done"][0, :, 0].nonzero()[0])
-    worst = data["reward"][0, :ends].min().item()
     assert worst < 0
-    assert data["reward"][0, ends].item() == pytest.approx((20 - ends) * worst, rel=1e-5)
+    assert driven(tank(**settings, failure=-7.0), 20, 0.5)["next", "reward"][0, ends].item() == -7.0
 
 
 def test_env_goes_on_after_a_failure() -> None:

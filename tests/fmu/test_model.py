@@ -38,7 +38,7 @@ class Odd(Fmi2Slave):
 """
 
 
-def odd() -> Path:
+def odd(_: Path | None = None) -> Path:
     return fmus.built(ODD, "odd")
 
 
@@ -52,6 +52,15 @@ def text(folder: Path) -> Path:
     return path
 
 
+def motor(_: Path) -> Path:
+    return fmus.motor()
+
+
+def tank(_: Path) -> Path:
+    return fmus.tank()
+
+
+PUSH: dict[str, Any] = {"actions": ["push"]}
 CASES: dict[str, tuple[Callable[[Path], Path], dict[str, Any], str]] = {
     "missing": (lambda folder: folder / "none.fmu", {}, "does not exist"),
     "no archive": (text, {}, "text.fmu is no FMU: .*zip"),
@@ -61,43 +70,20 @@ CASES: dict[str, tuple[Callable[[Path], Path], dict[str, Any], str]] = {
         {},
         "model exchange only.*co-simulation",
     ),
-    "platform": (
-        changed({}, {"linux64": "darwin64"}),
-        {},
-        "binaries for darwin64, win64, but this is",
-    ),
+    "platform": (changed({}, {"linux64": "darwin64"}), {}, "binaries for darwin64, win64, but th"),
     "no input": (changed({'causality="input"': 'causality="local"'}), {}, "has no input"),
-    "unknown input": (
-        lambda _: fmus.motor(),
-        {"actions": ["volt"]},
-        r"no input 'volt'; it has voltage; did you mean voltage\?",
-    ),
-    "unknown output": (
-        lambda _: fmus.motor(),
-        {"observations": ["sped"]},
-        "no output or local 'sped'; .*did you mean speed",
-    ),
+    "unknown input": (motor, {"actions": ["volt"]}, r"no input 'volt'.* did you mean voltage\?"),
+    "unknown output": (motor, {"observations": ["sped"]}, "no output or local 'sped'; .* speed"),
     "unknown parameter": (
-        lambda _: fmus.motor(),
+        motor,
         {"parameters": {"inertial": {"low": 1, "high": 2}}},
         "did you mean inertia",
     ),
-    "text": (lambda _: odd(), {"observations": ["name"]}, "name of odd.fmu is a String"),
-    "no unit": (
-        changed({'unit="rad/s"': ""}),
-        {},
-        "'speed': {'unit': 'not said', 'meaning': 'nominal 100'}",
-    ),
+    "text": (odd, {"observations": ["name"]}, "name of odd.fmu is a String"),
     "solver failure": (
-        lambda _: fmus.tank(),
+        tank,
         {"step": 2.0, "seconds": 4.0, "setpoints": {"level": 0.5}},
         "tank.fmu failed after 0 s of an episode: the tank overflows .* counts as failed",
-    ),
-    "array": (lambda _: fmus.heaters(), {"setpoints": {"temperature": 20.0}}, "'temperature': {"),
-    "flag": (
-        lambda _: odd(),
-        {"actions": ["push"], "bounds": {"push": [0, 1]}},
-        "'moving': {'unit': 'not said'",
     ),
     "its own setpoint": (
         changed({'name="current"': 'name="speed_setpoint"'}),
@@ -105,24 +91,29 @@ CASES: dict[str, tuple[Callable[[Path], Path], dict[str, Any], str]] = {
         "changed.fmu has an output speed_setpoint itself; leave it out",
     ),
     "drawn whole number": (
-        lambda _: odd(),
-        {"actions": ["push"], "parameters": {"gear": {"low": 1, "high": 3}}},
+        odd,
+        PUSH | {"parameters": {"gear": {"low": 1, "high": 3}}},
         "gear of odd.fmu is a Integer, and only real numbers are drawn",
     ),
-    "one bound": (lambda _: fmus.motor(), {"bounds": {"voltage": [24]}}, "at least 2 long"),
+    "one bound": (motor, {"bounds": {"voltage": [24]}}, "at least 2 long"),
     "course with a unit": (
-        lambda _: fmus.motor(),
+        motor,
         {"setpoints": {"speed": "100 rpm"}},
         "setpoints.speed: .*'100 rpm'; give a number, or",
     ),
     "course without a name": (
-        lambda _: fmus.motor(),
+        motor,
         {"parameters": {"inertia": [0.8, 1.2]}},
         "parameters.inertia: .*give a number, or",
     ),
-    "both kinds": (lambda _: odd(), {}, "push of odd.fmu are real .* open, gear are choices"),
+    "course the wrong way": (
+        motor,
+        {"setpoints": {"speed": {"low": 3, "high": 1}}},
+        "low=3.* must be at most high=1",
+    ),
+    "both kinds": (odd, {}, "push of odd.fmu are real .* open, gear are choices"),
     "whole without bounds": (
-        lambda _: odd(),
+        odd,
         {"actions": ["gear"]},
         r"gear of odd.fmu is a whole number without bounds; .*env.bounds.gear=\[LOW,HIGH\]",
     ),
@@ -131,43 +122,28 @@ CASES: dict[str, tuple[Callable[[Path], Path], dict[str, Any], str]] = {
         {},
         "voltage of changed.fmu goes from 5 to 5, which leaves no choice",
     ),
-    "no step": (lambda _: fmus.motor(), {"step": None}, "give env.step.*prefers 0.01"),
+    "no step": (motor, {"step": None}, "give env.step.*prefers 0.01"),
     "no seconds": (
-        lambda _: fmus.tank(),
+        tank,
         {"seconds": None, "setpoints": {"level": 1.0}},
         "tank.fmu has no stopTime",
     ),
-    "indivisible": (
-        lambda _: fmus.motor(),
-        {"step": 0.03},
-        "step=0.03 does not divide the 0.1 s .*0.06 or 0.09",
-    ),
+    "indivisible": (motor, {"step": 0.03}, "step=0.03 does not divide the 0.1 s .*0.06 or 0.09"),
     "fixed step": (
         changed({'canHandleVariableCommunicationStepSize="true"': ""}),
         {"step": 0.025},
         "takes steps of 0.01 s only",
     ),
-    "nothing to follow": (lambda _: fmus.motor(), {"setpoints": {}}, "nothing to follow"),
-    "setpoint of nothing": (
-        lambda _: fmus.motor(),
-        {"setpoints": {"voltage": 1.0}},
-        "voltage is not observed",
+    "nothing to follow": (motor, {"setpoints": {}}, "nothing to follow"),
+    "setpoint of nothing": (motor, {"setpoints": {"voltage": 1.0}}, "voltage is not observed"),
+    "no module": (motor, {"reward": "nowhere:none"}, "reward=nowhere:none: there is no"),
+    "no unit": (
+        changed({'unit="rad/s"': ""}),
+        {},
+        "'speed': {'unit': 'not said', 'meaning': 'nominal 100'}",
     ),
-    "bad course": (
-        lambda _: fmus.motor(),
-        {"setpoints": {"speed": {"lo": 1}}},
-        "setpoints.speed: .*'lo'; give a number, or",
-    ),
-    "course the wrong way": (
-        lambda _: fmus.motor(),
-        {"setpoints": {"speed": {"low": 3, "high": 1}}},
-        "low=3.* must be at most high=1",
-    ),
-    "no module": (
-        lambda _: fmus.motor(),
-        {"reward": "nowhere:none"},
-        "reward=nowhere:none: there is no",
-    ),
+    "array": (lambda _: fmus.heaters(), {"setpoints": {"temperature": 20.0}}, "'temperature': {"),
+    "flag": (odd, PUSH | {"bounds": {"push": [0, 1]}}, "'moving': {'unit': 'not said'"),
 }
 
 
