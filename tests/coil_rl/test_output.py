@@ -85,12 +85,15 @@ def test_bars_may_be_shown_where_nothing_is_said(capsys):
         say("said")
         with quietly():
             progress(total=1).close()
+            say("an error", error=True)
         assert capsys.readouterr() == ("", "")
         progress(total=1).close()
         with quietly(bars=True):
             say("said")
     out, error = capsys.readouterr()
     assert (out, "0/1" in error) == ("", True)
+    say("a text")
+    assert capsys.readouterr().out == "a text\n"
 
 
 def test_bar_in_a_file_is_a_line_now_and_then(monkeypatch, capsys):
@@ -108,14 +111,3 @@ def test_bar_in_a_file_is_a_line_now_and_then(monkeypatch, capsys):
     assert not {"\r", "\x1b"} & {*error}
     assert [line.partition(":")[0] for line in lines] == ["train", "test", "train", "quiet"]
     assert lines[-1].startswith("quiet: 100%")
-
-
-def test_nothing_is_shown_quietly(capsys):
-    with quietly():
-        say("a text")
-        say("an error", error=True)
-        with progress(total=1) as bar:
-            bar.update()
-    assert capsys.readouterr() == ("", "")
-    say("a text")
-    assert capsys.readouterr().out == "a text\n"

@@ -29,7 +29,9 @@ class Echo(gymnasium.Env):
         self.observation_space = spaces.Dict(
             {
                 "real": spaces.Box(-np.inf, np.inf, (3,), np.float64),
-                "image": spaces.Box(0, 255, (4, 5, 3), np.uint8),
+                "image": spaces.Box(0, 10, (4, 5, 3), np.uint8),
+                "pixels": spaces.Box(0, 255, (2,), np.uint8),
+                "cars": spaces.Box(0, 9, (2,), np.uint8),
                 "place": spaces.Discrete(LIMIT + 1, start=10),
                 "inner": spaces.Dict(
                     {"pair": spaces.MultiDiscrete([2, 3]), "bits": spaces.MultiBinary(3)}
@@ -43,6 +45,8 @@ class Echo(gymnasium.Env):
         return {
             "real": np.array([self.time, self.noise, np.sum(self.last)]),
             "image": np.full((4, 5, 3), self.time, np.uint8),
+            "pixels": np.full(2, self.time, np.uint8),
+            "cars": np.full(2, self.time, np.uint8),
             "place": 10 + self.time,
             "inner": {"pair": np.array([1, self.time % 3]), "bits": np.array([0, 1, 1], np.int8)},
             "both": (1, np.float32(0.25)),
@@ -214,7 +218,9 @@ def test_spaces_become_entries():
     real, place, pair = after["real"], after["place"], after["inner", "pair"]
     assert real.dtype == place.dtype == pair.dtype == after["inner", "bits"].dtype == torch.float64
     assert real[:, 0].tolist() == [4.0] * 3
-    assert after["image"].dtype == torch.uint8
+    assert after["image"].dtype == after["pixels"].dtype == torch.uint8
+    assert after["cars"].dtype == torch.float64, "small numbers that are no pixels"
+    assert after["cars"].tolist() == [[4.0, 4.0]] * 3
     assert after["image"].shape == (3, 4, 5, 3)
     assert after["image"].unique().tolist() == [4]
     assert place.tolist() == [[0, 0, 0, 0, 1, 0, 0, 0]] * 3
@@ -317,29 +323,6 @@ def test_actions_too_fine_for_the_dtype_are_refused(low, high, own, fits):
         GymnasiumEnv(partial(Acts, 0.0))
 
 
-def test_pixels_stay_whole_numbers_and_other_small_numbers_do_not():
-    class Counts(gymnasium.Env):
-        action_space = spaces.Discrete(2)
-        observation_space = spaces.Dict(
-            {
-                "image": spaces.Box(0, 10, (4, 5, 3), np.uint8),
-                "pixels": spaces.Box(0, 255, (2,), np.uint8),
-                "cars": spaces.Box(0, 3, (2,), np.uint8),
-            }
-        )
-
-        def reset(self, *, seed=None, options=None):
-            return self.observation_space.sample() | {"cars": np.array([3, 1], np.uint8)}, {}
-
-        def step(self, action):
-            return self.reset()[0], 0.0, False, False, {}
-
-    first = GymnasiumEnv(Counts, max_steps=3).reset()
-    assert first["image"].dtype == first["pixels"].dtype == torch.uint8
-    assert first["cars"][0].tolist() == [3.0, 1.0]
-    assert first["cars"].dtype == torch.float32
-
-
 @pytest.mark.parametrize(("offset", "coarse"), [(1e8, True), (-1e6, True), (100.0, False)])
 def test_rewards_too_fine_for_the_dtype_are_said(offset, coarse):
     class Offset(Place):
@@ -351,27 +334,6 @@ def test_rewards_too_fine_for_the_dtype_are_said(offset, coarse):
     found = said_of_coarse_numbers(env)
     assert bool(found) == coarse
     assert not coarse or ": the reward goes from " in found[0]
-
-
-def test_matrix_is_a_vector_of_which_controllers_give_the_matrix():
-    class Matrix(Place):
-        action_space = spaces.Box(-1, 1, (2, 3), np.float64)
-
-        def step(self, action):
-            self.received = action
-            return super().step(action)
-
-    def ones(env, observation):
-        return np.arange(6.0).reshape(2, 3) / 10
-
-    env = GymnasiumEnv(partial(Matrix, 0.0, 0.5), num_envs=2, controllers={"ones": ones})
-    data = env.reset()
-    assert env.action_spec.shape == (2, 6)
-    assert env.own_shape == (2, 3)
-    action = data["controller", "ones"]
-    assert action.shape == (2, 6)
-    env.step(data.set("action", action))
-    assert np.allclose(env.held.plants[1].env.unwrapped.received, ones(None, None))
 
 
 @pytest.mark.parametrize(("name", "said"), [("success", False), ("sucess", True)])

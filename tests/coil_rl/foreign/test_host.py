@@ -288,11 +288,14 @@ class GivesMatrix:
 
 
 def test_matrix_of_a_controller_is_the_matrix_that_the_env_gets():
-    env = TransformedEnv(GymnasiumEnv(Matrix, 2), GuideActions({"theirs": PerRow(GivesMatrix)}))
+    env = GymnasiumEnv(Matrix, 2, controllers={"beside": GivesMatrix()})
+    assert env.action_spec.shape == (2, 6)
+    env = TransformedEnv(env, GuideActions({"theirs": PerRow(GivesMatrix)}))
     data = env.reset()
     assert data["guide_action"].shape == (2, 1, 6)
-    for guide in (0, [0, 0]):
-        stepped = env.step(FollowAdvice(env, guide)(data.clone()))
+    actions = [FollowAdvice(env, guide)(data.clone())["action"] for guide in (0, [0, 0])]
+    for action in (*actions, data["controller", "beside"]):
+        stepped = env.step(data.clone().set("action", action))
         assert stepped["next", "reward"].flatten().tolist() == pytest.approx([0.3, 0.3])
 
 
@@ -301,9 +304,9 @@ class Shelf(gymnasium.Env):
 
     action_space = spaces.Box(-9.0, 9.0, (2,))
 
-    def __init__(self, observation_space):
-        self.observation_space = observation_space
-        self.seen = []  # what it returned
+    def __init__(self, observation_space, made):
+        self.observation_space, self.seen = observation_space, []  # what it returned
+        made.append(self)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -345,12 +348,7 @@ class Reader:
 )
 def test_controller_reads_choices_as_the_env_numbers_them(space, controller):
     made = []
-
-    def make():
-        made.append(Shelf(space))
-        return made[-1]
-
-    env = GymnasiumEnv(make, num_envs=1)
+    env = GymnasiumEnv(lambda: Shelf(space, made), num_envs=1)
     advised = TransformedEnv(env, GuideActions({"reader": ControllerGuide(controller)}))
     advice = advised.rollout(5)["guide_action"].reshape(-1, 2)
     batched = not isinstance(controller, (type, Reader)) and controller is not first_two
@@ -360,7 +358,7 @@ def test_controller_reads_choices_as_the_env_numbers_them(space, controller):
 
 
 def test_network_reads_choices_as_one_hot_vectors():
-    env = GymnasiumEnv(partial(Shelf, spaces.MultiDiscrete([2, 3])), num_envs=2)
+    env = GymnasiumEnv(partial(Shelf, spaces.MultiDiscrete([2, 3]), []), num_envs=2)
     advised = TransformedEnv(env, GuideActions({"net": ControllerGuide(torch.nn.Linear(5, 2))}))
     data = advised.rollout(3)
     assert torch.equal(data["observation"].sum(-1), torch.full((2, 3), 2.0))
@@ -466,7 +464,7 @@ def test_memory_of_a_model_is_in_the_checkpoint():
 
 
 def test_model_gets_choices_and_dictionaries_as_its_spaces_have_them():
-    seen = []
+    seen, made = [], []
 
     class Reads:
         observation_space = spaces.Dict(
@@ -474,24 +472,11 @@ def test_model_gets_choices_and_dictionaries_as_its_spaces_have_them():
         )
 
         def predict(self, observation, deterministic=True):
-            seen.append(observation)
-            return 0, None
+            seen.append((int(observation["place"]), observation["pair"].tolist()))
+            return np.zeros(2), None
 
-    class Grid(gymnasium.Env):
-        observation_space = Reads.observation_space
-        action_space = spaces.Discrete(2)
-
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            return {"place": 4, "pair": np.array([1, 2])}, {}
-
-        def step(self, action):
-            return {"place": 5, "pair": np.array([0, 1])}, 0.0, False, False, {}
-
-    advised(ControllerGuide(Reads()), lambda: Grid(), 1)
-    assert seen[0]["place"] == 4
-    assert seen[0]["pair"].tolist() == [1, 2]
-    assert seen[1]["place"] == 5
+    advised(ControllerGuide(Reads()), lambda: Shelf(Reads.observation_space, made), 1)
+    assert seen[:STEPS] == [(each["place"], each["pair"].tolist()) for each in made[0].seen][:STEPS]
 
 
 def test_saved_model_of_stable_baselines3_is_a_guide(tmp_path):
