@@ -5,10 +5,9 @@ from functools import partial
 import pytest
 import torch
 import worlds
-from tensordict.nn import TensorDictModule
 
 from coil_rl.errors import UserError
-from coil_rl.learners import A2C, DQN, PPO, SAC, TQC, CrossQ, DynamicCoil, gradient
+from coil_rl.learners import A2C, DQN, PPO, SAC, TQC, CrossQ, gradient
 from coil_rl.learners.gradient import GradientStep
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import DiscreteActions
@@ -106,14 +105,6 @@ def test_auto_goes_on_without_a_compiler_and_true_does_not(monkeypatch, tmp_path
     required, _ = make(PPO, True, minibatches=3)
     with pytest.raises(UserError, match="install one, or take compile=false"):
         required.update(rollout.collect())
-
-
-def test_update_with_shapes_from_data_is_not_compiled():
-    driver = TensorDictModule(torch.nn.Linear(20, 1), ["observation"], ["action"])
-    with pytest.raises(
-        ValueError, match="compile=true: this learner's update depends on data in its shapes"
-    ):
-        make(DynamicCoil, True, guides={"driver": driver})
 
 
 def test_update_on_a_gpu_is_not_compiled():

@@ -311,25 +311,3 @@ def test_uncertainty_is_the_standard_deviation_of_the_critics(many):
     torch.testing.assert_close(acted["next", "uncertainty"], values.std(0))
     policies = policy_batch(sac.policy, [sac.policy.state_dict()])
     assert policies(states)["next", "uncertainty"].shape == (32, 1)
-
-
-@pytest.mark.parametrize(
-    ("kind", "options", "message"),
-    [
-        (SAC, {"critics": 1}, "critics=1 must be"),
-        (
-            SAC,
-            {"critics": 4, "target_critics": 4},
-            "target_critics=4 must be at least 1 and less than critics=4",
-        ),
-        (SAC, {"prior": 0.5}, r"prior=0\.5 needs steps in which a guide acts"),
-        (SAC, {"prior": 1.5}, r"prior=1\.5 must be"),
-        (CrossQ, {"tau": 0.1}, "tau=0.1 must be None: CrossQ"),
-        (CrossQ, {"critic_layer_norm": True}, "critic_layer_norm=True and"),
-        (TQC, {"dropped": 25}, "dropped=25 must be less than quantiles=25"),
-        (TQC, {"target_critics": 1}, "all critics of TQC give the target"),
-    ],
-)
-def test_invalid_options_are_refused(kind, options, message):
-    with pytest.raises(ValueError, match=message):
-        make(kind, **options)
