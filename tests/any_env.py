@@ -5,6 +5,9 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, OneHot, Unbounded
 
 from coil_rl.envs.seeded_env import SeededEnv
+from coil_rl.learners import DQN
+from coil_rl.learners.off_policy import OffPolicy
+from coil_rl.run.rollout import Rollout
 
 FLOAT64 = {"dtype": torch.float64}
 
@@ -72,9 +75,25 @@ class AnyEnv(SeededEnv):
         return TensorDict(self.observe() | {self.reward: score} | ends, self.batch_size)
 
 
+def action_of(kind):
+    """Return the action that a kind of learner can choose; None: any."""
+    return Categorical(3, ()) if kind is DQN else None
+
+
+def learning(kind, env, *args, **options):
+    """Return a small learner in an env, and its rollout."""
+    replay = {"starts": 16, "batch_size": 16, "updates_per_step": 0.0625}
+    small = replay if issubclass(kind, OffPolicy) else {"minibatches": 2}
+    learner = kind(env, *args, **small | options)
+    return learner, Rollout(env, learner.policy, 8, learner.keys)
+
+
 def check_same_update(one, other, batch):
-    """Check that two learners report the same for an update with a batch."""
-    torch.manual_seed(1)
-    expected = one.update(batch.clone())
-    torch.manual_seed(1)
-    assert other.update(batch.clone()) == expected
+    """Check that two learners report the same for an update with a batch, and become the same."""
+    reports = []
+    for learner in (one, other):
+        torch.manual_seed(1)
+        reports.append(learner.update(batch.clone()))
+    assert reports[0] == reports[1]
+    theirs = other.policy.state_dict()
+    assert all(torch.equal(value, theirs[key]) for key, value in one.policy.state_dict().items())

@@ -1,8 +1,6 @@
 """Extensions of learners: what is not part of an algorithm, handed over as one list."""
 
-import ast
 import copy
-import inspect
 from pathlib import Path
 
 import pytest
@@ -10,26 +8,12 @@ import torch
 from any_env import AnyEnv
 from torchrl.data import Bounded, Unbounded
 
-import coil_rl.learners
-from coil_rl.learners import (
-    A2C,
-    DQN,
-    PPO,
-    SAC,
-    TRPO,
-    DynamicCoil,
-    KickstartLoss,
-    Reinforce,
-)
+from coil_rl.learners import A2C, PPO, TRPO, KickstartLoss, Reinforce
 from coil_rl.learners.extension import Extension, Extensions, SummedRewards
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.minibatches import Minibatches
 from coil_rl.learners.policy import Entries
-from coil_rl.ranges import settings_of
 from coil_rl.run.rollout import Rollout
-from coil_studies import IBRL, Advisor
-
-FOLDER = Path(coil_rl.learners.__file__).parent
 
 
 class Counting(Extension):
@@ -146,18 +130,6 @@ def test_minibatches_of_a_pass_are_all_steps_once_in_another_order_each():
     assert len(set(map(tuple, passes))) > 1
 
 
-@pytest.mark.parametrize(("frames", "fits"), [(8, True), (7, False)])
-def test_batch_must_have_two_frames_for_each_minibatch(frames, fits):
-    learner = PPO(AnyEnv(4), minibatches=4)
-    if fits:
-        learner.check_batch(1, frames)
-    else:
-        with pytest.raises(
-            ValueError, match="minibatches=4 leaves less than 2 of 7 frames to each"
-        ):
-            learner.check_batch(1, frames)
-
-
 def test_learner_needs_only_an_update_and_a_state():
     class Idle(Learner):
         def update(self, batch, progress=0.0):
@@ -176,48 +148,3 @@ def test_learner_needs_only_an_update_and_a_state():
     assert idle.callbacks(None) == []
     assert not idle.guides
     assert idle.critic is None
-
-
-@pytest.mark.parametrize("kind", [PPO, A2C, Reinforce, TRPO, DynamicCoil, SAC, DQN, Advisor, IBRL])
-def test_each_argument_of_a_learner_is_named_and_documented(kind):
-    _, *declared = inspect.signature(kind.__init__, eval_str=True).parameters.values()
-    settings = {name for each in declared for name in settings_of(each) or ()}
-    assert all(each.kind is not each.VAR_KEYWORD or settings_of(each) for each in declared)
-    assert documented(kind) <= {each.name for each in declared}
-    everywhere = set().union(*map(documented, kind.__mro__))
-    assert settings | {each.name for each in declared} <= everywhere
-
-
-def documented(kind):
-    """Return the arguments that the docstring of a class itself describes."""
-    described = inspect.cleandoc(kind.__doc__ or "").partition("Args:\n")[2].partition("\n\n")[0]
-    lines = [line for line in described.splitlines() if not line.startswith(" " * 8)]
-    return {line.strip().partition(":")[0] for line in lines}
-
-
-def test_no_file_of_the_learners_imports_itself_through_others():
-    imports = {}
-    for file in FOLDER.glob("*.py"):
-        if file.stem != "__init__":
-            imports[file.stem] = imported(file)
-
-    def reached(name):
-        found, waiting = set(), [name]
-        while waiting:
-            new = imports[waiting.pop()] - found
-            found |= new
-            waiting += new
-        return found
-
-    assert not [name for name in imports if name in reached(name)]
-
-
-def imported(file):
-    """Return the files of the learners that a file imports, also those for type checkers only."""
-    names = set()
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module == "coil_rl.learners":
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module.startswith("coil_rl.learners."):
-            names.add(node.module.rpartition(".")[2])
-    return names

@@ -64,17 +64,6 @@ def test_loss_of_discrete_actions_is_the_cross_entropy(categorical):
         )
 
 
-def test_coefficient_of_zero_changes_nothing():
-    def trained(*auxiliary):
-        torch.manual_seed(0)
-        env = worlds.cones(cars=16)
-        ppo = PPO(env, auxiliary=auxiliary, epochs=2, minibatches=2)
-        ppo.update(Rollout(env, ppo.policy, 8, ppo.keys).collect(), progress=1.0)
-        return torch.cat([p.detach().flatten() for p in ppo.gradient.parameters])
-
-    torch.testing.assert_close(trained(), trained(KickstartLoss(Linear(1.0, 0.0))))
-
-
 def test_loss_of_several_choices_is_their_cross_entropy():
     torch.manual_seed(0)
     env = AnyEnv(8, MultiCategorical([2, 4]))
@@ -138,10 +127,3 @@ def test_loss_is_added_to_that_of_the_policy_of_sac_by_its_schedule():
             KickstartLoss().each(sac.actor, data).mean(),
         )
     assert sac.update(rollout.collect())["loss_guide"] != 0
-
-
-def test_filter_needs_a_learner_with_action_values():
-    with pytest.raises(
-        ValueError, match="compares values of actions; take learner=sac, or KickstartLoss"
-    ):
-        PPO(worlds.cones(), auxiliary=[FilteredKickstartLoss()])

@@ -6,25 +6,16 @@ import math
 import pytest
 import torch
 import worlds
+from any_env import AnyEnv, action_of, learning
 from tensordict import TensorDict
-from torchrl.envs import Compose, PendulumEnv, TransformedEnv
+from torchrl.envs import PendulumEnv
 
-from coil_rl.envs import ConeTrackEnv, shipped_tracks
-from coil_rl.guides import RandomGuide
-from coil_rl.learners import DQN, SAC, TQC, CrossQ
+from coil_rl.learners import DQN, SAC
 from coil_rl.learners.n_step import NStep, discount
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.learners.policy import Entries
 from coil_rl.run.rollout import Rollout
-from coil_rl.transforms import (
-    DelayedAdvice,
-    DiscreteActions,
-    GradualResidual,
-    GuideActions,
-    JumpStart,
-    MixedAction,
-    Takeover,
-)
+from coil_rl.transforms import DiscreteActions, GradualResidual, JumpStart, MixedAction, Takeover
 
 
 def steps(first, count, **more):
@@ -165,9 +156,7 @@ def test_stored_steps_agree_with_the_env(name):
     taken = learner.buffer[:]
     assert len(taken) == 60
     action = taken["action"]
-    if (
-        name == "gradual residual"
-    ):  # the sum is a part of the env, and the agent's action is 0 where it does not act
+    if name == "gradual residual":  # the sum is a part of the env; an agent that rests adds 0
         action = (taken["guide_action"][:, 0] + 0.5 * action).clamp(-2, 2)
     state = PendulumEnv.gen_params(batch_size=[60]).update(taken.select("th", "thdot"))
     after = PendulumEnv().step(state.set("action", action))["next"]
@@ -198,55 +187,11 @@ def test_steps_of_the_guide_are_sampled_as_their_share():
     assert learner.kept == 80
 
 
-TINY = {
-    "starts": 20,
-    "batch_size": 16,
-    "updates_per_step": 0.125,
-    "capacity": 90,
-    "hidden": [8],
-}
-
-
-def make(kind, seed=0, **changes):
-    """A learner and its rollouts, with random, delayed advice, which no observation determines."""
-    torch.manual_seed(seed)
-    advice = [GuideActions({"any": RandomGuide(seed=seed)}), DelayedAdvice(2)]
-    discrete = [DiscreteActions(5)] if kind is DQN else []
-    env = TransformedEnv(
-        ConeTrackEnv(shipped_tracks("train")[:2], 8, seed=seed), Compose(*advice, *discrete)
-    )
-    learner = kind(env, ["observation", "guide_action"], seed=seed, **TINY | changes)
-    return learner, Rollout(env, learner.policy, 4, learner.keys)
-
-
-@pytest.mark.fast("buffer full-DQN", "buffer full-TQC")
-@pytest.mark.parametrize("kind", [DQN, SAC, CrossQ, TQC])
-@pytest.mark.parametrize("updates", [1, 4], ids=["buffer not full", "buffer full"])
-def test_state_contains_everything_the_next_update_depends_on(kind, updates):
-    first, rollout = make(kind)
-    for _ in range(updates):
-        first.update(rollout.collect())
-    second, _ = make(kind, seed=9)
-    state = copy.deepcopy(first.state_dict())
-    assert len(state["buffers"][0]["steps"]["action"]) == min(32 * updates, 90)
-    second.load_state_dict(state)
-    batch, metrics, actions = rollout.collect(), [], []
-    for learner in (first, second):
-        torch.manual_seed(1)  # SAC samples actions
-        metrics.append(learner.update(batch.clone()))
-        actions.append(learner.policy(batch.clone())["action"])
-    assert metrics[0] == metrics[1]
-    assert torch.equal(*actions)
-    assert (first.buffer[:] == second.buffer[:]).all()
-    assert len(first.guide_buffer) == 0
-
-
 def test_steps_are_stored_with_the_advice_before_and_after_them():
-    learner, rollout = make(SAC)
+    learner, rollout = learning(SAC, worlds.cones(), ["observation", "guide_action"])
     batch = rollout.collect()
     learner.update(batch)
     steps, expected = learner.buffer[:], batch.select(*learner.stored_keys).reshape(-1)
-    assert len(steps) == 32
     for key in ("guide_action", ("next", "guide_action"), "action"):
         assert torch.equal(steps[key], expected[key])
     assert not torch.equal(steps["guide_action"], steps["next", "guide_action"])
@@ -254,7 +199,7 @@ def test_steps_are_stored_with_the_advice_before_and_after_them():
 
 @pytest.mark.parametrize("kind", [DQN, SAC])
 def test_learning_starts_after_some_steps_and_has_no_losses_before(kind):
-    learner, rollout = make(kind, starts=40)
+    learner, rollout = learning(kind, AnyEnv(action=action_of(kind)), starts=80)
     first, second = (learner.update(rollout.collect()) for _ in range(2))
     assert first["minibatches"] == 0
     assert second["minibatches"] == 4

@@ -1,4 +1,4 @@
-"""PPO's loss is written once: it is TorchRL's, and who changes it changes a default update."""
+"""PPO's loss, equation 92 of the paper, is that of TorchRL."""
 
 import copy
 
@@ -10,10 +10,10 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import MultiCategorical, Unbounded
 from torchrl.envs import TransformedEnv
-from torchrl.objectives import A2CLoss, ClipPPOLoss
+from torchrl.objectives import ClipPPOLoss
 
 from coil_rl import GymnasiumEnv
-from coil_rl.learners import A2C, PPO, Anchor
+from coil_rl.learners import PPO, Anchor
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions, NormalisedAction
 
@@ -47,14 +47,6 @@ KINDS = [
 ]
 
 
-def made(learner, make_env, options):
-    torch.manual_seed(0)
-    env = make_env()
-    passes = {} if learner is A2C else {"epochs": 2}
-    ppo = learner(env, **{"minibatches": 3, "compile": False} | passes | options)
-    return ppo, Rollout(env, ppo.policy, 27, ppo.keys)
-
-
 def reference_of(ppo, options):
     """Return TorchRL's loss of copies of the networks."""
     coefficient = options.get("entropy", 0.0)
@@ -80,10 +72,14 @@ def gradient_of(loss, *networks):
 @pytest.mark.fast(3)
 @pytest.mark.parametrize(("make_env", "options"), KINDS)
 def test_losses_and_gradients_are_those_of_torchrl(make_env, options):
-    ppo, rollout = made(PPO, make_env, options)
+    torch.manual_seed(0)
+    env = make_env()
+    ppo = PPO(env, minibatches=3, epochs=2, compile=False, **options)
+    rollout = Rollout(env, ppo.policy, 27, ppo.keys)
     for progress in (0.0, 0.5):  # then the policy has moved, and statistics are known
         batch = rollout.collect()
         rows, weights = ppo.prepare(batch.clone(), progress), ppo.loss_weights(progress)
+        rows["action_log_prob"] += 0.3 * torch.randn_like(rows["action_log_prob"])
         losses, reference = ppo.losses(rows), reference_of(ppo, options)
         data = TensorDict(dict(rows), len(rows["advantage"])).set(ppo.sample_key, rows["action"])
         expected = dict(reference(data).items())
@@ -102,40 +98,3 @@ def test_losses_and_gradients_are_those_of_torchrl(make_env, options):
         for name in expected.keys() & {"clip_fraction", "kl_approx", "max_ratio", "mean_ratio"}:
             assert report[name] == pytest.approx(float(expected[name]), rel=1e-3, abs=1e-5)
         ppo.update(batch, progress)
-
-
-class Unclipped(PPO):
-    """PPO with another loss: nothing is clipped."""
-
-    def objective(self, log_prob, minibatch):
-        ratio = (log_prob - minibatch["action_log_prob"]).exp()
-        return -ratio * minibatch["advantage"].squeeze(-1)
-
-
-@pytest.mark.fast(1)
-@pytest.mark.parametrize("options", [{}, ANCHORED, {"normalise": True}])
-def test_changed_loss_of_a_subclass_is_the_one_that_is_used(options):
-    weights = []
-    for learner in (PPO, PPO, Unclipped):
-        ppo, rollout = made(learner, worlds.cones, options)
-        ppo.update(rollout.collect())
-        weights.append(torch.cat([each.detach().flatten() for each in ppo.gradient.parameters]))
-    assert torch.equal(weights[0], weights[1])
-    assert not torch.allclose(weights[0], weights[2], atol=1e-4)
-
-
-def test_loss_of_a2c_is_that_of_torchrl():
-    a2c, rollout = made(A2C, worlds.cones, {"standardise": False})
-    rows = a2c.prepare(rollout.collect(), 0.0)
-    losses = a2c.losses(rows)
-    reference = A2CLoss(
-        a2c.policy,
-        a2c.critic,
-        entropy_bonus=False,
-        critic_coeff=0.5,
-        loss_critic_type="l2",
-        functional=False,
-    )
-    expected = reference(TensorDict(dict(rows), len(rows["advantage"])))
-    for name in ("loss_objective", "loss_critic"):
-        torch.testing.assert_close(losses[name], expected[name].mean(), rtol=1e-5, atol=1e-6)

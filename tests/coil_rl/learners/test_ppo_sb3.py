@@ -27,26 +27,6 @@ OPTIONS = {
 }  # without normaliser: the defaults of Stable-Baselines3 have none
 
 
-@pytest.mark.parametrize("deterministic", [False, True])
-def test_env_executes_the_clipped_sample_whose_probability_is_that_of_the_unclipped_one(
-    deterministic,
-):
-    torch.manual_seed(0)
-    env = worlds.cones(cars=16)
-    policy = PPO(env, action_scale=1.5, action_gain=5.0, squash=False).policy
-    batch = Rollout(env, policy, 8).collect()
-    if deterministic:
-        batch = policy(batch.select("observation"))
-        assert torch.equal(batch["unclipped_action"], batch["loc"])
-    else:
-        expected = torch.distributions.Normal(batch["loc"], batch["scale"]).log_prob(
-            batch["unclipped_action"]
-        )
-        torch.testing.assert_close(batch["action_log_prob"], expected.sum(-1))
-    assert 0 < (batch["action"].abs() == 1).float().mean() < 1
-    assert torch.equal(batch["action"], batch["unclipped_action"].clamp(-1, 1))
-
-
 @pytest.mark.fast(2)
 @pytest.mark.parametrize("kind", [PPO, A2C, TRPO, Reinforce])
 def test_learners_learn_from_the_unclipped_sample(kind):
@@ -87,11 +67,8 @@ def batch_of(model):
     buffer = model.rollout_buffer
     names = ("observations", "actions", "rewards", "episode_starts", "log_probs")
     parts = {name: torch.from_numpy(getattr(buffer, name).copy()).transpose(0, 1) for name in names}
-    observation, action, starts = (
-        parts["observations"],
-        parts["actions"],
-        parts["episode_starts"].unsqueeze(-1),
-    )
+    observation, action = parts["observations"], parts["actions"]
+    starts = parts["episode_starts"].unsqueeze(-1)
     done = torch.cat(
         [starts[:, 1:], torch.from_numpy(model._last_episode_starts)[:, None, None]], 1
     ).bool()
@@ -165,10 +142,8 @@ def test_cart_pole_is_learned_as_fast_as_by_stable_baselines3():
         torch.manual_seed(seed)
         env = TransformedEnv(CartPoles(1, seed), RewardSum())
         learner = PPO(env, **OPTIONS, seed=seed)
-        rollout, of_seed = (
-            Rollout(env, learner.policy, 2048, [*learner.keys, ("next", "episode_reward")]),
-            [],
-        )
+        keys, of_seed = [*learner.keys, ("next", "episode_reward")], []
+        rollout = Rollout(env, learner.policy, 2048, keys)
         for _ in range(12):  # 24,576 frames; the last 100 episodes count
             batch = rollout.collect()
             learner.update(batch)
