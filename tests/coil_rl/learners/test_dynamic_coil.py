@@ -3,15 +3,13 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.envs import RewardSum, TransformedEnv
+from any_env import AnyEnv, check_same_update
+from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.learners import AfterFrames, AtConvergence, DynamicCoil, PhaseSchedule, networks
 from coil_rl.learners.encoders import Mlp, ObservationNetwork
 from coil_rl.run.rollout import Rollout
-
-AGENT = (True, ())
 
 
 def schedule(guides=3, **options):
@@ -20,55 +18,28 @@ def schedule(guides=3, **options):
     )
 
 
-def phases(schedule, updates, frames=10):
-    """The learning networks in each update, as (agent, guides)."""
+def phases(schedule, updates):
+    """Return what learns in each update of 10 frames: "A" the agent, a number a guide."""
     result = []
     for _ in range(updates):
-        result.append((schedule.phase.agent, schedule.phase.guides))
-        schedule.advance(frames, reward=0.0)
+        result.append("A" * schedule.phase.agent + "".join(map(str, schedule.phase.guides)))
+        schedule.advance(10, reward=0.0)
     return result
 
 
 def test_agent_and_guides_alternate_and_the_ith_guide_phase_is_of_guide_i_mod_n():
-    assert phases(schedule(), 8) == [
-        AGENT,
-        AGENT,
-        (False, (0,)),
-        AGENT,
-        AGENT,
-        (False, (1,)),
-        AGENT,
-        AGENT,
-    ]
-    assert [guides[0] for agent, guides in phases(schedule(), 24) if not agent] == [
-        0,
-        1,
-        2,
-        0,
-        1,
-        2,
-        0,
-        1,
-    ]
-    assert set(phases(schedule(2, order="joint"), 9)) == {(True, (0, 1))}
-    assert set(phases(schedule(2, order="agent"), 9)) == {AGENT}
-    assert phases(schedule(2, order="guide"), 4) == [
-        (False, (0,)),
-        (False, (1,)),
-        (False, (0,)),
-        (False, (1,)),
-    ]
+    assert phases(schedule(), 15) == [*"AA0AA1AA2AA0AA1"]
+    assert phases(schedule(2, order="joint"), 3) == ["A01"] * 3
+    assert phases(schedule(2, order="agent"), 5) == [*"AAAAA"]
+    assert phases(schedule(2, order="guide"), 4) == [*"0101"]
 
 
 def test_stochastic_choice_is_uniform_and_follows_from_the_seed():
-    def guides(seed):
-        return [
-            guides[0]
-            for _, guides in phases(schedule(order="guide", choice="stochastic", seed=seed), 300)
-        ]
-
-    assert guides(1) == guides(1) != guides(2)
-    assert all(70 < guides(1).count(guide) < 130 for guide in range(3))
+    first, same, other = (
+        phases(schedule(order="guide", choice="stochastic", seed=seed), 300) for seed in (1, 1, 2)
+    )
+    assert first == same != other
+    assert all(70 < first.count(guide) < 130 for guide in "012")
 
 
 @pytest.mark.parametrize("choice", ["sequential", "stochastic"])
@@ -87,17 +58,8 @@ def test_convergence_is_several_evaluations_without_improvement_within_a_phase()
     assert not stop(100, [])
     assert AtConvergence(evaluations=5, frames=100)(100, [1.0])
     order = PhaseSchedule(1, agent_phase=AtConvergence(1), guide_phase=AtConvergence(1))
-    assert [order.advance(1, reward) for reward in (1, 2, 1.5, 1, 0.5)] == [
-        False,
-        False,
-        True,
-        False,
-        True,
-    ]
-
-
-def cars():
-    return TransformedEnv(ConeTrackEnv(shipped_tracks("test")[:1], 16, rate=6), RewardSum())
+    ends = [order.advance(1, reward) for reward in (1, 2, 1.5, 1, 0.5)]
+    assert ends == [False, False, True, False, True]
 
 
 def guide(env):
@@ -105,24 +67,27 @@ def guide(env):
     return networks.FastTensorDictModule(network, ["observation"], ["action"])
 
 
-def make(env, guides=("left", "right"), frames=512, seed=0, **options):
+SMALL = {
+    "minibatches": 4,
+    "epochs": 2,
+    "hidden": [16],
+    "action_gain": 1.0,
+    "learning_rate": 1e-3,
+    "guide_learning_rate": 1e-3,
+}
+
+
+def make(guides=("left", "right"), frames=512, seed=0, phases=(), **options):
+    """A learner and its rollouts, of 512 frames."""
     torch.manual_seed(seed)
-    stop = AfterFrames(frames)
-    phases = partial(PhaseSchedule, agent_phase=stop, guide_phase=stop, **options.pop("phases", {}))
-    return DynamicCoil(
+    env, stop = AnyEnv(16, Bounded(-1, 1, (1,))), AfterFrames(frames)
+    learner = DynamicCoil(
         env,
         guides={name: guide(env) for name in guides},
-        phases=phases,
-        **{
-            "minibatches": 4,
-            "epochs": 2,
-            "hidden": [16],
-            "action_gain": 1.0,
-            "learning_rate": 1e-3,
-            "guide_learning_rate": 1e-3,
-        }
-        | options,
+        phases=partial(PhaseSchedule, agent_phase=stop, guide_phase=stop, **dict(phases)),
+        **SMALL | options,
     )
+    return learner, Rollout(env, learner.policy, 32, learner.keys)
 
 
 def weights(learner):
@@ -135,9 +100,9 @@ def changed(before, after):
     return [not all(torch.equal(a, b) for a, b in zip(*groups, strict=True)) for groups in pairs]
 
 
-def updates(learner, env, count):
+def updates(learner, rollout, count):
     """The groups that each update changed, and its metrics."""
-    rollout, result = Rollout(env, learner.policy, 32, [*learner.keys]), []
+    result = []
     for number in range(count):
         before = weights(learner)
         metrics = learner.update(rollout.collect(), number / count)
@@ -147,12 +112,9 @@ def updates(learner, env, count):
 
 @pytest.mark.slow
 def test_each_phase_changes_its_networks_only_and_at_a_smaller_rate_than_the_last_of_its_kind():
-    result = updates(make(env := cars(), shrink=0.5, epochs=1), env, 4)
-    agent_phase, first, second = (
-        [True, True, False, False],
-        [False, True, True, False],
-        [False, True, False, True],
-    )
+    result = updates(*make(shrink=0.5, epochs=1), 4)
+    agent_phase, first = [True, True, False, False], [False, True, True, False]
+    second = [False, True, False, True]
     assert [groups for groups, _ in result] == [agent_phase, first, agent_phase, second]
     assert [metrics["guide"] for _, metrics in result] == [-1, 0, -1, 1]
     assert [metrics["guides_changed"] for _, metrics in result] == [0, 1, 0, 1]
@@ -160,7 +122,6 @@ def test_each_phase_changes_its_networks_only_and_at_a_smaller_rate_than_the_las
     assert [metrics["guide_learning_rate"] for _, metrics in result] == [0, 1e-3, 0, 5e-4]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "groups"),
     [
@@ -172,7 +133,7 @@ def test_each_phase_changes_its_networks_only_and_at_a_smaller_rate_than_the_las
     ],
 )
 def test_orders_and_phases_of_the_critic_change_their_networks_only(options, groups):
-    ((changed_groups, metrics),) = updates(make(env := cars(), **options), env, 1)
+    ((changed_groups, metrics),) = updates(*make(**options), 1)
     assert changed_groups == groups
     assert (metrics["moved_left"] > 0) == groups[2]
     assert (metrics["moved_right"] > 0) == groups[3]
@@ -180,55 +141,43 @@ def test_orders_and_phases_of_the_critic_change_their_networks_only(options, gro
 
 def test_dynamic_coil_with_frozen_guides_is_coil():
     """The agent acts on the observation and the actions of the guides, as with `GuideActions`."""
-    env = cars()
-    learner = make(env, phases={"order": "agent"})
-    batch = Rollout(env, learner.policy, 8).collect()
+    learner, rollout = make(phases={"order": "agent"})
+    batch = rollout.collect()
+    observed = batch.select("observation")
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        advice = torch.stack(
-            [guide(batch.select("observation"))["action"] for guide in learner.guides.values()], 2
-        )
-        torch.testing.assert_close(batch["guide_action"], advice)
-        observed = batch.select("observation").set("guide_action", advice)
-        assert torch.equal(
-            learner.policy(batch.select("observation"))["loc"], learner.policy[1](observed)["loc"]
-        )
+        actions = [guide(observed.copy())["action"] for guide in learner.guides.values()]
+        advice = torch.stack(actions, 2)
+        torch.testing.assert_close(learner.policy(observed.copy())["guide_action"], advice)
+        expected = learner.policy[1](observed.copy().set("guide_action", advice))
+        assert torch.equal(learner.policy(observed.copy())["loc"], expected["loc"])
 
 
 @pytest.mark.slow
 def test_state_resumes_in_the_middle_of_a_phase():
-    env, first = cars(), make(cars(), frames=1024)
-    batches = [Rollout(env, first.policy, 32, [*first.keys]).collect() for _ in range(5)]
-    for batch in batches[:3]:
-        first.update(batch.clone())
-    second = make(cars(), frames=1024, seed=5)
+    first, rollout = make(frames=1024)
+    for _ in range(3):
+        first.update(rollout.collect())
+    second, _ = make(frames=1024, seed=5)
     second.initial = first.initial
     second.load_state_dict(deepcopy(first.state_dict()))
-    for batch in batches[3:]:
-        assert first.update(batch.clone()) == second.update(batch.clone())
+    for _ in range(2):
+        check_same_update(first, second, rollout.collect())
     assert changed(weights(first), weights(second)) == [False] * 4
 
 
 @pytest.mark.slow
 def test_guide_learns_to_steer_through_a_frozen_agent():
-    """Steering left is rewarded. The guide can change it only through its advice to the agent."""
-    env = cars()
-    learner = make(
-        env,
-        guides=("only",),
-        phases={"order": "guide"},
-        gamma=0.0,
-        epochs=8,
-        guide_learning_rate=3e-3,
-    )
-    rollout = Rollout(env, learner.policy, 32, [*learner.keys])
+    """A large action is rewarded. The guide can change it only through its advice to the agent."""
+    options = {"gamma": 0.0, "epochs": 8, "guide_learning_rate": 3e-3}
+    learner, rollout = make(guides=("only",), phases={"order": "guide"}, **options)
     observed = rollout.collect().select("observation")
 
-    def steering():
+    def action():
         return float(learner.policy.get_dist(observed.copy()).deterministic_sample.detach().mean())
 
-    before = steering()
+    before = action()
     for _ in range(3):
         batch = rollout.collect()
         batch["next", "reward"] = batch["action"].clone()
         learner.update(batch)
-    assert steering() > before + 0.02
+    assert action() > before + 0.02
