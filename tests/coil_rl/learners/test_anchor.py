@@ -1,6 +1,6 @@
 import pytest
 import torch
-from any_env import AnyEnv
+from any_env import AnyEnv, learning
 from scipy import stats
 from tensordict.nn import TensorDictModule
 from torch.nn import functional as F
@@ -72,25 +72,19 @@ def test_first_policy_is_the_guide(name):
     torch.testing.assert_close(acted(learner(env).policy, data), guide(data["observation"]))
 
 
-def test_action_is_the_weighted_guide_plus_a_share_of_the_own_part_within_the_bounds():
+@pytest.mark.parametrize(("weight", "share"), [(-0.75, 0.5), (0.0, 1.0)], ids=["held", "not held"])
+def test_action_is_the_weighted_guide_plus_a_share_of_the_own_part_within_the_bounds(weight, share):
     env = advised(Bounded(-1, 1, (2,)), two_numbers, count=64)
     policy = learner(env, reach=0.5).policy
-    hold_of(policy).set([-0.75])
+    hold_of(policy).set([weight])
     data = env.reset()
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         data = policy(data)
-    expected = -0.75 * data["guide_action"][:, 0] + 0.5 * data[UNCLIPPED]
-    assert (expected.abs() > 1).any(), "the bounds matter"
+    expected = weight * data["guide_action"][:, 0] + share * data[UNCLIPPED]
+    assert weight == 0 or (expected.abs() > 1).any(), "the bounds matter"
     torch.testing.assert_close(data["action"], expected.clamp(-1, 1))
-
-
-def test_logarithmic_probability_is_that_of_the_own_part():
-    env = advised(Bounded(-1, 1, (2,)), two_numbers)
-    policy = learner(env).policy
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        data = policy(env.reset())
-    expected = policy.get_dist(data).log_prob(data[UNCLIPPED])
-    torch.testing.assert_close(data["action_log_prob"], expected)
+    of_own_part = policy.get_dist(data).log_prob(data[UNCLIPPED])
+    torch.testing.assert_close(data["action_log_prob"], of_own_part)
 
 
 @pytest.mark.parametrize(("count", "probability"), [(2, 0.75), (4, 3 / (3 + 3**0.5))])
@@ -117,13 +111,8 @@ def test_opposite_of_choices_is_their_reverse_order(name):
 
 @pytest.mark.parametrize("kind", [PPO, A2C, Reinforce, TRPO, SAC, DQN])
 def test_advice_is_hidden_while_no_guide_is_held(kind):
-    action = OneHot(3) if kind is DQN else Bounded(-1, 1, (2,))
-    guide = ACTIONS["one-hot"][1] if kind is DQN else two_numbers
-    if kind is DQN:
-        action = OneHot(4)
-    env = advised(action, guide)
-    options = REPLAY if kind in (SAC, DQN) else {"minibatches": 2}
-    policy = kind(env, KEYS, action_gain=1.0, anchor=Anchor(), **options).policy
+    env = advised(*ACTIONS["one-hot" if kind is DQN else "bounded"])
+    policy = learning(kind, env, KEYS, action_gain=1.0, anchor=Anchor())[0].policy
     data = env.reset()
     other = data.clone().set("guide_action", data["guide_action"].flip(0))
     if kind is not DQN:
@@ -150,15 +139,6 @@ def test_guides_that_are_not_held_rest_unless_something_else_reads_their_advice(
         assert torch.equal(batches[0][key], batches[1][key])
 
 
-def test_without_a_held_guide_actions_are_those_of_ppo():
-    env = advised(Bounded(-1, 1, (2,)), two_numbers)
-    policy = learner(env).policy
-    hold_of(policy).set([0.0])
-    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-        data = policy(env.reset())
-    torch.testing.assert_close(data["action"], data[UNCLIPPED], rtol=0, atol=0)
-
-
 def test_policy_with_a_memory_starts_at_the_guide_and_learns():
     gru = Gru(state=8)
     env = advised(Bounded(-1, 1, (2,)), lambda observation: two_numbers(observation) / 2)
@@ -171,17 +151,14 @@ def test_policy_with_a_memory_starts_at_the_guide_and_learns():
     assert (acted(ppo.policy, data) - before).abs().max() > 0
 
 
-REPLAY = {"starts": 16, "batch_size": 16, "updates_per_step": 0.25}
-
-
 def test_sac_starts_at_the_guide_and_learns_its_own_part():
     torch.manual_seed(0)
     env = advised(Bounded(-1, 1, (2,)), two_numbers)
-    sac = SAC(env, KEYS, action_gain=0.0, anchor=Anchor(), **REPLAY)
+    sac, rollout = learning(SAC, env, KEYS, action_gain=0.0, anchor=Anchor())
     data = env.reset()
     first = acted(sac.policy, data)
     torch.testing.assert_close(first, two_numbers(data["observation"]))
-    batch = Rollout(env, sac.policy, 8, sac.keys).collect()
+    batch = rollout.collect()
     assert sac.update(batch, 0.25)["minibatches"] > 0
     assert torch.equal(sac.buffer[:]["action"], batch["action"].reshape(-1, 2))
     assert UNCLIPPED not in sac.buffer[:], "critics rate what is executed"
@@ -192,18 +169,16 @@ def test_sac_starts_at_the_guide_and_learns_its_own_part():
 def test_dqn_takes_the_advised_option_unless_it_is_worse_by_more_than_the_weighted_range(
     weight, advised_acts
 ):
-    env = advised(
-        OneHot(3), lambda observation: F.one_hot(torch.ones_like(observation[..., 0]).long(), 3)
-    )
-    dqn = DQN(env, KEYS, action_gain=0.0, anchor=Anchor(choice_weight=weight), **REPLAY)
-    assert acted(dqn.policy, env.reset()).argmax(-1).eq(1).all(), (
-        "without any knowledge of the values"
-    )
+    second = torch.tensor([0, 1, 0])
+    env = advised(OneHot(3), lambda observation: second.expand(*observation.shape[:-1], 3))
+    anchor = Anchor(choice_weight=weight)
+    dqn, rollout = learning(DQN, env, KEYS, action_gain=0.0, anchor=anchor)
+    of_unknown_values = acted(dqn.policy, env.reset())
+    assert of_unknown_values.argmax(-1).eq(1).all()
     values = dqn.policy.module[2]
-    numbers = torch.tensor([[4.0, 2.0, 0.0]])
-    data = env.reset()[:1].set("action_value", numbers)
+    data = env.reset()[:1].set("action_value", torch.tensor([[4.0, 2.0, 0.0]]))
     assert values(data)["action_value"].argmax().item() == (1 if advised_acts else 0)
-    metrics = dqn.update(Rollout(env, dqn.policy, 8, dqn.keys).collect(), 0.0)
+    metrics = dqn.update(rollout.collect(), 0.0)
     assert metrics["epsilon"] == pytest.approx(0.3), "little noise"
 
 
@@ -221,8 +196,8 @@ def test_steps_in_which_the_guide_acts_are_learned_from():
     guide = TensorDictModule(two_numbers, in_keys=["observation"], out_keys=["action"])
     parts = Compose(GuideActions({"guide": guide}), Takeover(0.5))
     env = TransformedEnv(AnyEnv(action=Bounded(-1, 1, (2,))), parts)
-    sac = SAC(env, KEYS, anchor=Anchor(), **REPLAY)
-    batch = Rollout(env, sac.policy, 8, sac.keys).collect()
+    sac, rollout = learning(SAC, env, KEYS, anchor=Anchor())
+    batch = rollout.collect()
     assert sac.update(batch, 0.25)["minibatches"] > 0
     executed = batch["next", "executed_action"].reshape(-1, 2)
     torch.testing.assert_close(sac.buffer[:]["action"], executed)
@@ -298,15 +273,18 @@ def test_numbers_are_those_of_guide_and_new_policy_in_the_same_cases():
     assert numbers["start/guide"] - numbers["start/new"] == pytest.approx(1000, abs=1)
 
 
-def test_opposite_of_a_reversed_guide_is_held():
-    assert decided(lambda weights: -100 * weights[0])[0] == [-1]
-
-
-def test_best_of_several_guides_is_held():
-    def of(weights):
-        return 100 * weights[0] + 200 * weights[1] + 50 * weights[2]
-
-    assert decided(of, guides=3)[0] == [0, 1, 0]
+@pytest.mark.parametrize(
+    ("of", "held"),
+    [
+        (lambda weights: -100 * weights[0], [-1]),
+        (lambda weights: 100 * weights[0] + 200 * weights[1] + 50 * weights[2], [0, 1, 0]),
+        (lambda weights: 100 - 60 * abs(weights[0] - 0.5) if weights[0] else 0, [0.5]),
+        (lambda weights: 100 * (weights[0] in (-0.75, -1.0)) - weights[0], [-1]),
+    ],
+    ids=["reversed", "several", "a lower gain is better", "a lower gain of the opposite is not"],
+)
+def test_best_guide_opposite_or_gain_is_held(of, held):
+    assert decided(of, guides=len(held))[0] == held
 
 
 @pytest.mark.parametrize("gain", [0.3, 0.0, -1.0], ids=["a little better", "equal", "worse"])
@@ -406,15 +384,6 @@ def test_lower_gains_beyond_the_share_must_pass_the_bars():
     assert taken[200_000] >= 15
     much_better = Returns(lambda weights: 130 - 60 * weights[0] if weights[0] else 0, frames=24_000)
     assert decided(None, cases=much_better)[0] == [0.5]
-
-
-def test_lower_gain_is_taken_only_if_it_is_better():
-    weights, *_ = decided(lambda weights: 100 - 60 * abs(weights[0] - 0.5) if weights[0] else 0)
-    assert weights == [0.5]
-    weights, *_ = decided(lambda weights: 100 * weights[0])
-    assert weights == [1]
-    weights, *_ = decided(lambda weights: 100 * (weights[0] in (-0.75, -1.0)) - weights[0])
-    assert weights == [-1], "the opposite keeps its sign"
 
 
 def test_gains_are_not_tried_for_choices():
