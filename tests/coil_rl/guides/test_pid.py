@@ -1,4 +1,5 @@
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -119,30 +120,21 @@ def test_pid_has_the_contract_of_a_guide_and_the_bounds_of_its_env() -> None:
     assert guide.numbers[5:].flatten().tolist() == [-2.0, 2.0]
 
 
+def used(measured: Any, env: str = "Pendulum-v1") -> None:
+    check_guide(PID(measured), GymnasiumEnv(env, num_envs=2))
+
+
 @pytest.mark.parametrize(
-    ("arguments", "env", "sentence"),
+    ("use", "sentence"),
     [
-        ({"measured": ["a", "b"], "kp": [1.0, 2.0, 3.0]}, None, "kp has 3 values.* 2 loops"),
-        ({"measured": []}, None, "measured names no entry"),
-        (
-            {"measured": "observation"},
-            "Pendulum-v1",
-            r"has 3 numbers; give .*\[observation,INDEX\]",
-        ),
-        ({"measured": ["observation", 1]}, "CartPole-v1", "actions of this env are choices"),
-        (
-            {"measured": [["observation", 0], ["observation", 1]]},
-            "Pendulum-v1",
-            "1 numbers, but the PID 2 loops",
-        ),
+        (lambda: PID(["a", "b"], kp=[1.0, 2.0, 3.0]), "kp has 3 values.* 2 loops"),
+        (lambda: PID([]), "measured names no entry"),
+        (lambda: used("observation"), r"has 3 numbers; give .*\[observation,INDEX\]"),
+        (lambda: used(["observation", 1], "CartPole-v1"), "actions of this env are choices"),
+        (lambda: used([["observation", 0], ["observation", 1]]), "1 numbers, but the PID 2 loops"),
     ],
 )
-def test_what_does_not_fit_is_refused(
-    arguments: dict[str, Any], env: str | None, sentence: str
-) -> None:
-    def use() -> None:
-        check_guide(PID(**arguments), GymnasiumEnv(env or "Pendulum-v1", num_envs=2))
-
+def test_what_does_not_fit_is_refused(use: Callable[[], Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         use()
 

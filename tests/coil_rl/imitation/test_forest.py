@@ -83,10 +83,7 @@ def test_forged_state_is_refused(forgery):
 
 
 def test_state_of_other_inputs_and_of_an_earlier_version_is_refused():
-    for inputs, state in (
-        (2, fitted().get_extra_state()),
-        (4, torch.zeros(9, dtype=torch.uint8)),
-    ):
+    for inputs, state in ((2, fitted().get_extra_state()), (4, torch.zeros(9, dtype=torch.uint8))):
         with pytest.raises(UserError, match=f"is not a forest of {inputs} inputs"):
             ForestRegressor().fresh(inputs, 1).set_extra_state(state)
 

@@ -3,10 +3,10 @@ import math
 import pytest
 import torch
 import worlds
-from tensordict import TensorDict
+from any_env import AnyEnv
 from tensordict.nn import TensorDictModule
-from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.data import Bounded, Unbounded
+from torchrl.envs import SerialEnv, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
@@ -139,50 +139,21 @@ def test_resumed_learner_equals_an_uninterrupted_one(name, env, batches, tmp_pat
     assert (first.dataset == second.dataset).all()
 
 
-class Points(EnvBase):
-    """A batch [2, 3] of points to move to the origin."""
-
-    def __init__(self):
-        super().__init__(batch_size=[2, 3])
-        self.observation_spec = Composite(
-            place=Unbounded((2, 3, 2)), wind=Unbounded((2, 3)), shape=(2, 3)
-        )
-        self.action_spec = Bounded(torch.tensor([-1.0, 1.0]), torch.tensor([1.0, 3.0])).expand(
-            2, 3, 2
-        )
-        self.reward_spec = Unbounded((2, 3, 1))
-        self.generator = torch.Generator().manual_seed(0)
-
-    def _reset(self, tensordict=None, **kwargs):
-        place = torch.randn(2, 3, 2, generator=self.generator)
-        return TensorDict({"place": place, "wind": place.sum(-1)}, [2, 3])
-
-    def _step(self, tensordict):
-        place = tensordict["place"] + 0.1 * tensordict["action"]
-        done = torch.zeros(2, 3, 1, dtype=torch.bool)
-        return TensorDict(
-            {
-                "place": place,
-                "wind": place.sum(-1),
-                "reward": -place.norm(dim=-1, keepdim=True),
-                "done": done,
-            },
-            [2, 3],
-        )
-
-    def _set_seed(self, seed):
-        pass
+def places():
+    """A batch [2, 3] of envs with two entries and an action of two numbers."""
+    action = Bounded(torch.tensor([-1.0, 1.0]), torch.tensor([1.0, 3.0]))
+    seen = {"place": Unbounded((2,)), "wind": Unbounded(())}
+    return SerialEnv(2, lambda: AnyEnv(3, action, seen))
 
 
 @pytest.mark.parametrize("name", REGRESSORS)
 def test_two_dimensional_actions_and_batches(name):
     def linear(place, wind):
-        return 0.1 * (wind.unsqueeze(-1) - place) + torch.tensor(
-            [0.0, 2.0]
-        )  # within the bounds of the action
+        centre = torch.tensor([0.0, 2.0])
+        return centre + 0.1 * (wind.unsqueeze(-1) - place)  # within the bounds of the action
 
     pull = TensorDictModule(linear, ["place", "wind"], ["action"])
-    env = TransformedEnv(Points(), GuideActions({"pull": pull}))
+    env = TransformedEnv(places(), GuideActions({"pull": pull}))
     learner = Imitation(env, ["place", "wind"], regressor=REGRESSORS[name]())
     before = learner.policy(env.reset())["action"]
     assert torch.equal(before, torch.tensor([0.0, 1.0]).expand(2, 3, 2))

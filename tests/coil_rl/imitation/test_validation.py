@@ -47,10 +47,7 @@ def test_error_on_left_out_tracks_equals_that_of_scikit_learn_for_every_seed():
 
 def test_without_tracks_there_is_a_random_split_only():
     x, y, groups = sines()
-    assert set(cross_validate(LinearRegressor(), x, y)) == {
-        "mse_random_split",
-        "r2_random_split",
-    }
+    assert set(cross_validate(LinearRegressor(), x, y)) == {"mse_random_split", "r2_random_split"}
     with pytest.raises(UserError, match="from one track"):
         cross_validate(LinearRegressor(), x, y, torch.zeros_like(groups))
     with pytest.raises(UserError, match="9 samples are too few"):
