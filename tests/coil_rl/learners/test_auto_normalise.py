@@ -1,6 +1,5 @@
 """Observations in physical units: decided on the first batch, said, and kept with the policy."""
 
-import copy
 from functools import partial
 
 import gymnasium
@@ -11,20 +10,11 @@ from gymnasium.spaces import Box
 from tensordict import TensorDict
 
 import coil_rl
-from coil_rl.errors import UserError
 from coil_rl.learners.normaliser import Moments
-from coil_rl.run.training import training_of
 
 TINY = ["budget.num_envs=4", "budget.steps=16", "evaluation.cases=2", "logger=none"]
 TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
-TINY += ["checkpoint_every=1"]
-ON_POLICY = ["learner.minibatches=2"]
-REPLAY = [
-    "learner=sac",
-    "learner.starts=16",
-    "learner.updates_per_step=0.015625",
-    "learner.batch_size=16",
-]
+TINY += ["checkpoint_every=1", "learner.minibatches=2"]
 
 
 class Reactor(gymnasium.Env):
@@ -54,26 +44,21 @@ class Reactor(gymnasium.Env):
 PHYSICAL = partial(Reactor, (322.0, 7000.0), (0.5, 900.0))
 
 
-def learned(env, folder, *overrides, frames=128, method="ppo"):
-    run = coil_rl.prepare(
-        env, method=method, frames=frames, folder=folder, overrides=[*TINY, *overrides]
-    )
+def learned(env, folder, *overrides, frames=128):
+    words = [*TINY, *overrides]
+    run = coil_rl.prepare(env, method="ppo", frames=frames, folder=folder, overrides=words)
     run.begin()
     run.learn()
     return run
 
 
-def used(run, which="last"):
-    (moments,) = [m for m in run.policy(which=which).modules() if isinstance(m, Moments)]
-    return bool(moments.used)
-
-
 @pytest.mark.slow
 def test_observations_in_scale_stay_as_they_are(tmp_path, capsys):
-    run = learned(Reactor, tmp_path / "auto", *ON_POLICY)
+    run = learned(Reactor, tmp_path / "auto")
     assert "normalise: observation is in scale and stays as it is" in capsys.readouterr().err
-    assert not used(run)
-    raw = learned(Reactor, tmp_path / "raw", *ON_POLICY, "learner.normalise=false")
+    (moments,) = (each for each in run.policy().modules() if isinstance(each, Moments))
+    assert not moments.used
+    raw = learned(Reactor, tmp_path / "raw", "learner.normalise=false")
     state, expected = run.policy().state_dict(), raw.policy().state_dict()
     for key, value in expected.items():
         found = [state[name] for name in state if name.endswith(key.split(".", 2)[2])]
@@ -81,32 +66,10 @@ def test_observations_in_scale_stay_as_they_are(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_decision_is_resumed_to_the_bit(tmp_path, capsys):
-    words = [*TINY, *ON_POLICY]
-    run = coil_rl.prepare(
-        PHYSICAL, method="ppo", frames=256, folder=tmp_path / "run", overrides=words
-    )
-    run.begin()
-    experiment, other = training_of(run, 0), training_of(run, 0)
-    experiment.update(0.0)
-    other.load_state_dict(copy.deepcopy(experiment.state_dict()))
-    capsys.readouterr()
-    for each in (experiment, other):
-        each.update(0.25)
-    assert "normalise" not in capsys.readouterr().err  # decided once
-    ours, theirs = (each.learner.normaliser.state_dict() for each in (other, experiment))
-    assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
-    assert bool(other.learner.normaliser.moments[0].used)
-
-
-@pytest.mark.slow
 def test_raw_observations_far_out_of_scale_are_named(tmp_path):
-    with pytest.warns(
-        UserWarning,
-        match=r"observation is observed as it is, but is far out of scale for a network: \[0\] "
-        r"mean 32\d.* deviation .*, \[1\] mean .*; use learner.normalise=auto or true",
-    ):
-        learned(PHYSICAL, tmp_path / "run", *ON_POLICY, "learner.normalise=false")
+    said = r"\[0\] mean 32\d.* deviation .*, \[1\] mean .*; use learner.normalise=auto or true"
+    with pytest.warns(UserWarning, match=f"far out of scale for a network: {said}"):
+        learned(PHYSICAL, tmp_path / "run", "learner.normalise=false")
 
 
 def test_an_entry_is_never_in_scale_and_far_out_of_scale_in_one_batch():
@@ -121,7 +84,7 @@ def test_steps_before_learning_decide_together_with_replay(capsys):
     (moments,) = sac.normaliser.moments
 
     def learn(mean, deviation):
-        batch = mean + deviation * torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]).repeat(16, 1)
+        batch = mean + deviation * torch.tensor([[-1.0], [1.0]]).repeat(16, 3)
         sac.normaliser.learn(TensorDict({"observation": batch}, 32))
         return bool(moments.used)
 
@@ -150,7 +113,7 @@ class Drifting(Reactor):
 @pytest.mark.slow
 def test_observations_that_leave_their_scale_later_are_named_once(tmp_path):
     with pytest.warns(UserWarning, match="out of scale") as found:
-        learned(Drifting, tmp_path / "run", *ON_POLICY, "budget.steps=8", frames=512)
+        learned(Drifting, tmp_path / "run", "budget.steps=8", frames=512)
     texts = [str(each.message) for each in found]
     named = [text for text in texts if "far out of scale for a network: [0] mean" in text]
     assert len(named) == 1
@@ -185,8 +148,3 @@ def test_what_is_out_of_scale(mean, variance, wrong):
     moments.mean.fill_(mean)
     moments.variance.fill_(variance)
     assert moments.out_of_scale.tolist() == [wrong]
-
-
-def test_other_word_is_refused(tmp_path):
-    with pytest.raises(UserError, match="normalise"):
-        learned(Reactor, tmp_path / "run", *ON_POLICY, "learner.normalise=sometimes")

@@ -1,6 +1,5 @@
 """Extensions of learners: what is not part of an algorithm, handed over as one list."""
 
-import copy
 from pathlib import Path
 
 import pytest
@@ -40,12 +39,6 @@ class Counting(Extension):
         self.updates += 1
         return {"updates": float(self.updates)}
 
-    def state_dict(self):
-        return {"updates": self.updates}
-
-    def load_state_dict(self, state):
-        self.updates = state["updates"]
-
 
 def make(*extensions, kind=PPO, **options):
     torch.manual_seed(0)
@@ -81,25 +74,6 @@ def test_loss_of_an_extension_trains_the_policy_of_each_on_policy_learner(kind):
     for _ in range(5):
         after = learner.update(rollout.collect(), 0.5)["loss_noise"]
     assert after < before
-
-
-def test_state_of_an_extension_is_part_of_that_of_the_learner():
-    learner, rollout = make(Counting())
-    learner.update(rollout.collect())
-    state = copy.deepcopy(learner.state_dict())
-    counting = Counting()
-    other, _ = make(counting)
-    other.load_state_dict(state)
-    assert counting.updates == 1
-
-
-def test_extension_without_methods_changes_nothing():
-    trained = []
-    for extensions in ((), (Extension(),)):
-        learner, rollout = make(*extensions)
-        learner.update(rollout.collect())
-        trained.append(torch.nn.utils.parameters_to_vector(learner.policy.parameters()))
-    assert torch.equal(*trained)
 
 
 def test_extensions_act_one_after_the_other():

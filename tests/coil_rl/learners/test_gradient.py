@@ -26,9 +26,8 @@ def numbers(learner):
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv(
-        "XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp())
-    )  # one for all tests here
+    one_for_all_tests = str(tmp_path_factory.getbasetemp())
+    monkeypatch.setenv("XDG_CACHE_HOME", one_for_all_tests)
 
 
 REPLAY = {"starts": 64, "batch_size": 32}
@@ -76,10 +75,7 @@ def test_auto_compiles_a_run_of_many_steps_and_remembers_it(monkeypatch):
     monkeypatch.setattr(gradient, "ENOUGH", 100)
     for updates, expected in ((2, False), (10, True)):  # of 20 steps each
         ppo, rollout = make(PPO, "auto", minibatches=4)
-        for waiting in (
-            0.0,
-            0.2,
-        ):  # nothing is learned yet, as before there are enough steps for replay
+        for waiting in (0.0, 0.2):  # with replay nothing is learned at first
             ppo.gradient.begin(waiting)
         ppo.update(rollout.collect(), 0.4)
         assert ppo.gradient.compile == "auto"
@@ -95,9 +91,7 @@ def test_auto_goes_on_without_a_compiler_and_true_does_not(monkeypatch, tmp_path
     monkeypatch.setattr(gradient, "ENOUGH", 1)
     ppo, rollout = make(PPO, "auto", minibatches=3)
     ppo.update(rollout.collect(), 0.0)
-    with pytest.warns(
-        UserWarning, match=r"without a C\+\+ compiler.*the update goes on uncompiled"
-    ):
+    with pytest.warns(UserWarning, match=r"without a C\+\+ compiler.*goes on uncompiled"):
         assert ppo.update(rollout.collect(), 0.5)["compiled"] == 0.0
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -59,17 +59,17 @@ def test_learner_learns_the_same_in_every_unit_of_the_reward(kind):
     ("kind", "options"),
     [
         *((kind, {"normalise": True, "scale_rewards": True}) for kind in KINDS),
-        *((kind, {}) for kind in (PPO, SAC, CrossQ)),
-        (TQC, {"n_step": 3}),
+        *((kind, {"normalise": "auto"}) for kind in (PPO, SAC, CrossQ)),
+        (TQC, {"normalise": True, "n_step": 3}),
     ],
 )
 def test_restored_learner_goes_on_with_the_same_digits(kind, options, updates):
     torch.manual_seed(0)
     replay = {} if issubclass(kind, PPO) else {"capacity": 150}
-    first, rollout = learning(kind, InUnits(kind), **options, **replay)
+    first, rollout = learning(kind, InUnits(kind, unit=1e3), **options, **replay)
     for _ in range(updates):
         first.update(rollout.collect())
-    second, _ = learning(kind, InUnits(kind), **options, **replay, seed=9)
+    second, _ = learning(kind, InUnits(kind, unit=1e3), **options, **replay, seed=9)
     second.load_state_dict(copy.deepcopy(first.state_dict()))
     check_same_update(first, second, rollout.collect())
     if replay:

@@ -55,6 +55,7 @@ def constant():
 
 
 COMMON = {"gamma": 2, "learning_rate": -1, "action_gain": -1, "hidden": [0], "seed": -1}
+COMMON |= {"normalise": "sometimes"}
 REPLAY = {"tau": 2, "batch_size": 0, "capacity": 10, "updates_per_step": -1, "starts": -1}
 OWN = {"minibatches": 0, "action_scale": 0, "epochs": 0, "clip": 0, "entropy": -1, "critic": -1}
 OUT_OF_RANGE = [
