@@ -6,11 +6,9 @@ import numpy as np
 import odd_recordings as odd
 import pytest
 import zstandard
-from drives import store
-from mcap.writer import CompressionType, Writer
+from drives import rosbag_of, store
 
 from coil_rl.envs.recordings.folders import RecordingError
-from coil_rl.envs.recordings.mcap_files import read_messages
 from coil_rl.envs.recordings.messages import encode
 from coil_rl.envs.recordings.reading import read_recording
 
@@ -18,12 +16,6 @@ from coil_rl.envs.recordings.reading import read_recording
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
     return odd.good_drive(tmp_path_factory.mktemp("good"))
-
-
-def changed(good, change, folder):
-    drive = odd.messages_of(good)
-    change(drive)
-    return odd.write(folder / "odd.mcap", drive)
 
 
 def remarks(path):
@@ -38,69 +30,61 @@ def remarks(path):
 
 @pytest.mark.slow
 def test_good_drive_leaves_no_doubts(good, tmp_path):
-    assert remarks(good) == remarks(odd.write(tmp_path / "same.mcap", odd.messages_of(good))) == []
+    assert remarks(good) == []
+    assert remarks(odd.changed(good, odd.stamped_commands, tmp_path)) == []
 
 
-@pytest.mark.parametrize("change", [each for each in odd.ODD if each not in odd.OF_A_REPLAY])
-def test_odd_recording_is_said_to_be_odd(good, change, tmp_path):
-    said, words = remarks(changed(good, change, tmp_path)), odd.ODD[change]
-    assert any(words in remark for remark in said) if words else said == [], said
+@pytest.mark.parametrize(("change", "words"), odd.OF_A_READING)
+def test_odd_recording_is_said_to_be_odd(good, change, words, tmp_path):
+    said = remarks(odd.changed(good, change, tmp_path))
+    assert any(words in remark for remark in said), said
 
 
-@pytest.mark.parametrize("change", odd.ODD_FOLDERS)
-def test_odd_folder_is_said_to_be_odd(good, change, tmp_path):
-    said, words = remarks(odd.make_odd_folder(tmp_path, good, change)), odd.ODD_FOLDERS[change]
+@pytest.mark.parametrize(("change", "words"), odd.OF_A_FOLDER)
+def test_odd_folder_is_said_to_be_odd(good, change, words, tmp_path):
+    said = remarks(odd.changed_folder(good, change, tmp_path))
     assert any(words in remark for remark in said) if words else said == [], said
 
 
 def test_command_that_is_too_old_is_none(good, tmp_path):
     with pytest.warns(UserWarning, match="has no command of the last"):
-        recording = read_recording(changed(good, odd.commands_end_early, tmp_path))
+        recording = read_recording(odd.changed(good, odd.commands_end_early, tmp_path))
     known = ~np.isnan(recording.commands_of_scans(0.15)[:, 1])
     # The twelfth command is sent with the twelfth scan, and counts for three turns.
     assert known.tolist() == [True] * 15 + [False] * 29
 
 
-@pytest.mark.parametrize("change", odd.IN_BURSTS)
-def test_commands_belong_to_the_scans_of_their_time_and_not_of_their_log(good, change, tmp_path):
+@pytest.mark.parametrize(("change", "words"), odd.IN_BURSTS)
+def test_commands_belong_to_the_scans_of_their_time_and_not_of_their_log(
+    good, change, words, tmp_path
+):
     expected = read_recording(good).commands_of_scans(0.15)
-    with pytest.warns(UserWarning, match="late, so their stamps are the clock"):
-        found = read_recording(changed(good, change, tmp_path)).commands_of_scans(0.15)
+    with pytest.warns(UserWarning, match=words):
+        found = read_recording(odd.changed(good, change, tmp_path)).commands_of_scans(0.15)
     np.testing.assert_allclose(found, expected)
 
 
 def test_command_of_another_type_is_no_label_for_its_scan(good, tmp_path):
     with pytest.warns(UserWarning, match="22 of geometry_msgs/msg/Twist are read"):
-        recording = read_recording(changed(good, odd.stamped_commands_by_turns, tmp_path))
+        recording = read_recording(odd.changed(good, odd.stamped_commands_by_turns, tmp_path))
     commands = recording.commands_of_scans(0.15)[:, 1]
     assert np.isnan(commands).tolist() == [False, True] * 22
     np.testing.assert_allclose(commands[::2], read_recording(good).commands_of_scans(0.15)[::2, 1])
 
 
 def test_log_clock_that_is_set_back_is_named_and_stamps_give_the_order(good, tmp_path):
-    contents, path = read_messages(good), tmp_path / "back.mcap"
-    start = 10**10
-    with path.open("wb") as stream:
-        writer = Writer(stream, 10**7, CompressionType.NONE)
-        writer.start("ros2")
-        channels = {}
-        for topic, messages in contents.messages.items():
-            channel = messages[0].channel
-            schema = writer.register_schema(channel.message_type, "ros2msg", channel.definition)
-            channels[topic] = writer.register_channel(topic, "cdr", schema)
-        sent = [each for messages in contents.messages.values() for each in messages]
-        for each in sorted(sent, key=lambda each: (each.log_time, each.channel.topic != "/scan")):
-            later = start + each.log_time - (5 * 10**9 if each.log_time > 4 * 10**9 else 0)
-            writer.add_message(channels[each.channel.topic], later, each.data, later)
-        writer.finish()
+    messages = [
+        (topic, kind, time - 5 * 10**9 * (time > odd.START + 4 * 10**9), fields)
+        for topic, kind, time, fields in odd.messages_of(good).all()
+    ]
     with pytest.warns(UserWarning, match="log times that step back by 4.82 s, so stamps give"):
-        recording = read_recording(path)
+        recording = read_recording(rosbag_of(tmp_path / "back", *messages))
     assert len(recording.remarks) == 1
     expected = read_recording(good)
     np.testing.assert_array_equal(recording.ranges, expected.ranges)
-    found = recording.commands_of_scans(0.15), recording.poses()
-    np.testing.assert_allclose(found[0], expected.commands_of_scans(0.15))
-    np.testing.assert_allclose(found[1], expected.poses())
+    found = recording.commands_of_scans(0.15)
+    np.testing.assert_allclose(found, expected.commands_of_scans(0.15))
+    np.testing.assert_allclose(recording.poses(), expected.poses())
 
 
 def test_messages_that_are_compressed_one_by_one_are_named(tmp_path):
@@ -114,16 +98,18 @@ def test_command_long_after_the_last_scan_before_a_gap_does_not_belong_to_it(goo
         del drive.scans[5:40], drive.commands[4:35]
 
     with pytest.warns(UserWarning, match="has 1 gap of more than 2.5 turns"):
-        recording = read_recording(changed(good, early_gap, tmp_path))
+        recording = read_recording(odd.changed(good, early_gap, tmp_path))
     # Without the gap it would be the fifth command, which is sent just before the sixth scan.
     assert recording.commands_of_scans(0.15)[4, 1] == recording.commands[0][3, 1]
 
 
-@pytest.mark.parametrize("kind", [odd.ackermann, odd.ackermann_stamped])
-def test_ackermann_commands_are_steering_angles(good, kind, tmp_path):
+@pytest.mark.parametrize(
+    "change", [odd.ackermann_on_another_topic, odd.stamped_ackermann_on_another_topic]
+)
+def test_ackermann_commands_are_steering_angles(good, change, tmp_path):
     twists = read_recording(good)
     with pytest.warns(UserWarning, match="those on /drive are read instead"):
-        angles = read_recording(changed(good, kind, tmp_path))
+        angles = read_recording(odd.changed(good, change, tmp_path))
     assert (angles.steered, twists.steered) == (True, False)
     expected = twists.commands[0][:, 1]
     found = 0.15 * np.sin(angles.commands[0][:, 1]) / (2 / 7)
@@ -131,19 +117,14 @@ def test_ackermann_commands_are_steering_angles(good, kind, tmp_path):
 
 
 def test_poses_of_ackermann_commands_are_those_of_the_turn_rates(good, tmp_path):
-    def without_odometry(drive):
-        odd.ackermann(drive)
-        drive.odometry = []
-
     twists = read_recording(good, odometry=None)
-    with pytest.warns(UserWarning, match="read instead"):
-        angles = read_recording(changed(good, without_odometry, tmp_path))
+    angles = read_recording(odd.changed(good, odd.ackermann, tmp_path), odometry=None)
+    assert angles.remarks == []
     np.testing.assert_allclose(angles.poses(2 / 7)[:, :2], twists.poses()[:, :2], atol=1e-5)
 
 
 def test_steering_that_a_replay_added_is_not_taken_for_commands(good, tmp_path):
-    def annotated(drive):
-        drive.command_topic = "/coil/spline/cmd_vel"
-
-    recording = read_recording(changed(good, annotated, tmp_path))
+    drive = odd.messages_of(good)
+    drive.command_topic = "/coil/spline/cmd_vel"
+    recording = read_recording(odd.write(tmp_path / "annotated.mcap", drive))
     assert (recording.commands, list(recording.remarks)) == (None, [])
