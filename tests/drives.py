@@ -1,9 +1,14 @@
-"""Recordings of a robot, made for tests."""
+"""Recordings of a robot, made for tests, and their messages as another library reads them."""
+
+import warnings
+from pathlib import Path
 
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags import rosbag2
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -12,8 +17,9 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
+from rosbags.typesys import Stores, get_typestore
 
-from coil_rl.envs import simulated_drive
+from coil_rl.envs import read_recording, simulated_drive
 from coil_rl.envs.recordings.mcap_files import Channel, RawMessage, RecordingWriter
 from coil_rl.envs.recordings.messages import (
     ODOMETRY,
@@ -26,6 +32,7 @@ from coil_rl.envs.recordings.messages import (
     twist,
 )
 
+REAL = Path(__file__).parents[2] / "shared" / "recordings"
 PERIOD = 182_000_000  # ns
 START = 1_700_000_000_000_000_000  # ns
 
@@ -122,6 +129,31 @@ def rosbag_of(folder, *messages, latched=()):
                 )
             writer.write(topics[topic], time, encode(kind, fields))
     return folder
+
+
+def by_another_library(path):
+    """The messages of each topic, and their times in ns."""
+    messages, times = {}, {}
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        for channel, time, data in reader.messages():
+            messages.setdefault(channel.topic, []).append(reader.deserialize(data, channel.msgtype))
+            times.setdefault(channel.topic, []).append(time)
+    return messages, times
+
+
+def blind(ranges, angles):
+    """Perception without cones."""
+    return np.zeros((len(ranges), 2, 16, 2)), np.zeros((len(ranges), 2))
+
+
+def real_recording(name, topic):
+    """The recording of a real sensor."""
+    path = REAL / f"{name}.mcap"
+    if not path.is_file():
+        pytest.skip("the recordings of real sensors are not part of the repository")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return read_recording(path, scan=topic, strict=True)
 
 
 def uncompressed(path):

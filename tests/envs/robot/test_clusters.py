@@ -1,18 +1,14 @@
 """Clusters of LiDAR points."""
 
-import warnings
-from pathlib import Path
-
 import numpy as np
 import pytest
+from drives import real_recording
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
-from coil_rl.envs import read_recording
 from coil_rl.envs.robot.clusters import GAP, Points, measure, points_of, single_linkage
 
-RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "recordings"
 CIRCLE = np.arange(360) * 2 * np.pi / 360 - np.pi
 
 
@@ -172,12 +168,7 @@ COUNTS = {
 
 @pytest.mark.parametrize(("name", "topic"), COUNTS)
 def test_clusters_of_real_scans_are_connected_components(name, topic):
-    path = RECORDINGS / f"{name}.mcap"
-    if not path.exists():
-        pytest.skip("the recordings of real sensors are not part of the repository")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        recording = read_recording(path, scan=topic)
+    recording = real_recording(name, topic)
     points = points_of(recording.ranges, recording.angles(0), 0.0, 1.15)
     clusters = measure(points, single_linkage(points))
     count = expect_exact(recording.ranges, recording.angles(0), 0.0)

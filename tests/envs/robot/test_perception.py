@@ -1,17 +1,15 @@
 """The cone classifier, the cones in view, and the memory of the boundaries."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from drives import real_recording
 
 from coil_rl.envs import (
     ConeClassifier,
     ConeTrackEnv,
     Perception,
     SimulatedLidar,
-    read_recording,
     shipped_tracks,
     simulated_cone_classifier,
     simulated_drive,
@@ -21,7 +19,6 @@ from coil_rl.envs.robot.lidar import cast_beams
 from coil_rl.envs.robot.perception import BoundaryMemory
 from coil_rl.guides import SplineGuide
 
-RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "recordings"
 EXACT = SimulatedLidar(noise=0.0, noise_growth=0.0, no_return=0.0, outliers=0.0)
 
 
@@ -119,9 +116,6 @@ def test_walls_are_no_cones():
     assert perception.rejected(*scan_of((3.0, 0, THICK))) == 0
 
 
-@pytest.mark.skipif(
-    not RECORDINGS.is_dir(), reason="the recordings beside the repository are not there"
-)
 @pytest.mark.parametrize(
     ("name", "topic", "share"),
     [
@@ -133,7 +127,7 @@ def test_walls_are_no_cones():
     ],
 )
 def test_share_of_clusters_in_rooms_without_cones_that_are_rejected(name, topic, share):
-    recording = read_recording(RECORDINGS / f"{name}.mcap", topic, None, None)
+    recording = real_recording(name, topic)
     rejected = Perception(simulated_cone_classifier()).rejected(
         recording.ranges, recording.angles(slice(None))
     )
