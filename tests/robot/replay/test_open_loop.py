@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from drives import blind
 from tensordict.nn import TensorDictModule
 
 from coil_rl.envs import SIGHT, McapReplayEnv, Recording
@@ -17,19 +18,12 @@ from coil_robot.replay.report import describe, disagreement, extent, outcome
 TURN_RATE, MAX_STEERING = 0.15 / (2 / 7), math.radians(80)
 
 
-def blind(ranges, angles):
-    """Perception without cones."""
-    return np.zeros((len(ranges), 2, 16, 2)), np.zeros((len(ranges), 2))
-
-
 def recording(omegas=(), times=(), scans=4, period=100, **options):
     """A recording of scans at 0, 100, 200 ... ns with commands at other times."""
     scan_times, ones = np.arange(scans) * period, np.ones(scans)
     if len(omegas):
-        options["commands"] = (
-            np.stack([np.full(len(omegas), 0.15), omegas], axis=1),
-            np.array(times),
-        )
+        commands = np.stack([np.full(len(omegas), 0.15), omegas], axis=1)
+        options["commands"] = commands, np.array(times)
     ranges, points = np.ones((scans, 9), np.float32), ones.astype(int) * 9
     return Recording(
         Path("drive.mcap"), scan_times, scan_times, ranges, points, -ones, ones / 9, **options
@@ -105,12 +99,8 @@ def test_an_env_with_fewer_rows_than_recordings_is_refused():
 
 
 def test_random_draws_of_a_policy_depend_on_the_seed_alone():
-    def drawing():
-        return TensorDictModule(
-            lambda x: torch.rand(len(x), 1), in_keys=["observation"], out_keys=["action"]
-        )
-
-    [both], [other] = (run(recording(), drawing(), drawing(), seed=seed) for seed in (0, 1))
+    drawing = TensorDictModule(lambda x: torch.rand(len(x), 1), ["observation"], ["action"])
+    [both], [other] = (run(recording(), drawing, drawing, seed=seed) for seed in (0, 1))
     np.testing.assert_array_equal(both.steering["0"].action, both.steering["1"].action)
     assert (both.steering["0"].action != other.steering["0"].action).all()
     names = []
@@ -120,10 +110,10 @@ def test_random_draws_of_a_policy_depend_on_the_seed_alone():
 
 def result_of(remarks=(), **actions):
     """A result with given actions; both sides are valid in the first and the last of 4 scans."""
-    steering = {
-        name: Steering(a, a / 2, np.abs(a) / 4)
-        for name, a in ((n, np.array(x)) for n, x in actions.items())
-    }
+    steering = {}
+    for name, given in actions.items():
+        action = np.array(given)
+        steering[name] = Steering(action, action / 2, np.abs(action) / 4)
     valid = np.array([[1, 1], [1, 0], [0, 0], [1, 1]], dtype=bool)
     one = recording(period=10**9, notes={"simulated": {}})
     vars(one)["remarks"] = remarks
@@ -133,9 +123,8 @@ def result_of(remarks=(), **actions):
 
 @pytest.fixture
 def result():
-    return result_of(
-        left=[1.0] * 4, both=[1.0, -1.0, 1.0, -1.0], recorded=[math.nan, 0.0, 0.0, 0.5]
-    )
+    recorded = [math.nan, 0.0, 0.0, 0.5]
+    return result_of(left=[1.0] * 4, both=[1.0, -1.0, 1.0, -1.0], recorded=recorded)
 
 
 def test_disagreement_is_a_mean_over_the_scans_with_both_known(result):
@@ -152,19 +141,9 @@ def test_table_has_a_row_and_a_column_per_policy(result):
     text = describe(result)
     assert "## drive.mcap (simulated)" in text
     assert "4 scans in 3.0 s, 1.0 a second; both boundaries valid in 50% of them." in text
-    rows = [
-        [cell.strip() for cell in line.split("|")[1:-1]]
-        for line in text.splitlines()
-        if line.startswith("|")
-    ]
-    assert rows[0] == [
-        "policy",
-        "smoothness",
-        "omega (rad/s)",
-        "from left",
-        "from both",
-        "from recorded",
-    ]
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    assert rows[0][:4] == ["policy", "smoothness", "omega (rad/s)", "from left"]
     assert rows[2:] == [
         ["left", "0.250", "0.500", "-", "1.000", "0.833"],
         ["both", "0.250", "0.500", "1.000", "-", "1.167"],
