@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags import rosbag2
@@ -18,6 +19,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.typesys import Stores, get_typestore
+from tensordict import TensorDict
 
 from coil_rl.envs import read_recording, simulated_drive
 from coil_rl.envs.recordings.mcap_files import Channel, RawMessage, RecordingWriter
@@ -31,6 +33,7 @@ from coil_rl.envs.recordings.messages import (
     ros_types,
     twist,
 )
+from coil_rl.guides import SplineGuide
 
 REAL = Path(__file__).parents[2] / "shared" / "recordings"
 PERIOD = 182_000_000  # ns
@@ -144,6 +147,17 @@ def by_another_library(path):
 def blind(ranges, angles):
     """Perception without cones."""
     return np.zeros((len(ranges), 2, 16, 2)), np.zeros((len(ranges), 2))
+
+
+class SplineDriver:
+    """The spline guide as an object with `act` and `reset`, as a policy of somebody else."""
+
+    def reset(self):
+        pass
+
+    def act(self, observation):
+        data = {key: torch.as_tensor(value)[None] for key, value in observation.items()}
+        return SplineGuide()(TensorDict(data, [1]))["action"][0].numpy()
 
 
 def real_recording(name, topic):

@@ -50,12 +50,10 @@ def test_decision_equals_that_of_scikit_learn(training):
     features, thick, _ = cones()
     pipeline = make_pipeline(StandardScaler(), SVC(C=100.0)).fit(features, thick)
     known = make_pipeline(StandardScaler(), OneClassSVM(nu=UNUSUAL)).fit(features)
-    others = np.concatenate(
-        [np.random.default_rng(1).uniform(-0.02, 0.15, (500, 3)), cones(seed=1)[0]]
-    )
-    expected = np.stack(
-        [machine.decision_function(others) for machine in (pipeline, known)], axis=1
-    )
+    clutter = np.random.default_rng(1).uniform(-0.02, 0.15, (500, 3))
+    others = np.concatenate([clutter, cones(seed=1)[0]])
+    machines = [machine.decision_function(others) for machine in (pipeline, known)]
+    expected = np.stack(machines, axis=1)
     np.testing.assert_allclose(training.classifier.decision(others), expected, rtol=1e-9, atol=1e-9)
     classes = training.classifier.classify(others)
     assert (classes == np.where(known.predict(others) < 0, -1, pipeline.predict(others))).all()
@@ -118,11 +116,10 @@ def test_clusters_are_labelled_with_the_kind_of_their_cone(held_out):
     assert np.array_equal(labelled.thick, labelled.drive == 1)
     assert len(labelled.thick) > 2000
     assert labelled.distance.max() <= 1.0
-    whole = labelled.visibility == 1
-    widths = [
-        np.median(labelled.features[whole & (labelled.thick == kind), 0]) for kind in (False, True)
-    ]
-    assert 0.02 < widths[0] < 0.04 < 0.06 < widths[1] < 0.09
+    whole, width = labelled.visibility == 1, labelled.features[:, 0]
+    thin, thick = width[whole & ~labelled.thick], width[whole & labelled.thick]
+    assert 0.02 < np.median(thin) < 0.04
+    assert 0.06 < np.median(thick) < 0.09
     outliers = replace(held_out[0], hit=torch.full_like(held_out[0].hit, -1))
     assert not len(label_clusters([outliers]).thick)
 
@@ -131,20 +128,13 @@ def test_shipped_classifier_is_as_accurate_as_the_papers(held_out):
     shares = accuracy(simulated_cone_classifier(), label_clusters(held_out))
     assert 0.964 < shares["all"].share < 0.996
     assert shares["0.15-0.25 m"].share > shares["0.75-1 m"].share
-    assert (
-        shares["0.999-1 visible"].share
-        > 0.98
-        > shares["0.5-0.999 visible"].share
-        > shares["0-0.5 visible"].share
-    )
+    whole, half, less = (shares[f"{seen} visible"] for seen in ("0.999-1", "0.5-0.999", "0-0.5"))
+    assert whole.share > 0.98 > half.share > less.share
+    assert whole.total + half.total + less.total == shares["all"].total
     for found in recall(simulated_cone_classifier(), held_out).values():
         assert found["0.999-1 visible"].share > 0.97
         assert found["0-0.5 visible"].share < 0.6
         assert found["all"].total > 2000
-    assert (
-        sum(shares[name].total for name in shares if name.endswith("visible"))
-        == shares["all"].total
-    )
 
 
 @pytest.mark.fast("180-0.94")
@@ -164,10 +154,7 @@ def test_shares_have_the_interval_of_wilson():
 
 @pytest.mark.slow
 def test_shipped_classifier_is_the_result_of_training():
-    """It is what `save_classifier` writes here.
-
-    There is a pair of drives per seed, with more and more beams.
-    """
+    """It is what `save_classifier` writes of pairs of drives, with more and more beams."""
 
     def scans(sides, seed):
         drive = simulated_drive(sides, seed, SimulatedLidar((180, 360, 720, 1440)[seed % 4]))

@@ -7,15 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from drives import SplineDriver
 from hydra import compose, initialize_config_module
-from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.envs import Perception, SimulatedRobotEnv, simulated_cone_classifier
 from coil_rl.envs.recordings.mcap_files import read_messages
 from coil_rl.envs.recordings.reading import read_recording
-from coil_rl.guides import SplineGuide
 from coil_rl.run.controller import Controller
 from coil_rl.run.parts import TEST, TRAIN
 from coil_robot import (
@@ -33,23 +32,19 @@ RATE = 5.5
 FAULT = 20  # number of the scan from which something is wrong
 
 
-class Guide:
-    """The spline guide as an object with `act` and `reset`."""
+class Guide(SplineDriver):
+    """A guide that fails, or that acts in a way of its own, after some scans."""
 
     def __init__(self, fails_at=10**6, action=None):
-        self.guide, self.fails_at, self.action, self.scans = SplineGuide(), fails_at, action, 0
-
-    def reset(self):
-        self.scans = 0
+        self.fails_at, self.action, self.scans = fails_at, action, 0
 
     def act(self, observation):
         self.scans += 1
-        if self.scans > self.fails_at:
-            if self.action is not None:
-                return self.action
+        if self.scans <= self.fails_at:
+            return super().act(observation)
+        if self.action is None:
             raise RuntimeError("no weights")
-        data = {key: torch.as_tensor(value)[None] for key, value in observation.items()}
-        return self.guide(TensorDict(data, [1]))["action"][0].numpy()
+        return self.action
 
 
 def driver(controller=None, log=lambda moment: None, **limits):
@@ -104,8 +99,7 @@ def test_commands_are_those_of_the_closed_loop(name):
             state = env.step_mdp(step)
 
 
-def lost(index, scan, now):
-    return None if index >= FAULT else scan, now
+# Changes of scans and of what the car does, as options of `drive_simulation`.
 
 
 def changed(**values):
@@ -116,7 +110,11 @@ def changed(**values):
             scan = replace(scan, **{key: make(index, scan) for key, make in values.items()})
         return scan, now
 
-    return change
+    return {"change": change}
+
+
+def lost(index, scan, now):
+    return None if index >= FAULT else scan, now
 
 
 def late_clock(index, scan, now):
@@ -128,9 +126,7 @@ def half_rate(index, scan, now):
 
 
 def double_rate(index, scan, now):
-    if index < FAULT:
-        return scan, now
-    early = (index - FAULT) / RATE / 2
+    early = max(0, index - FAULT) / RATE / 2
     return replace(scan, stamp=scan.stamp - early), now - early
 
 
@@ -147,104 +143,49 @@ class Frozen:
         return (replace(scan, ranges=self.ranges) if index > FAULT else scan), now
 
 
-def stuck(index, command):
-    return Command(0.0, 0.0) if index >= FAULT else command
+def moved(speed=1.0, pull=0.0):
+    """Return a change of what the car does: a factor of its speed, and a turn rate more."""
 
+    def follow(index, command):
+        if index < FAULT:
+            return command
+        return Command(speed * command.speed, speed * command.turn_rate + pull)
 
-def pulls(index, command):
-    return Command(command.speed, command.turn_rate + 0.45) if index >= FAULT else command
-
-
-def crawls(index, command):
-    return Command(0.3 * command.speed, command.turn_rate) if index >= FAULT else command
+    return {"follow": follow}
 
 
 NAN = float("nan")
+EMPTY = np.zeros(0)
+NO_RETURN = np.full(360, np.inf, np.float32)
+MIRRORED = changed(ranges=lambda n, scan: np.roll(scan.ranges[::-1], -1))
+TURNED = changed(ranges=lambda n, scan: np.roll(scan.ranges, 180))
+COVERED = changed(ranges=lambda n, scan: (0.3 + 0.001 * (n % 7)) * np.ones(360, np.float32))
+HALF = {"ranges": lambda n, scan: scan.ranges[:180], "angles": lambda n, scan: scan.angles[:180]}
+STUCK_WITHOUT_ODOMETRY = moved(speed=0.0) | {"odometry": False}
+# What is wrong, the reason of the stop, and the seconds within which the car stops.
 FAULTS = {
     "no more scans": ({"change": lost}, "gap of 0.5", 0.6),
-    "stamp is NaN": ({"change": changed(stamp=lambda *_: NAN)}, "stamp that is not finite", 0.2),
-    "stamp is infinite": (
-        {"change": changed(stamp=lambda *_: math.inf)},
-        "stamp that is not finite",
-        0.2,
-    ),
-    "stamp stands": (
-        {"change": changed(stamp=lambda *_: (FAULT - 1) / RATE)},
-        "stamp that does not rise",
-        0.2,
-    ),
-    "stamp jumps back": (
-        {"change": changed(stamp=lambda index, scan: scan.stamp - 10)},
-        "stamp that does not rise",
-        0.2,
-    ),
-    "stamp jumps ahead": (
-        {"change": changed(stamp=lambda index, scan: scan.stamp + 3600)},
-        "gap of 3600.18 s between the stamps",
-        0.2,
-    ),
-    "no returns": (
-        {"change": changed(ranges=lambda index, scan: np.full(360, np.inf, np.float32))},
-        "invalid scan: 0.0% of its beams have a return",
-        0.2,
-    ),
-    "ranges are NaN": (
-        {"change": changed(ranges=lambda index, scan: np.full(360, NAN, np.float32))},
-        "invalid scan: 0.0% of its beams have a return",
-        0.2,
-    ),
-    "empty scan": (
-        {"change": changed(ranges=lambda *_: np.zeros(0), angles=lambda *_: np.zeros(0))},
-        "invalid scan: it has no ranges",
-        0.2,
-    ),
-    "half of the beams": (
-        {
-            "change": changed(
-                ranges=lambda index, scan: scan.ranges[:180],
-                angles=lambda index, scan: scan.angles[:180],
-            )
-        },
-        "invalid scan: 180 beams instead of 360",
-        0.2,
-    ),
-    "angles are NaN": (
-        {"change": changed(angles=lambda index, scan: NAN * scan.angles)},
-        "invalid scan: its angles or its range are not finite",
-        0.2,
-    ),
+    "stamp is NaN": (changed(stamp=lambda *_: NAN), "stamp that is not finite", 0.2),
+    "stamp stands": (changed(stamp=lambda *_: (FAULT - 1) / RATE), "does not rise", 0.2),
+    "stamp jumps back": (changed(stamp=lambda n, scan: scan.stamp - 10), "does not rise", 0.2),
+    "stamp jumps ahead": (changed(stamp=lambda n, scan: scan.stamp + 3600), "gap of 3600.", 0.2),
+    "no returns": (changed(ranges=lambda *_: NO_RETURN), "0.0% of its beams have a return", 0.2),
+    "ranges are NaN": (changed(ranges=lambda *_: NAN * NO_RETURN), "0.0% of its beams", 0.2),
+    "empty scan": (changed(ranges=lambda *_: EMPTY, angles=lambda *_: EMPTY), "no ranges", 0.2),
+    "half of the beams": (changed(**HALF), "invalid scan: 180 beams instead of 360", 0.2),
+    "angles are NaN": (changed(angles=lambda n, scan: NAN * scan.angles), "are not finite", 0.2),
     "frozen scanner": ({"change": Frozen()}, "repeats the one before to the last digit", 0.4),
-    "covered scanner": (
-        {
-            "change": changed(
-                ranges=lambda index, scan: (0.3 + 0.001 * (index % 7)) * np.ones(360, np.float32)
-            )
-        },
-        "no view of both boundaries for 2.",
-        2.6,
-    ),
-    "mirrored scans": (
-        {"change": changed(ranges=lambda index, scan: np.roll(scan.ranges[::-1], -1))},
-        "mirrored or turned: left cones right of the right ones in 4 of the last 6",
-        0.8,
-    ),
-    "turned scans": (
-        {"change": changed(ranges=lambda index, scan: np.roll(scan.ranges, 180))},
-        "mirrored or turned: left cones right of the right ones in 4 of the last 6",
-        0.8,
-    ),
+    "covered scanner": (COVERED, "no view of both boundaries for 2.", 2.6),
+    "mirrored scans": (MIRRORED, "left cones right of the right ones in 4 of the last 6", 0.8),
+    "turned scans": (TURNED, "left cones right of the right ones in 4 of the last 6", 0.8),
     "queue that grows": ({"change": queued}, "come late: 0.38 s later than the quickest", 3.0),
     "half the rate": ({"change": half_rate}, "rate: scans arrive 3.7 times", 2.0),
     "twice the rate": ({"change": double_rate}, "rate: scans arrive 7.3 times", 1.0),
     "clock goes back": ({"change": late_clock}, "steady clock that goes back", 0.2),
-    "stuck car": ({"follow": stuck}, "does not follow: its speed is off by -0.08 m/s", 2.0),
-    "stuck car without odometry": (
-        {"follow": stuck, "odometry": False},
-        "does not follow: the scans stand still for 1.6 s",
-        2.4,
-    ),
-    "slow car": ({"follow": crawls}, "does not follow: its speed is off by -0.", 2.0),
-    "car that pulls to the left": ({"follow": pulls}, "its turn rate is off by +0.", 2.0),
+    "stuck car": (moved(speed=0.0), "does not follow: its speed is off by -0.08 m/s", 2.0),
+    "stuck car without odometry": (STUCK_WITHOUT_ODOMETRY, "the scans stand still for 1.6 s", 2.4),
+    "slow car": (moved(speed=0.3), "does not follow: its speed is off by -0.", 2.0),
+    "car that pulls to the left": (moved(pull=0.45), "its turn rate is off by +0.", 2.0),
 }
 
 
@@ -296,7 +237,7 @@ def test_a_healthy_robot_drives_and_survives_a_single_lost_scan():
 
 def test_the_car_does_not_move_before_it_has_seen_both_boundaries():
     def blind(index, scan, now):
-        return (replace(scan, ranges=np.where(np.arange(360) < 180, np.inf, scan.ranges))), now
+        return replace(scan, ranges=np.where(np.arange(360) < 180, np.inf, scan.ranges)), now
 
     live = driver()
     result, env = driven(live, 5.0, change=blind)
@@ -305,10 +246,10 @@ def test_the_car_does_not_move_before_it_has_seen_both_boundaries():
     assert torch.equal(env.pose, env.start_pose[:, :1])
 
 
-@pytest.mark.parametrize("change", [FAULTS["mirrored scans"], FAULTS["turned scans"]])
-def test_the_car_does_not_move_by_scans_that_are_mirrored_or_turned_from_the_start(change):
+@pytest.mark.parametrize("fault", [MIRRORED, TURNED])
+def test_the_car_does_not_move_by_scans_that_are_mirrored_or_turned_from_the_start(fault):
     def from_the_start(index, scan, now):
-        return change[0]["change"](index + FAULT, scan, now)
+        return fault["change"](index + FAULT, scan, now)
 
     live = driver()
     result, env = driven(live, 3.0, change=from_the_start)

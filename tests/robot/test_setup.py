@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from drives import drive
-from tensordict.nn import TensorDictModule
 
 from coil_rl.envs import (
     ConeTrackEnv,
@@ -37,18 +37,12 @@ class Straight:
 
 def test_observations_are_those_of_the_training():
     perception = Perception(simulated_cone_classifier(), **AUTHORS)
-    env = SimulatedRobotEnv(
-        perception=perception, spline="quadratic", max_steering=60.0, assignment="cyclic"
-    )
+    options = {"spline": "quadratic", "max_steering": 60.0, "assignment": "cyclic"}
+    env = SimulatedRobotEnv(perception=perception, **options)
     setup, moments = setup_of(env), []
+    limits, settings = Limits(setup.rate), {"spline": setup.spline, "smoothing": setup.smoothing}
     driver = LiveDriver(
-        Straight(),
-        setup.perception,
-        Limits(setup.rate),
-        setup.car,
-        spline=setup.spline,
-        smoothing=setup.smoothing,
-        log=moments.append,
+        Straight(), setup.perception, limits, setup.car, **settings, log=moments.append
     )
     assert driver.car.max_steering == pytest.approx(60)
     state = env.reset()
@@ -56,8 +50,7 @@ def test_observations_are_those_of_the_training():
         scan = Scan(index / env.rate, env.scan[0].numpy().copy(), env.lidar.angles.numpy())
         driver.scan(scan, (index + 1) / env.rate)
         np.testing.assert_array_equal(moments[-1].observation, state["observation"][0])
-        policy = TensorDictModule(lambda x: x[..., :1] * 0, ["observation"], ["action"])
-        state = env.step_mdp(env.step(policy(state)))
+        state = env.step_mdp(env.step(state.set("action", torch.zeros(1, 1))))
 
 
 def test_a_car_of_the_cone_world_is_the_papers_robot_in_its_scale():

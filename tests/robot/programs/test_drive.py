@@ -1,36 +1,21 @@
 """`coil-drive`: what it drives with, where, and what it refuses."""
 
 import sys
-from pathlib import Path
 
 import pytest
-import torch
 from drives import scan
 from programs import called
 from run_folders import make_untrained_run
-from tensordict import TensorDict
 
 from coil_rl.envs.recordings.mcap_files import RecordingWriter, read_messages
 from coil_rl.envs.recordings.messages import SCAN, header
-from coil_rl.guides import SplineGuide
-
-
-class Guide:
-    """The spline guide as an object with `act` and `reset`, as a policy of somebody else."""
-
-    def reset(self):
-        pass
-
-    def act(self, observation):
-        data = {key: torch.as_tensor(value)[None] for key, value in observation.items()}
-        return SplineGuide()(TensorDict(data, [1]))["action"][0].numpy()
 
 
 class Silent:
     """No controller."""
 
 
-OWN = [f"+controller._target_={__name__}.Guide", "rate=5.5"]
+OWN = ["+controller._target_=drives.SplineDriver", "rate=5.5"]
 SHORT = [*OWN, "simulation.seconds=6"]
 
 
@@ -70,10 +55,8 @@ def test_a_policy_drives_with_what_it_was_trained_with(tmp_path):
     assert "with which the policy was trained" not in done.stderr
     given = ["perception.scale=7", "car.max_steering=80", "rate=5"]
     done = called("drive", *drive, *given, "hydra.run.dir=other", cwd=tmp_path)
-    assert (
-        "drive: car.max_steering=80 instead of 60, perception.scale=7 instead of 5.625, "
-        "rate=5.0 instead of 5.5, with which the policy was trained\n"
-    ) in done.stderr
+    changes = "car.max_steering=80 instead of 60, perception.scale=7 instead of 5.625"
+    assert f"drive: {changes}, rate=5.0 instead of 5.5, with which" in done.stderr
 
 
 @pytest.mark.slow
@@ -82,11 +65,6 @@ def test_a_run_of_the_cone_world_drives_the_robot(tmp_path):
     called("train", *words, "evaluation.gif=false", "hydra.run.dir=run", cwd=tmp_path)
     done = called("drive", "run=run", "simulation.seconds=6", cwd=tmp_path)
     assert "33 scans (driving 33)" in done.stdout
-    # 24 steps per second of the cone world are 12.6 of the robot's scans.
-    words[0:0] = ["preset=paper"]
-    called("train", *words, "evaluation.gif=false", "hydra.run.dir=fast", cwd=tmp_path)
-    done = called("drive", "run=fast", "simulation.seconds=6", cwd=tmp_path)
-    assert "rate: scans arrive 5.5 times per second, the policy was trained for 12.6" in done.stdout
 
 
 @pytest.mark.slow
@@ -112,14 +90,9 @@ def test_a_shipped_policy_completes_a_lap_of_the_robot(tmp_path):
         ([*OWN, "scan=/x"], "scan=/x has no effect: nothing reads it with a controller and where="),
         ([*OWN, "ros.stamped=true"], "ros.stamped=true has no effect"),
         ([*OWN, "where=ros", "simulation.laps=1"], "simulation.laps=1 has no effect"),
-        ([*OWN, "simulation.laps=0"], "simulation.laps=0"),
         ([*OWN, "+simulation.lap=1"], "lap"),
-        ([*OWN, "limits.longest_gap=0.1"], "longest_gap=0.1 s must be more than the time"),
-        ([*OWN, "perception.scale=0"], "perception.scale=0 must be more than 0"),
         ([*OWN, "perception.range_max=far"], "perception.range_max='far' must be"),
         ([*OWN, "smoothing=-1"], "smoothing=-1.0 must be"),
-        ([*OWN, "limits.blind=-1"], "blind=-1 must be"),
-        ([*OWN, "car.speed=0"], "speed=0"),
         ([*OWN, "lift_after=-1"], "lift_after"),
         ([*OWN[1:], f"+controller._target_={__name__}.Silent"], "cannot drive"),
         pytest.param(
@@ -129,8 +102,7 @@ def test_a_shipped_policy_completes_a_lap_of_the_robot(tmp_path):
         ),
     ],
 )
-def test_mistakes_are_refused_in_one_sentence(words, message, tmp_path: Path):
+def test_mistakes_are_refused_in_one_sentence(words, message, tmp_path):
     done = called("drive", *words, cwd=tmp_path, code=2)
     assert message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
-    assert "Traceback" not in done.stderr
