@@ -28,9 +28,6 @@ def oval_line(length=40.0, radius=6.0, spacing=0.1):
 def oval_track(name, clockwise=False, length=10.0, radius=6.0):
     """Return a track 3 m wide along an oval."""
     inner, outer = (oval_line(length, r, spacing=1.5) for r in (radius - 1.5, radius + 1.5))
-    mirrored = np.array([1, -1])
-    return (
-        Track(name, left=outer * mirrored, right=inner * mirrored)
-        if clockwise
-        else Track(name, inner, outer)
-    )
+    if clockwise:
+        inner, outer = outer * [1, -1], inner * [1, -1]
+    return Track(name, inner, outer)

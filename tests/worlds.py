@@ -110,16 +110,10 @@ class Script(EnvBase):
 
     def __init__(self, lengths, reward, **entries):
         super().__init__(batch_size=lengths.shape)
-        self.lengths, self.entries, self.time = (
-            lengths.unsqueeze(-1),
-            entries | {"reward": reward},
-            0,
-        )
+        entries["reward"] = reward
+        self.lengths, self.entries, self.time = lengths.unsqueeze(-1), entries, 0
         flag = Categorical(2, (*lengths.shape, 1), dtype=torch.bool)
-        shown = {
-            name: Unbounded(values.shape[1:], dtype=values.dtype)
-            for name, values in self.entries.items()
-        }
+        shown = {name: Unbounded(v.shape[1:], dtype=v.dtype) for name, v in entries.items()}
         self.full_reward_spec = Composite(reward=shown.pop("reward"), shape=self.batch_size)
         self.observation_spec = Composite(shown, shape=self.batch_size)
         self.action_spec = Bounded(-1, 1, (*self.batch_size, 1))
@@ -127,14 +121,11 @@ class Script(EnvBase):
 
     def _reset(self, tensordict=None, **_):
         self.time = 0
-        return TensorDict(
-            {**self.observation_spec.zero(), **self.full_done_spec.zero()}, self.batch_size
-        )
+        zeros = {**self.observation_spec.zero(), **self.full_done_spec.zero()}
+        return TensorDict(zeros, self.batch_size)
 
     def _step(self, tensordict):
-        shown = {
-            name: values[min(self.time, len(values) - 1)] for name, values in self.entries.items()
-        }
+        shown = {name: v[min(self.time, len(v) - 1)] for name, v in self.entries.items()}
         self.time += 1
         ended = self.time >= self.lengths
         return TensorDict({**shown, "done": ended, "terminated": ended}, self.batch_size)

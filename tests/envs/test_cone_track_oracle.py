@@ -39,6 +39,8 @@ PRESETS = {
         {"spline": "quadratic", "gain": 80 / 120},
     ),
 }
+OUTPUTS = ("observation", "steering", "reward", "terminated", "truncated")
+INFO = ("lap", "lap_time", "crashed", "clearance", "smoothness")
 # Summation orders differ; float64 trajectories of 9,000 steps agree within 1e-13.
 CLOSE = 1e-6
 # The env interpolates the distance to a boundary on a grid of 10 cm.
@@ -76,20 +78,13 @@ def drive(
             if driver == "random":
                 state["action"] = torch.tensor(noise).unsqueeze(-1).to(dtype)
             elif driver == "disturbed":
-                state["action"] = (
-                    (advice + 0.5 * torch.tensor(noise).unsqueeze(-1)).clamp(-1, 1).to(dtype)
-                )
+                disturbed = (advice + 0.5 * torch.tensor(noise).unsqueeze(-1)).clamp(-1, 1)
+                state["action"] = disturbed.to(dtype)
             after = env.step(state)["next"]
             over |= after["done"]
             row = {"advice": advice, "action": state["action"]}
-            row |= {
-                key: after[key]
-                for key in ("observation", "steering", "reward", "terminated", "truncated")
-            }
-            row |= {
-                key: after["info", key]
-                for key in ("lap", "lap_time", "crashed", "clearance", "smoothness")
-            }
+            row |= {key: after[key] for key in OUTPUTS}
+            row |= {key: after["info", key] for key in INFO}
             row |= {key: after["info", "reward", key] for key in TERMS}
             rows.append({key: value.numpy().copy() for key, value in row.items()})
             state = env.step_mdp(state)
@@ -112,12 +107,8 @@ def retrace(track: Track, preset: Preset, actions: Array) -> Iterator[tuple[floa
 def assert_agreement(track: Track, preset: Preset, trace: dict[str, Array]) -> Outcome:
     """Compare the trace [steps, ...] of an episode with the oracle; return its last outcome."""
     advice, gaps, outcomes = zip(*retrace(track, preset, trace["action"][:, 0]), strict=True)
-    expected = {
-        key: np.array([getattr(outcome, key) for outcome in outcomes])
-        for key in Outcome._fields
-        if key != "terms"
-    }
-    expected |= {term: np.array([outcome.terms[term] for outcome in outcomes]) for term in TERMS}
+    rows = [outcome._asdict() | outcome.terms for outcome in outcomes]
+    expected = {key: np.array([row[key] for row in rows]) for key in rows[0] if key != "terms"}
     expected["reward"] = np.array([outcome.reward for outcome in outcomes])
 
     # Within the error of the distance field, a car may crash in one of the two only; later steps
@@ -128,27 +119,22 @@ def assert_agreement(track: Track, preset: Preset, trace: dict[str, Array]) -> O
             f"step {k}: one crashes, {expected['clearance'][k]} m from a crash"
         )
         together = k
-    ours = {
-        key: value[:together, 0] if key != "observation" else value[:together]
-        for key, value in trace.items()
-    }
+    ours = {key: value[:together] for key, value in trace.items()}
+    ours |= {key: value[:, 0] for key, value in ours.items() if key != "observation"}
     expected = {key: value[:together] for key, value in expected.items()}
 
-    tolerance = np.where(
-        np.array(gaps) < 1e-3, COINCIDENT[preset.guide.get("spline", "cubic")], CLOSE
-    )[:together]
+    coincident = COINCIDENT[preset.guide.get("spline", "cubic")]
+    tolerance = np.where(np.array(gaps) < 1e-3, coincident, CLOSE)[:together]
     difference = np.abs(ours["advice"] - np.array(advice)[:together])
     assert (difference <= tolerance).all(), (
         f"advice differs by {difference.max()} at step {difference.argmax()}"
     )
     for key in ("observation", "reward", "lap_time", "smoothness", *TERMS):
-        np.testing.assert_allclose(
-            ours[key], expected[key], rtol=0, atol=CLOSE, err_msg=f"{key}, track {track.name}"
-        )
+        name = f"{key}, track {track.name}"
+        np.testing.assert_allclose(ours[key], expected[key], rtol=0, atol=CLOSE, err_msg=name)
     for key in ("lap", "crashed", "terminated", "truncated"):
-        np.testing.assert_array_equal(
-            ours[key], expected[key], err_msg=f"{key}, track {track.name}"
-        )
+        name = f"{key}, track {track.name}"
+        np.testing.assert_array_equal(ours[key], expected[key], err_msg=name)
     near = expected["clearance"] < 1
     np.testing.assert_allclose(
         ours["clearance"][near], expected["clearance"][near], rtol=0, atol=FIELD
@@ -184,10 +170,8 @@ def test_env_agrees_with_the_oracle_under_other_steering(preset: str, driver: st
 def test_guide_agrees_with_the_oracle_for_coincident_midpoints(levels: list[Track]) -> None:
     # The authors' cones are on a grid, so different pairs have the same midpoint.
     trace = drive(levels[:1], PRESETS["paper"], "guide", 60)
-    assert (
-        min(gap for _, gap, _ in retrace(levels[0], PRESETS["paper"], trace["action"][:, 0, 0]))
-        < 1e-9
-    )
+    retraced = retrace(levels[0], PRESETS["paper"], trace["action"][:, 0, 0])
+    assert min(gap for _, gap, _ in retraced) < 1e-9
     assert_agreement(levels[0], PRESETS["paper"], column(trace, 0))
 
 

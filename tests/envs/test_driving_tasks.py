@@ -72,15 +72,10 @@ def test_lateral_position_is_rewarded_by_the_task(
 
 def test_tasks_override_only_the_weights_they_set(ring: Track) -> None:
     common = {"alive": 0.5, "left": 0.1, "cone": 0.0}
-    rewards = {
-        task: one_step(ring, 0.4, 0.2, only=task, reward=common)["info", "reward"] for task in TASKS
-    }
-    assert {task: reward["alive"].item() for task, reward in rewards.items()} == {
-        "centred": 0.5,
-        "corners": 0.5,
-        "left": 0.25,
-        "smooth": 0.5,
-    }
+    steps = {task: one_step(ring, 0.4, 0.2, only=task, reward=common) for task in TASKS}
+    rewards = {task: step["info", "reward"] for task, step in steps.items()}
+    alive = {task: reward["alive"].item() for task, reward in rewards.items()}
+    assert alive == {"centred": 0.5, "corners": 0.5, "left": 0.25, "smooth": 0.5}
     assert rewards["left"]["left"].item() == pytest.approx(5 * rewards["smooth"]["left"].item())
     assert rewards["smooth"]["smooth"].item() == pytest.approx(-5 * 0.2)
     assert rewards["left"]["smooth"].item() == pytest.approx(-0.1 * 0.2)
@@ -90,9 +85,8 @@ def test_crash_replaces_all_other_reward_terms(ring: Track) -> None:
     after = one_step(ring, 0.95, 0.2, only="left")
     assert after["terminated"].all()
     assert after["reward"].item() == -100
-    assert all(
-        value.item() == 0 for term, value in after["info", "reward"].items() if term != "crash"
-    )
+    terms = after["info", "reward"]
+    assert all(terms[term].item() == 0 for term in set(terms.keys()) - {"crash"})
 
 
 @pytest.mark.slow
@@ -179,25 +173,19 @@ def test_restored_env_continues_bit_for_bit(rings: list[Track]) -> None:
     assert any(step["next", "done"].any() for step in trace)
     restored = DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5, seed=99)
     restored.load_state_dict(saved)
-    assert all(
-        (ours == step).all()
-        for ours, step in zip(drive(restored, 80, state.clone()), trace, strict=True)
-    )
+    again = drive(restored, 80, state.clone())
+    assert all((ours == step).all() for ours, step in zip(again, trace, strict=True))
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ({"tasks": {}}, "tasks is empty; give at least one"),
-        (
-            {"tasks": {"fast": {"speed": 1.0}}},
-            r"tasks.fast has no weight \['speed'\]; it has finish, .*, inside",
-        ),
+        ({"tasks": {"fast": {"speed": 1.0}}}, r"tasks.fast has no weight \['speed'\]"),
         ({"tasks": {"fast": {"second": math.nan}}}, "tasks.fast.second=nan must be between"),
         ({"reward": {"speed": 1.0}}, r"reward has no weight \['speed'\]"),
         ({"only": "right"}, "only='right' must be one of centred, corners, left, smooth"),
         ({"duration": 0.01}, "duration=0.01 must be at least one step"),
-        ({"duration": math.nan}, "duration=nan must be at least one step"),
         ({"rate": 0}, "rate=0 must be more than 0"),
     ],
 )
@@ -210,15 +198,12 @@ def test_invalid_arguments_are_rejected(
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_tasks_agree_on_a_gpu(rings: list[Track]) -> None:
-    envs = [
-        DrivingTasksEnv(rings, 32, tasks=TASKS, duration=0.2, device=device)
-        for device in ("cpu", "cuda")
-    ]
-    check_env(envs[1])
-    for env in envs:
+    options = {"tasks": TASKS, "duration": 0.2}
+    cpu, gpu = (DrivingTasksEnv(rings, 32, **options, device=device) for device in ("cpu", "cuda"))
+    check_env(gpu)
+    for env in (cpu, gpu):
         env.set_seed(5)
         env.reset()
     for _ in range(20):
-        for env in envs:
-            env.task = env._next_task()
-        assert torch.equal(envs[0].task, envs[1].task.cpu())
+        cpu.task, gpu.task = cpu._next_task(), gpu._next_task()
+        assert torch.equal(cpu.task, gpu.task.cpu())

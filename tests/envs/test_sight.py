@@ -62,23 +62,12 @@ def test_view_agrees_with_brute_force(seed: int, limit: int) -> None:
 
 @both_dtypes
 def test_cones_are_visible_up_to_seven_metres_and_sixty_degrees(dtype: torch.dtype) -> None:
-    assert visible([(7.0, 0.0), (7.00001, 0.0), (6.99999, 0.0), (0.0, 0.0)], dtype) == [
-        True,
-        False,
-        True,
-        True,
-    ]
+    ahead = [(7.0, 0.0), (7.00001, 0.0), (6.99999, 0.0), (0.0, 0.0)]
+    assert visible(ahead, dtype) == [True, False, True, True]
     # 60 degrees has no exact floating-point representation.
-    angles = [59.999, 60.001, -59.999, -60.001, 90.0, 120.0, 180.0]
-    assert visible([polar(5, angle) for angle in angles], dtype) == [
-        True,
-        False,
-        True,
-        False,
-        False,
-        False,
-        False,
-    ]
+    degrees = [59.999, 60.001, -59.999, -60.001, 90.0, 120.0, 180.0]
+    seen = [True, False, True, False, False, False, False]
+    assert visible([polar(5, angle) for angle in degrees], dtype) == seen
 
 
 def test_equidistant_cones_keep_their_order() -> None:
@@ -109,28 +98,9 @@ def test_samples_are_encoded_as_distance_and_angle() -> None:
     left = [(7.0, 0.0), (0.0, 3.5), (0.0, 0.0), (-1.0, 0.0), polar(14, 30)]
     right = [polar(1.75, -60), polar(5.25, -120), polar(7, -150), (3.5, 0.0), (0.0, -7.0)]
     samples[:, :, 0, 0], samples[:, :, 1, 0] = torch.tensor(left).t(), torch.tensor(right).t()
-    expected = [
-        1,
-        0,
-        0,
-        0.75,
-        -1,
-        0,
-        2 / 7 - 1,
-        1,
-        1,
-        0.25,
-        -0.5,
-        -0.5,
-        0.5,
-        -1,
-        1,
-        -1,
-        0,
-        0,
-        1,
-        -0.75,
-    ]
+    # Distance and angle of each sample, left ones first.
+    expected = [1, 0, 0, 0.75, -1, 0, 2 / 7 - 1, 1, 1, 0.25]
+    expected += [-0.5, -0.5, 0.5, -1, 1, -1, 0, 0, 1, -0.75]
     known = torch.ones(2, 1)
     assert encode_samples(samples, known).tolist()[0] == pytest.approx(expected, abs=1e-6)
 
@@ -151,12 +121,10 @@ def test_observations_agree_with_hypot_and_atan2(dtype: torch.dtype) -> None:
     line = torch.tensor([-7.0, -1.0, -1e-6, -0.0, 0.0, 1e-6, 0.5, 3.0], dtype=dtype)
     x, y = torch.meshgrid(line, line, indexing="ij")
     samples = torch.stack([x, y]).view(2, 1, 1, -1).expand(2, 5, 2, -1)
-    distance, angle = (
-        encode_samples(samples, torch.ones(2, 64, dtype=dtype)).view(64, 10, 2)[:, 7].unbind(-1)
-    )
+    observation = encode_samples(samples, torch.ones(2, 64, dtype=dtype))
+    distance, angle = observation.view(64, 10, 2)[:, 7].unbind(-1)
     known = torch.atan2(y, x).flatten() * (x != 0).logical_or(y != 0).flatten()
     assert torch.allclose(distance, (torch.hypot(x, y).flatten() * 2 / 7 - 1).clamp(-1, 1))
     # A sample straight behind the car is encoded as left of it.
-    assert torch.allclose(
-        angle, (known.where(y.flatten() != 0, known.abs()) / math.radians(120)).clamp(-1, 1)
-    )
+    expected = known.where(y.flatten() != 0, known.abs()) / math.radians(120)
+    assert torch.allclose(angle, expected.clamp(-1, 1))

@@ -4,12 +4,12 @@ import re
 
 import numpy as np
 import pytest
+from ovals import circle
 
 from coil_rl.envs import ConeTrackEnv, load_track, load_tracks
 from coil_rl.envs.track import TrackError
 
-TURN = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
+CIRCLE = circle(1, 24)
 SIMULATOR = "cone_type,X,Y,Z,std_X,std_Y,std_Z,right,left"
 EUFS = "tag,x,y,direction,x_variance,y_variance,xy_covariance"
 

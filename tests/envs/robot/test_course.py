@@ -42,10 +42,11 @@ def test_cones_are_missing_or_moved_in_copies_of_the_track():
     left = [len(copy.left) for copy in copies]
     assert np.mean(left) == pytest.approx(0.9 * len(track.left), rel=0.03)
     assert min(left) < max(left)
-    offsets = [copy.right[:, None] - track.right for copy in copies]
-    nearest = [
-        np.take_along_axis(o, (o**2).sum(-1).argmin(1)[:, None, None], 1)[:, 0] for o in offsets
-    ]
+    nearest = []
+    for copy in copies:
+        offsets = copy.right[:, None] - track.right
+        own = (offsets**2).sum(-1).argmin(1)
+        nearest.append(offsets[np.arange(len(own)), own])
     assert np.concatenate(nearest).std() == pytest.approx(0.01, rel=0.1)
     assert {copy.start for copy in copies} == {track.start}
     again, (unchanged,) = robot_tracks(count=40, missing=0.1, moved=0.01, seed=3), robot_tracks()
@@ -93,9 +94,8 @@ def test_noted_track_is_equal_and_invalid_notes_are_refused():
 def circle(rounds, points=400, radius=1.0, speed=0.5):
     """Poses and times on a circle, anticlockwise from its lowest point."""
     angle = np.linspace(0, rounds * 2 * np.pi, points)
-    return np.stack(
-        [radius * np.sin(angle), -radius * np.cos(angle), angle], axis=1
-    ), angle * radius / speed
+    poses = np.stack([radius * np.sin(angle), -radius * np.cos(angle), angle], axis=1)
+    return poses, angle * radius / speed
 
 
 @pytest.mark.parametrize("turn", [0.0, 2.5, -1.9])
@@ -103,9 +103,8 @@ def test_laps_of_a_circle_have_its_length_and_duration_from_any_origin(turn):
     poses, seconds = circle(3.2)
     cos, sin = np.cos(turn), np.sin(turn)
     x, y, heading = poses.T
-    found = laps(
-        np.stack([cos * x - sin * y + 5, sin * x + cos * y - 3, heading + turn], axis=1), seconds
-    )
+    moved = [cos * x - sin * y + 5, sin * x + cos * y - 3, heading + turn]
+    found = laps(np.stack(moved, axis=1), seconds)
     assert found.metres == pytest.approx([2 * np.pi] * 3, rel=1e-3)
     assert found.seconds == pytest.approx([4 * np.pi] * 3, rel=1e-3)
 
@@ -113,11 +112,9 @@ def test_laps_of_a_circle_have_its_length_and_duration_from_any_origin(turn):
 def test_only_complete_laps_count_without_the_time_before_the_start():
     assert [len(laps(*circle(rounds)).seconds) for rounds in (0.99, 1.01)] == [0, 1]
     poses, seconds = circle(1.2)
-    waiting = (
-        np.concatenate([np.repeat(poses[:1], 50, axis=0), poses]),
-        np.concatenate([np.arange(50), seconds + 50]),
-    )
-    assert laps(*waiting).seconds == pytest.approx([4 * np.pi], rel=1e-3)
+    waiting = np.concatenate([np.repeat(poses[:1], 50, axis=0), poses])
+    later = np.concatenate([np.arange(50), seconds + 50])
+    assert laps(waiting, later).seconds == pytest.approx([4 * np.pi], rel=1e-3)
     swaying = np.outer([0, 0.1, -0.1, 0.1, -0.1, 0.1], [1, 0, 0])
     assert len(laps(swaying, np.arange(6.0)).seconds) == 0
 

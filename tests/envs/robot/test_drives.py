@@ -45,10 +45,8 @@ def test_heading_is_tangential_and_the_robot_moves_during_a_scan(both):
     # The last beam is measured first.
     starts, ends = both.poses[..., -1], both.poses[..., 0]
     way = starts[:2, 1:] - starts[:2, :-1]
-    off = (
-        torch.remainder(torch.atan2(way[1], way[0]) - starts[2, :-1] + torch.pi, 2 * torch.pi)
-        - torch.pi
-    )
+    bearing = torch.atan2(way[1], way[0]) - starts[2, :-1]
+    off = torch.remainder(bearing + torch.pi, 2 * torch.pi) - torch.pi
     assert off.abs().max() < 0.05
     gaps = ends[:, :-1] - starts[:, 1:]
     assert gaps[:2].norm(dim=0).max() < 0.001
@@ -57,13 +55,11 @@ def test_heading_is_tangential_and_the_robot_moves_during_a_scan(both):
 
 def test_ranges_end_at_the_surface_of_the_cone_they_hit(both):
     angle = both.poses[2] + both.angles
-    points = both.poses[:2] + torch.where(both.hit >= 0, both.ranges, 0) * torch.stack(
-        [angle.cos(), angle.sin()]
-    )
+    ranges = torch.where(both.hit >= 0, both.ranges, 0)
+    points = both.poses[:2] + ranges * torch.stack([angle.cos(), angle.sin()])
     hits = (both.hit >= 0) & both.ranges.isfinite()
-    off = (points[:, hits] - both.cones[:, both.hit[hits]]).norm(dim=0) - both.radius[
-        both.hit[hits]
-    ]
+    cone = both.hit[hits]
+    off = (points[:, hits] - both.cones[:, cone]).norm(dim=0) - both.radius[cone]
     assert hits.sum() > 10_000
     # Noise along a beam that grazes a cone moves the point off its surface.
     assert off.abs().max() < 0.045
@@ -164,9 +160,8 @@ def test_track_is_noted_for_drives_past_both_sides(files, tmp_path):
 
 def test_transforms_do_not_change_the_recording(files, tmp_path):
     env = TransformedEnv(robots(), GuideActions({"spline": SplineGuide()}))
-    record_drives(
-        env, FollowAdvice(env), [tmp_path / "0.mcap", tmp_path / "1.mcap"], {"policy": "spline"}
-    )
+    paths = [tmp_path / "0.mcap", tmp_path / "1.mcap"]
+    record_drives(env, FollowAdvice(env), paths, {"policy": "spline"})
     for robot, path in enumerate(files):
         assert (tmp_path / f"{robot}.mcap").read_bytes() == path.read_bytes()
 

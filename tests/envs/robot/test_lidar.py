@@ -34,17 +34,12 @@ def test_turning_during_a_scan_shifts_the_bearings():
     turn = 0.05
     poses = torch.zeros(3, 1, 360)
     poses[2] = turn * lidar.phase
-    standing, turning = (
-        cast((1.0, 0.0, 0.2), (-1.0, 0.3, 0.2), poses=p)[0][0].isfinite() for p in (STANDING, poses)
-    )
+    middle = []
+    for given in (STANDING, poses):
+        seen = cast((1.0, 0.0, 0.2), (-1.0, 0.3, 0.2), poses=given)[0][0].isfinite()
+        parts = lidar.angles.abs() < 1, lidar.angles > 2
+        middle.append([float(lidar.angles[seen & part].mean()) for part in parts])
     assert lidar.phase[-1] == 0
-    middle = [
-        [
-            float(lidar.angles[seen & part].mean())
-            for part in (lidar.angles.abs() < 1, lidar.angles > 2)
-        ]
-        for seen in (standing, turning)
-    ]
     # What is behind on the left is measured first, before the robot has turned.
     expected = [turn / 2, turn * 0.05]
     np.testing.assert_allclose(np.subtract(*middle), expected, atol=0.01)
@@ -87,13 +82,9 @@ def test_arc_equals_many_small_steps():
     steps = pose
     for _ in range(2000):
         half = torch.stack([steps[0], steps[1], steps[2] + 0.4 / 4000])
-        steps = torch.stack(
-            [
-                half[0] + 0.5 / 2000 * half[2].cos(),
-                half[1] + 0.5 / 2000 * half[2].sin(),
-                steps[2] + 0.4 / 2000,
-            ]
-        )
+        x = half[0] + 0.5 / 2000 * half[2].cos()
+        y = half[1] + 0.5 / 2000 * half[2].sin()
+        steps = torch.stack([x, y, steps[2] + 0.4 / 2000])
     found = move_along_arc(pose, *torch.tensor([0.5, 0.4]).double())
     torch.testing.assert_close(found, steps, atol=1e-7, rtol=0)
 
@@ -110,10 +101,7 @@ def all_pairs(poses, angles, cones, radius):
     """Return what `cast_beams` does, computed for all pairs of beams and cones."""
     direction = poses[2] + angles
     cos, sin = direction.cos().unsqueeze(-1), direction.sin().unsqueeze(-1)
-    x, y = (
-        centre.unsqueeze(-2) - sensor.unsqueeze(-1)
-        for centre, sensor in zip(cones, poses[:2], strict=True)
-    )
+    x, y = (c.unsqueeze(-2) - s.unsqueeze(-1) for c, s in zip(cones, poses[:2], strict=True))
     along, across = x * cos + y * sin, y * cos - x * sin
     half_chord_squared = radius.square().unsqueeze(-2) - across.square()
     distance = along - half_chord_squared.clamp(min=0).sqrt()
@@ -125,9 +113,8 @@ def all_pairs(poses, angles, cones, radius):
 def test_beams_in_windows_are_those_of_all_pairs_to_the_last_bit(own):
     lidar, draw = SimulatedLidar(), torch.Generator().manual_seed(0)
     cones, radius = 3 * torch.rand(2, 40, 40, generator=draw), 0.1 * torch.rand(40, generator=draw)
-    start = torch.cat(
-        [3 * torch.rand(2, 40, generator=draw), 20 * torch.randn(1, 40, generator=draw)]
-    )
+    heading = 20 * torch.randn(1, 40, generator=draw)
+    start = torch.cat([3 * torch.rand(2, 40, generator=draw), heading])
     start[:2, :3] = cones[:, 0, :3] + 0.01  # within a cone
     turn = torch.randn(40, 1, generator=draw)
     poses = move_along_arc(start.unsqueeze(-1), 0.1 * lidar.phase, turn * lidar.phase)
@@ -159,7 +146,6 @@ def test_no_sensor_and_no_cone_are_allowed():
 def test_rows_of_one_case_have_the_same_noise():
     true = torch.rand(2, 360, generator=torch.Generator().manual_seed(0)) + 0.5
     few, _ = SimulatedLidar().measure(true, torch.Generator().manual_seed(1))
-    many, _ = SimulatedLidar().measure(
-        true.repeat(3, 1), torch.Generator().manual_seed(1), different=2
-    )
+    again = torch.Generator().manual_seed(1)
+    many, _ = SimulatedLidar().measure(true.repeat(3, 1), again, different=2)
     assert torch.equal(many, few.repeat(3, 1))
