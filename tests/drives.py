@@ -36,6 +36,16 @@ from coil_rl.envs.recordings.messages import (
 from coil_rl.guides import SplineGuide
 
 REAL = Path(__file__).parents[2] / "shared" / "recordings"
+# Recordings of real sensors in rooms without cones, and their topics. Numbers of scans, of their
+# ranges, of clusters within 1.15 m and of those with at least two points, and the share of the
+# clusters in sight that are rejected.
+SENSORS = {
+    ("breezyslam_exp1_urg_odom", "/scan"): (756, 682, 3241, 2817, 0.50),
+    ("rplidar_c1_lab446a", "/scan"): (2, 1440, 17, 17, 0.50),  # of the first of five scanners
+    ("urg04lx_obstacle_detector_demo", "/rear_scan"): (330, 726, 1955, 1926, 0.14),
+    ("urg04lx_obstacle_detector_demo", "/scan"): (331, 726, 722, 719, 0.57),
+    ("urg_legs_positive_7", "/scan"): (510, 768, 1247, 1229, 0.85),
+}
 PERIOD = 182_000_000  # ns
 START = 1_700_000_000_000_000_000  # ns
 
@@ -161,7 +171,7 @@ class SplineDriver:
 
 
 def real_recording(name, topic):
-    """The recording of a real sensor."""
+    """The recording of a real sensor, see `SENSORS`."""
     path = REAL / f"{name}.mcap"
     if not path.is_file():
         pytest.skip("the recordings of real sensors are not part of the repository")

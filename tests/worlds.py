@@ -17,6 +17,17 @@ from coil_rl.guides import SplineGuide
 from coil_rl.measures import Measure, measures_of
 from coil_rl.transforms import GuideActions
 
+# The cone world as the authors of the paper have it, see preset=authors.
+AUTHORS = {
+    "rate": 60.0,
+    "spline": "quadratic",
+    "cone_bonus": "every_sighting",
+    "held_steps": 2,
+    "sight": 7.03125,
+    "hold_boundary": True,
+    "finish_in_sight": True,
+}
+
 
 @cache
 def driving_measures(env="cone_track") -> dict[str, Measure]:

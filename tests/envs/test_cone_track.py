@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
-from worlds import driving_measures
+from worlds import AUTHORS, driving_measures
 
 from coil_rl.compiled import Compiled
 from coil_rl.cones.spline import SplineGuide
@@ -18,15 +18,6 @@ from coil_rl.testing import check_env
 from coil_rl.transforms import GuideActions
 
 Steps = tuple[TensorDictBase, TensorDictBase]
-AUTHORS: dict[str, Any] = {
-    "rate": 60.0,
-    "spline": "quadratic",
-    "cone_bonus": "every_sighting",
-    "held_steps": 2,
-    "sight": 7.03125,
-    "hold_boundary": True,
-    "finish_in_sight": True,
-}
 
 
 @pytest.fixture(scope="module")

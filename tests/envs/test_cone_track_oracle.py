@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from oracle import OneCar, Outcome, guide_action, midpoints
 from torchrl.envs import TransformedEnv
+from worlds import AUTHORS
 
 from coil_rl.cones.spline import SplineGuide
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
@@ -26,17 +27,7 @@ class Preset(NamedTuple):
 PRESETS = {
     "paper": Preset({}, {}),
     "authors": Preset(
-        {
-            "rate": 60.0,
-            "spline": "quadratic",
-            "cone_bonus": "every_sighting",
-            "held_steps": 2,
-            "sight": 7.03125,
-            "hold_boundary": True,
-            "late_observation": True,
-            "finish_in_sight": True,
-        },
-        {"spline": "quadratic", "gain": 80 / 120},
+        AUTHORS | {"late_observation": True}, {"spline": "quadratic", "gain": 80 / 120}
     ),
 }
 OUTPUTS = ("observation", "steering", "reward", "terminated", "truncated")

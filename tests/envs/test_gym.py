@@ -29,7 +29,7 @@ def test_stable_baselines3_checks_and_trains_the_env():
         warnings.simplefilter("error")
         checker.check_env(env.unwrapped)
     sb3 = importlib.import_module("stable_baselines3")
-    model = sb3.PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=1, device="cpu")
+    model = sb3.PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=1, seed=0, device="cpu")
     assert model.learn(64).num_timesteps == 64
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from drives import (
     PERIOD,
+    SENSORS,
     START,
     by_another_library,
     drive,
@@ -459,19 +460,10 @@ def test_truncated_and_infinite_messages_are_refused(tmp_path, size):
     assert "topic /odom, message 0" in refusal(rosbag(tmp_path, "b.mcap", "c.mcap"))
 
 
-SENSORS = {
-    ("breezyslam_exp1_urg_odom", "/scan"): (756, 682),
-    ("rplidar_c1_lab446a", "/scan"): (2, 1440),  # of the first of five scanners
-    ("urg04lx_obstacle_detector_demo", "/rear_scan"): (330, 726),
-    ("urg04lx_obstacle_detector_demo", "/scan"): (331, 726),
-    ("urg_legs_positive_7", "/scan"): (510, 768),
-}
-
-
 @pytest.mark.parametrize(("name", "topic"), SENSORS)
 def test_recordings_of_real_sensors_are_read_like_another_library_does(name, topic):
     recording = real_recording(name, topic)
-    assert recording.ranges.shape == SENSORS[name, topic]
+    assert recording.ranges.shape == SENSORS[name, topic][:2]
     assert np.isfinite(recording.poses()).all()
     assert (recording.odometry is not None) == ("odom" in name)
     assert (np.diff(recording.seconds) > 0).all()

@@ -173,9 +173,7 @@ def test_invalid_arguments_are_refused(tmp_path):
         McapReplayEnv(path, blind, max_steering=91.0)
 
 
-@pytest.mark.fast(1)
-@pytest.mark.parametrize("range_max", [1.0, 1.6])
-@pytest.mark.parametrize("scale", [7.0, 5.625])
+@pytest.mark.parametrize(("range_max", "scale"), [(1.0, 7.0), (1.6, 5.625)])
 def test_observation_is_that_of_a_robot_with_the_same_perception(tmp_path, range_max, scale):
     perception = Perception(simulated_cone_classifier(), range_max=range_max, scale=scale)
     robot = SimulatedRobotEnv(perception=perception, time_limit=4.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from drives import real_recording
+from drives import SENSORS, real_recording
 
 from coil_rl.envs import (
     ConeClassifier,
@@ -103,22 +103,12 @@ def test_walls_are_no_cones():
     assert perception.rejected(*scan_of((3.0, 0, THICK))) == 0
 
 
-@pytest.mark.parametrize(
-    ("name", "topic", "share"),
-    [
-        ("breezyslam_exp1_urg_odom", "/scan", 0.50),
-        ("rplidar_c1_lab446a", "/scan", 0.50),
-        ("urg04lx_obstacle_detector_demo", "/scan", 0.57),
-        ("urg04lx_obstacle_detector_demo", "/rear_scan", 0.14),
-        ("urg_legs_positive_7", "/scan", 0.85),
-    ],
-)
-def test_share_of_clusters_in_rooms_without_cones_that_are_rejected(name, topic, share):
+@pytest.mark.parametrize(("name", "topic"), SENSORS)
+def test_share_of_clusters_in_rooms_without_cones_that_are_rejected(name, topic):
     recording = real_recording(name, topic)
-    rejected = Perception(simulated_cone_classifier()).rejected(
-        recording.ranges, recording.angles(slice(None))
-    )
-    assert rejected == pytest.approx(share, abs=0.02)
+    angles = recording.angles(slice(None))
+    rejected = Perception(simulated_cone_classifier()).rejected(recording.ranges, angles)
+    assert rejected == pytest.approx(SENSORS[name, topic][-1], abs=0.02)
 
 
 def test_laser_yaw_rotates_the_view():
