@@ -44,10 +44,10 @@ def test_clockwise_scans_leave_no_doubt():
     assert remarks == []
 
 
-@pytest.mark.parametrize("step", [7.0, -5.0])
-def test_scan_over_many_turns_is_said_to_be_one(step):
+@pytest.mark.parametrize(("step", "turns"), [(7.0, "400.0"), (-5.0, "285.7")])
+def test_scan_over_many_turns_is_said_to_be_one(step, turns):
     _, remarks = taken(0.0, 359 * step, step)
-    assert "turns, so its angles mean little" in remarks[0]
+    assert f"has ranges over {turns} turns, so its angles mean little" in remarks[0]
 
 
 def test_scans_with_one_bearing_are_refused():
