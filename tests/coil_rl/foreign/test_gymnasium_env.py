@@ -262,6 +262,17 @@ def test_actions_of_a_space_reach_the_env(space, spec, shape):
     )
 
 
+@pytest.mark.parametrize(
+    "space", [spaces.Discrete(3), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)]
+)
+def test_all_spaces_have_the_same_digits_in_processes(space):
+    outcomes = []
+    for workers in (0, 2):
+        env = GymnasiumEnv("Echo-v0", 3, options={"action_space": space}, workers=workers)
+        outcomes.append(drive(env, 12)[0])
+    assert same(*outcomes)
+
+
 class Place(gymnasium.Env):
     """Moves a millimetre a step, from an offset on."""
 

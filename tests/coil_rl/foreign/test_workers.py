@@ -51,29 +51,6 @@ class Plant(gymnasium.Env):
         )
 
 
-class Nested(Plant):
-    """The plant with choices as actions, and its observation in a nested dictionary."""
-
-    def __init__(self, action_space):
-        super().__init__()
-        self.action_space = action_space
-        state, phase = self.observation_space, spaces.Discrete(3)
-        self.observation_space = spaces.Dict(
-            {"plant": spaces.Dict({"state": state}), "phase": phase}
-        )
-
-    def _nested(self, state):
-        return {"plant": {"state": state}, "phase": self.time % 3}
-
-    def reset(self, *, seed=None, options=None):
-        state, info = super().reset(seed=seed)
-        return self._nested(state), info
-
-    def step(self, action):
-        state, *rest = super().step(np.asarray(action))
-        return self._nested(state), *rest
-
-
 class Integrator:
     """A controller with a memory."""
 
@@ -105,17 +82,6 @@ def test_digits_do_not_depend_on_the_number_of_processes(workers) -> None:
     alone, _ = drive(plants(0), 25)
     spread, _ = drive(plants(workers), 25)
     assert same(alone, spread)
-
-
-@pytest.mark.parametrize(
-    "action_space", [spaces.Discrete(3), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)]
-)
-def test_choices_and_nested_observations_are_spread_too(action_space) -> None:
-    outcomes = []
-    for workers in (0, 2):
-        env = GymnasiumEnv(Nested, 3, options={"action_space": action_space}, workers=workers)
-        outcomes.append(drive(env, 12)[0])
-    assert same(*outcomes)
 
 
 @pytest.mark.parametrize(("before", "after"), [(2, 0), (0, 3), (2, 2)])
