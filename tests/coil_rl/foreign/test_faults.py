@@ -126,6 +126,7 @@ def is_one_sentence(caught, length=400):
         (reward("1.0"), "the reward is '1.0', not one number"),
         (reward(10**400), "the reward is 1000.*, not one number"),
         (reward(NAN), "the reward is nan, not a finite number"),
+        (reward(-np.inf), "the reward is -inf, not a finite number"),
         (reward(1e300), r"the reward is 1e\+300, not a finite number of float32"),
         (end(None), "terminated is None, not True or False"),
         (end("False"), "terminated is 'False', not True or False"),
@@ -169,6 +170,7 @@ def test_exception_of_an_env_is_chained():
     [
         (lambda x: None, r"reset returned None, not the two of Gymnasium \(observation, info\)"),
         (lambda x: x, r"reset returned \[.*\], not the two"),  # two numbers, which would unpack
+        (lambda x: (x, {}, 1), "reset returned 3 values, not the two"),
         (lambda x: (x, 0.0), "info of reset is 0.0, not a dictionary"),
         (lambda x: (x[:1], {}), r"the observation has the shape \[1\]"),
         (fail(RuntimeError("no key")), "reset raised RuntimeError: no key"),
@@ -185,6 +187,7 @@ def test_fault_in_a_reset_has_its_place(reset, message):
         (spaces.Box(-1, 1, (2, 3)), np.zeros((3, 2)), r"shape \[3, 2\], but .* has \[2, 3\]"),
         (BYTES, [0.5, 0.25], "the observation holds 0.5, which is not"),
         (BYTES, [0, 256], "the observation holds 256, which is not"),
+        (BYTES, [0, -1], "the observation holds -1, which is not in"),
         (spaces.MultiBinary(2), [0, 2], "the observation holds 2, which is not in MultiBinary"),
         (spaces.Discrete(3), 3, "the observation holds 3, which is not in Discrete"),
         (spaces.Discrete(3, start=5), 2, "the observation holds 2, which is not in Discrete"),
@@ -412,6 +415,7 @@ class Raises(nn.Module):
         ("Pendulum-v1", lambda x: x, r"has the shape \[2, 3\], but must have \[2, 1\]"),
         ("Pendulum-v1", nn.Identity(), r"Identity: its action has the shape .* but must have"),
         ("Pendulum-v1", Raises(), "Raises: it raised RuntimeError: no weights at"),
+        ("CartPole-v1", lambda x: -1, "is neither an index below 2 nor a one-hot vector"),
         ("CartPole-v1", lambda x: 2, "is neither an index below 2 nor a one-hot vector"),
         ("CartPole-v1", lambda x: 0.5, "is no whole number, but must be the number of a choice"),
     ],
@@ -540,6 +544,11 @@ class OfClass(Remembers):
         pass
 
 
+class OfClassCleared(OfClass):
+    def reset(self):
+        self.memory.clear()
+
+
 class OfModule(OfClass):
     def act(self, observation):
         MEMORY.append(float(observation[0]))
@@ -600,6 +609,7 @@ def findings(env=Drift, controller=None):
         ({"env": SharesDefault}, "rows", "all rows share a default of SharesDefault.__init__; mak"),
         ({"env": SharesAttribute}, "rows", "all rows share SharesAttribute.shared; make it in __i"),
         ({"controller": OfClass}, "rows", "all rows share OfClass.memory; make it in __init__"),
+        ({"controller": OfClassCleared}, "rows", "all rows share OfClass.memory; make it in __"),
         ({"controller": OfModule}, "rows", r"all rows share .*test_faults\.MEMORY; make it in"),
         (
             {"controller": OfClock},
