@@ -681,10 +681,6 @@ def test_rows_that_use_the_numbers_of_the_process_are_separate_and_repeat(id):
         assert torch.equal(alone[0, 0], actions(beside, 10)[0, 0])
 
 
-def chdir(*_):
-    os.chdir("/")
-
-
 CHANGES = {
     "torch": lambda: torch.manual_seed(0),
     "torch drawn": lambda: torch.rand(3),
@@ -692,7 +688,7 @@ CHANGES = {
     "numpy drawn": lambda: np.random.rand(),
     "random": lambda: random.seed(0),
     "random drawn": random.random,
-    "folder": chdir,
+    "folder": lambda: os.chdir("/"),
     "dtype": lambda: torch.set_default_dtype(torch.float64),
     "grad": lambda: torch.set_grad_enabled(False),
     "autocast": lambda: torch.autocast("cpu").__enter__(),
@@ -749,8 +745,12 @@ def acts_that(change):
 ACTS = tuple(acts_that(None))
 
 
-def process_after(change, place):
-    """Return the state of the process after a place of an env or a controller has changed it."""
+@pytest.mark.parametrize("place", ["the maker", "reset", "step", *ACTS])
+@pytest.mark.parametrize("change", [*CHANGES, *MADE])
+def test_process_is_as_before_whatever_foreign_code_does_to_it(change, place):
+    if change in MADE and place not in ("the maker", "reset"):
+        pytest.skip("it is restored where an env or a controller is made")
+    do = (CHANGES | MADE)[change]
 
     class Does(Drift):
         def __init__(self, **options):
@@ -759,7 +759,7 @@ def process_after(change, place):
 
         def at(self, here):
             if here == place:
-                change()
+                do()
 
         def begin(self, seed):
             self.at("reset")
@@ -770,24 +770,16 @@ def process_after(change, place):
             super().move(action)
 
     seeded()
+    before = state()
+    seeded()
     env = GymnasiumEnv(Does, 2, first_seed=0)
     if place in ACTS:
-        guide = ControllerGuide(acts_that(change)[place])
+        guide = ControllerGuide(acts_that(do)[place])
         env = TransformedEnv(env, GuideActions({"theirs": guide}))
     carrier = env.reset()
     for _ in range(6):
         carrier = env.step_mdp(env.step(carrier.set("action", torch.zeros(2, 1))))
-    return state()
-
-
-@pytest.mark.parametrize("place", ["the maker", "reset", "step", *ACTS])
-@pytest.mark.parametrize("change", [*CHANGES, *MADE])
-def test_process_is_as_before_whatever_foreign_code_does_to_it(change, place):
-    if change in MADE and place not in ("the maker", "reset"):
-        pytest.skip("it is restored where an env or a controller is made")
-    seeded()
-    before = state()
-    assert process_after((CHANGES | MADE)[change], place) == before
+    assert state() == before
 
 
 class Dithers(TensorDictModuleBase):

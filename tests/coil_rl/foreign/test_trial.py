@@ -77,14 +77,6 @@ class Inside(Still):
         return self.parts["noise"][0].randn()
 
 
-class OwnAtReset(Inside):
-    def reset(self):
-        self.past = super().draw()
-
-    def draw(self):
-        return 0.0
-
-
 class Unused(Unseeded):
     """Controller with a generator that it does not use."""
 
@@ -110,7 +102,7 @@ def found(of):
 
 
 @pytest.mark.fast(2)
-@pytest.mark.parametrize("of", [Unseeded, Unseeded(), Inside, Inside(), OwnAtReset()])
+@pytest.mark.parametrize("of", [Unseeded, Unseeded(), Inside, Inside()])
 def test_controller_that_draws_what_no_seed_reaches_is_found(of):
     sentence = found(of)["draws"]
     name = of.__name__ if isinstance(of, type) else type(of).__name__
@@ -122,7 +114,7 @@ def test_controller_that_draws_what_no_seed_reaches_is_found(of):
 @pytest.mark.parametrize(
     "of",
     [
-        *(Still, Still(), Seeded, Seeded(3), Inside(3), OwnAtReset(3), Unused(), OfTorch, Fails),
+        *(Still, Still(), Seeded, Seeded(3), Inside(3), Unused(), OfTorch, Fails),
         *(Global, Global(), Python, Late, AtReset),
     ],
 )
