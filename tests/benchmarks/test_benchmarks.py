@@ -42,20 +42,14 @@ def test_stopwatch_counts_the_outer_of_two_methods():
 @pytest.mark.slow
 def test_quick_run_measures_everything(tmp_path, capsys):
     parts = [name for name in PARTS if name != "compiled"]
-    arguments = [
-        "track=generated",
-        "track.train.count=1",
-        "--quick",
-        "--output",
-        str(tmp_path / "run"),
-    ]
+    arguments = ["track=generated", "track.train.count=1", "--quick"]
+    arguments += ["--output", str(tmp_path / "run")]
     main(arguments)
     results = json.loads((tmp_path / "run" / "benchmark.json").read_text())
     assert set(results) == {"versions", "settings", "goals", *parts}
     for row in results["shares"]:
-        assert sum(
-            row[key] for key in ("env", "guide", "policy", "update", "framework")
-        ) == pytest.approx(1)
+        shares = [row[key] for key in ("env", "guide", "policy", "update", "framework")]
+        assert sum(shares) == pytest.approx(1)
     assert all(172 < row["state per car (B)"] < 2000 for row in results["processes"])
     assert (tmp_path / "run" / "benchmark.md").read_text() in capsys.readouterr().out
     with pytest.raises(SystemExit):
@@ -65,14 +59,8 @@ def test_quick_run_measures_everything(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_other_learners_are_measured_without_yardsticks(tmp_path):
-    overrides = [
-        "track=generated",
-        "track.train.count=1",
-        "learner=dqn",
-        "learner.starts=300",
-        "learner.updates_per_step=0.125",
-        "learner.batch_size=8",
-    ]
+    overrides = ["track=generated", "track.train.count=1", "learner=dqn", "learner.starts=300"]
+    overrides += ["learner.updates_per_step=0.125", "learner.batch_size=8"]
     main([*overrides, "--quick", "--parts", "training", "sb3", "--output", str(tmp_path / "run")])
     results = json.loads((tmp_path / "run" / "benchmark.json").read_text())
     (row,) = results["training"]

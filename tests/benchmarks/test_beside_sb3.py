@@ -17,21 +17,18 @@ ENVS = {"ppo": "CartPole-v1", "sac": "Pendulum-v1", "dqn": "CartPole-v1"}
 @pytest.mark.parametrize("algorithm", VALUES)
 def test_our_learner_trains_with_the_shared_values(algorithm):
     frames = 512 if algorithm == "ppo" else 40
-    act, rate = ours(
-        algorithm, ENVS[algorithm], {**VALUES[algorithm], **SHORT[algorithm]}, frames, seed=0
-    )
+    env, values = ENVS[algorithm], VALUES[algorithm] | SHORT[algorithm]
+    act, rate = ours(algorithm, env, values, frames, seed=0)
     assert rate > 0
-    assert mean_return(ENVS[algorithm], act) == mean_return(
-        ENVS[algorithm], act
-    )  # fixed seeds, no random numbers
+    assert mean_return(env, act) == mean_return(env, act)  # fixed seeds, no random numbers
 
 
 def test_mean_return_is_that_of_complete_episodes():
     # Pushing to one side only, a cart falls after 8 to 10 steps.
-    left = mean_return(
-        "CartPole-v1", lambda observation: torch.zeros(len(observation), dtype=torch.long)
-    )
-    assert 8 <= left <= 10
+    def push(observation):
+        return torch.zeros(len(observation), dtype=torch.long)
+
+    assert 8 <= mean_return("CartPole-v1", push) <= 10
 
 
 def test_both_are_trained_and_printed(capsys):

@@ -20,17 +20,8 @@ def rewards(result):
 def folder(tmp_path_factory):
     """Two seeds of PPO with exact views."""
     path = tmp_path_factory.mktemp("delay")
-    called(
-        "train",
-        "-m",
-        "+experiment=robot_delay",
-        "method=ppo",
-        "disturb=[]",
-        "seed=0,1",
-        *SMALL,
-        f"hydra.sweep.dir={path}",
-        cwd=path,
-    )
+    words = ["+experiment=robot_delay", "method=ppo", "disturb=[]", "seed=0,1"]
+    called("train", "-m", *words, *SMALL, f"hydra.sweep.dir={path}", cwd=path)
     return path
 
 

@@ -1,17 +1,14 @@
 """The guide benchmark: its rows, their check, its pages, and the tasks of other packages."""
 
-import csv
 import json
 import math
 import shutil
 import sys
 from importlib.util import find_spec
-from pathlib import Path
 
 import gymnasium
 import pytest
-from hydra import compose, initialize_config_module
-from programs import TINY_ARM, called, shipped
+from programs import ROOT, TINY_ARM, called, composed, read_csv, shipped
 from run_folders import driven, make_run
 
 from benchmarks.guide_benchmark import __main__ as program
@@ -32,7 +29,6 @@ from coil_rl.errors import UserError
 from coil_rl.report.runs import read_runs
 
 pytest.importorskip("gymnasium.envs.classic_control")
-ROOT = Path(__file__).parents[2]
 ROWS = ROOT / "docs" / "guide_benchmark" / "rows.csv"
 FOREIGN = ROOT / "benchmarks" / "guide_benchmark" / "conf"
 PACKAGES = {
@@ -52,14 +48,18 @@ IDS = {
 }
 
 
-def table():
-    """Return the rows of the documentation."""
-    with ROWS.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+def intact():
+    """Return a row of the documentation, of an intact guide."""
+    return next(row for row in read_csv(ROWS) if row["arm"] == "intact")
+
+
+def with_cells(row, changed):
+    """Return a row with other cells; those that are None are left out."""
+    return {name: cell for name, cell in (row | changed).items() if cell is not None}
 
 
 def test_rows_of_the_table_are_valid():
-    for row in table():
+    for row in read_csv(ROWS):
         check_row(row)  # an error names task and method
 
 
@@ -80,42 +80,28 @@ def test_rows_of_the_table_are_valid():
         ({"reached": "99"}, "reached=99, but the row has"),
         ({"reached": "0"}, "reached=0, but frames_to_guide="),
         ({"low": "nan", "high": "nan"}, "but its interval says unknown"),
+        ({"seconds": None}, "expected: task, method"),
+        ({None: ["a further cell"]}, "expected: task, method"),
     ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
 def test_row_that_contradicts_itself_is_refused(changed, message):
-    row = next(each for each in table() if each["arm"] == "intact")
     with pytest.raises(ValueError, match=message):
-        check_row(row | changed)
+        check_row(with_cells(intact(), changed))
 
 
-def test_row_without_an_interval_is_valid_if_its_verdict_is_unknown():
-    row = next(each for each in table() if each["arm"] == "intact")
-    check_row(row | {"low": "nan", "high": "nan", "verdict": "unknown"})
-
-
-def test_row_of_before_the_seeds_that_reach_the_guide_were_counted_is_valid():
-    row = table()[0]
-    assert row.pop("reached") == ""
-    read = check_row(row)
-    assert read["reached"] is None
+@pytest.mark.parametrize(
+    "changed",
+    [{"low": "nan", "high": "nan", "verdict": "unknown"}, {"reached": None}, {"reached": ""}],
+    ids=["no interval", "no column of those that reach the guide", "they were not counted"],
+)
+def test_row_may_lack_an_interval_and_the_seeds_that_reach_the_guide(changed):
+    read = check_row(with_cells(intact(), changed))
     assert tuple(read) == COLUMNS
-
-
-def test_row_without_a_column_is_refused():
-    row = dict(table()[0])
-    del row["seconds"]
-    with pytest.raises(ValueError, match="expected: task, method"):
-        check_row(row)
-
-
-def test_row_with_a_further_cell_is_refused():
-    with pytest.raises(ValueError, match="expected: task, method"):
-        check_row(table()[0] | {None: ["more"]})
+    assert read["reached"] is None or "low" in changed
 
 
 def test_table_has_no_row_twice():
-    keys = [tuple(row[name] for name in program.SAME) for row in table()]
+    keys = [tuple(row[name] for name in program.SAME) for row in read_csv(ROWS)]
     assert len(keys) == len(set(keys))
 
 
@@ -151,19 +137,21 @@ def test_reference_of_gymnasium_is_its_reward_threshold(task):
 def folder(tmp_path_factory):
     """One seed of PPO, and of kickstarting with two guides, in one task."""
     path = tmp_path_factory.mktemp("guide_benchmark")
+    small = ["env.max_steps=15", *TINY_ARM, f"hydra.sweep.dir={path / 'pendulum'}", "seed=0"]
     for words in (["+arm=alone", "method=ppo"], ["+arm=intact,random", "method=kickstart"]):
-        called(
-            "train",
-            "-m",
-            "+experiment=guide_benchmark/pendulum",
-            *words,
-            "seed=0",
-            "env.max_steps=15",
-            *TINY_ARM,
-            f"hydra.sweep.dir={path / 'pendulum'}",
-            cwd=path,
-        )
+        called("train", "-m", "+experiment=guide_benchmark/pendulum", *words, *small, cwd=path)
     return path
+
+
+@pytest.fixture
+def run(monkeypatch):
+    """Return a function that runs the program with some words."""
+
+    def run_with(*words):
+        monkeypatch.setattr(sys, "argv", ["guide_benchmark", *map(str, words)])
+        program.main()
+
+    return run_with
 
 
 @pytest.mark.slow
@@ -255,7 +243,7 @@ def test_run_without_its_versions_is_one_sentence(made):
 
 @pytest.mark.slow
 def test_unknown_verdicts_have_a_column_only_if_there_are_any(tmp_path):
-    rows = [check_row(row) for row in table() if row["arm"] != "alone"]
+    rows = [row for row in read_rows(ROWS) if row["arm"] != "alone"]
     assert "unknown" not in write_all(tmp_path, rows)
     rows[0] |= {"verdict": "unknown", "low": math.nan, "high": math.nan}
     page = write_all(tmp_path, rows)
@@ -285,14 +273,11 @@ def test_methods_are_ordered_by_their_share_of_losses_and_name_their_worst_pair(
 
 
 @pytest.mark.slow
-def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, monkeypatch, capsys):
+def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, run, capsys):
     file = tmp_path / "rows.csv"
     for _ in range(2):  # the second time each row replaces itself
-        words = ["guide_benchmark", str(folder), "--pages", str(tmp_path), "--add", str(file)]
-        monkeypatch.setattr(sys, "argv", words)
-        program.main()
-    with file.open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+        run(folder, "--pages", tmp_path, "--add", file)
+    rows = read_csv(file)
     assert len(rows) == 3
     for row in rows:
         check_row(row)
@@ -306,69 +291,54 @@ def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, monke
 
 
 @pytest.mark.slow
-def test_page_of_all_tasks_is_of_the_whole_table_that_rows_join(folder, tmp_path, monkeypatch):
-    file = tmp_path / "table.csv"
-    shutil.copyfile(ROWS, file)
-    pages = tmp_path / "pages"
+def test_page_of_all_tasks_is_of_the_whole_table_that_rows_join(folder, tmp_path, run):
+    file, pages, picture = tmp_path / "table.csv", tmp_path / "pages", "pendulum.webp"
     pages.mkdir()
-    shutil.copyfile(ROWS.parent / "pendulum.webp", pages / "pendulum.webp")
-    words = ["guide_benchmark", str(folder), "--pages", str(pages), "--add", str(file)]
-    monkeypatch.setattr(sys, "argv", words)
-    program.main()
+    shutil.copyfile(ROWS, file)
+    shutil.copyfile(ROWS.parent / picture, pages / picture)
+    run(folder, "--pages", pages, "--add", file)
     assert len(read_rows(file)) == len(read_rows(ROWS)) + 3
     assert (pages / "rows.csv").read_bytes() == file.read_bytes()
     page = (pages / "README.md").read_text()
     assert "acrobot, cart_pole" in page  # without a page here
     assert "[pendulum](pendulum.md)" in page
     task = (pages / "pendulum.md").read_text()
-    assert "(pendulum.webp)" in task
+    assert f"({picture})" in task
     known = [row for row in read_rows(file) if row["task"] == "pendulum"]
     assert task.count("\n| ") == len(known) + 1  # the ladder has the rows of all sweeps
-    assert (pages / "pendulum.webp").read_bytes() == (ROWS.parent / "pendulum.webp").read_bytes()
+    assert (pages / picture).read_bytes() == (ROWS.parent / picture).read_bytes()
 
 
 @pytest.mark.slow
-def test_pages_of_the_docs_are_those_of_the_table(tmp_path, monkeypatch):
+def test_pages_of_the_docs_are_those_of_the_table(tmp_path, run):
     for file in (ROWS, *ROWS.parent.glob("*.webp")):
         shutil.copyfile(file, tmp_path / file.name)
-    words = ["guide_benchmark", "--pages", str(tmp_path), "--add", str(tmp_path / "rows.csv")]
-    monkeypatch.setattr(sys, "argv", words)
-    program.main()
+    run("--pages", tmp_path, "--add", tmp_path / "rows.csv")
     for page in ROWS.parent.glob("*.md"):
         assert (tmp_path / page.name).read_text() == page.read_text(), page.name
 
 
-def test_no_folder_and_no_table_is_one_sentence(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["guide_benchmark", "--pages", "pages"])
-    with pytest.raises(SystemExit) as refused:
-        program.main()
-    assert refused.value.code == 2
-    assert "give the folder of the experiments" in capsys.readouterr().err
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("task", "message"),
-    [("chess", "the task chess has no reference"), (None, "has no task with plain PPO")],
+    ("words", "message"),
+    [
+        (["--pages", "pages"], "give the folder of the experiments"),
+        (["."], "the task chess has no reference"),
+    ],
 )
-def test_folder_without_results_is_one_sentence(
-    task, message, folder, tmp_path, monkeypatch, capsys
-):
-    if task:
-        shutil.copytree(folder / "pendulum", tmp_path / task)
-    monkeypatch.setattr(sys, "argv", ["guide_benchmark", str(tmp_path)])
+def test_without_results_it_ends_with_one_sentence(words, message, made, run, capsys, monkeypatch):
+    shutil.copytree(made, made / "chess")
+    monkeypatch.chdir(made)
     with pytest.raises(SystemExit) as refused:
-        program.main()
+        run(*words)
     assert refused.value.code == 2
     assert message in capsys.readouterr().err
-    assert not (tmp_path / "pages").exists()
+    assert not (made / "pages").exists()
 
 
 def jobs(task):
     """Return arm and method of some jobs of a task: each arm, and each method, at least once."""
     words = [f"+experiment=guide_benchmark/{task}"]
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        params = compose("train", words, return_hydra_config=True).hydra.sweeper.params
+    params = composed(*words, return_hydra_config=True).hydra.sweeper.params
     arms, methods = (str(params[key]).split(",") for key in ("+arm", "method"))
     result = [(arm, methods[0]) for arm in arms] + [("intact", each) for each in methods[1:]]
     tuned = (ROOT / "conf" / "arm" / "tuned" / f"{task}.yaml").exists()
@@ -382,8 +352,7 @@ def test_every_arm_and_every_method_of_a_task_can_be_started(task, tmp_path):
         pytest.skip(f"{EXTRAS[task]} is not installed")
     for arm, method in jobs(task):
         words = [f"+experiment=guide_benchmark/{task}", f"+arm={arm}", f"method={method}"]
-        with initialize_config_module("coil_rl.conf", version_base="1.3"):
-            check(compose("train", [*words, f"run_dir={tmp_path}"]))
+        check(composed(*words, f"run_dir={tmp_path}"))
 
 
 @pytest.mark.slow
@@ -391,16 +360,8 @@ def test_every_arm_and_every_method_of_a_task_can_be_started(task, tmp_path):
 def test_task_of_another_package_trains(task, tmp_path):
     if find_spec(PACKAGES[task]) is None:
         pytest.skip(f"{PACKAGES[task]} is not installed")
-    called(
-        "train",
-        "-m",
-        "hydra.searchpath=[pkg://benchmarks.guide_benchmark.conf]",
-        f"+experiment=guide_benchmark/{task}",
-        "+arm=intact",
-        "method=coil",
-        "seed=0",
-        *TINY_ARM,
-        f"hydra.sweep.dir={tmp_path}",
-        cwd=tmp_path,
-    )
+    place = "hydra.searchpath=[pkg://benchmarks.guide_benchmark.conf]"
+    words = [f"+experiment=guide_benchmark/{task}", "+arm=intact", "method=coil", "seed=0"]
+    words += [*TINY_ARM, f"hydra.sweep.dir={tmp_path}"]
+    called("train", "-m", place, *words, cwd=tmp_path)
     assert (tmp_path / "coil_intact_seed0" / "evaluation.csv").exists()
