@@ -36,9 +36,8 @@ def distance(advisor, minibatch, categorical):
     distribution = advisor.imitator.get_dist(minibatch.select("observation"))
     if categorical:
         return -distribution.log_prob(minibatch["guide_action"][:, 0].argmax(-1))
-    return (
-        (minibatch["guide_action"][:, 0] - distribution.mode).abs().squeeze(-1)
-    )  # bounds -1 and 1
+    # In the bounds -1 and 1.
+    return (minibatch["guide_action"][:, 0] - distribution.mode).abs().squeeze(-1)
 
 
 @pytest.mark.parametrize("world", ["cones", "carts"])
@@ -50,10 +49,8 @@ def test_each_step_is_weighted_by_how_well_the_guide_can_be_imitated(world):
         weight = (-2.0 * distance(advisor, data, world == "carts")).exp()
         assert weight.std() > 0.01
         imitation = KickstartLoss()
-        ratio = (
-            advisor.policy.get_dist(data.select("observation")).log_prob(data["action"])
-            - data["action_log_prob"]
-        ).exp()
+        now = advisor.policy.get_dist(data.select("observation")).log_prob(data["action"])
+        ratio = (now - data["action_log_prob"]).exp()
         advantage = standardise(data["advantage"]).squeeze(-1)
         gain = torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage)
         expected = (weight * imitation.each(advisor.policy, data) - (1 - weight) * gain).mean()

@@ -1,7 +1,5 @@
-import csv
-
 import pytest
-from programs import called
+from programs import called, read_csv
 from run_folders import make_untrained_run
 
 TRACKS = ["track=generated", "track.test.count=1", "track.train.count=1"]
@@ -30,20 +28,14 @@ def runs(tmp_path_factory):
     return folder
 
 
-def listen(cwd, *arguments, code=0):
-    """Return standard output and standard error."""
-    done = called("listen", *arguments, cwd=cwd, code=code)
-    return done.stdout, done.stderr
-
-
-def read_csv(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+def listen(run, cwd, folder="out"):
+    """Return what the program prints about a run."""
+    return called("listen", f"run={run}", *FEW, f"hydra.run.dir={folder}", cwd=cwd).stdout
 
 
 @pytest.mark.slow
 def test_listen_prints_the_table_and_writes_maps_and_numbers(runs, tmp_path):
-    out, _ = listen(tmp_path, f"run={runs / 'coil'}", *FEW, "hydra.run.dir=out")
+    out = listen(runs / "coil", tmp_path)
     folder = tmp_path / "out"
     assert {path.name for path in folder.iterdir() if path.is_file()} == FILES
     assert out.startswith((folder / "listening.md").read_text())
@@ -56,26 +48,20 @@ def test_listen_prints_the_table_and_writes_maps_and_numbers(runs, tmp_path):
 
 @pytest.mark.slow
 def test_page_of_an_anchored_agent_gives_the_weights_of_its_guides(runs, tmp_path):
-    listen(tmp_path, f"run={runs / 'anchored'}", *FEW, "hydra.run.dir=out")
-    assert (
-        "Weight with which the policy holds each guide: spline 1.00, random 0.00."
-        in (tmp_path / "out" / "listening.md").read_text()
-    )
-    everywhere = {
-        row["guide"]: float(row["gradient"])
-        for row in read_csv(tmp_path / "out" / "listening_sections.csv")
-        if row["section"] == "everywhere"
-    }
-    assert everywhere["spline"] > 0.8
-    assert everywhere["random"] == 0
+    listen(runs / "anchored", tmp_path)
+    page = (tmp_path / "out" / "listening.md").read_text()
+    assert "holds each guide: spline 1.00, random 0.00." in page
+    rows = read_csv(tmp_path / "out" / "listening_sections.csv")
+    rows = [row for row in rows if row["section"] == "everywhere"]
+    gradients = {row["guide"]: float(row["gradient"]) for row in rows}
+    assert gradients["spline"] > 0.8
+    assert gradients["random"] == 0
 
 
 @pytest.mark.slow
 def test_discrete_actions_are_equal_or_different(runs, tmp_path):
-    out, _ = listen(tmp_path, f"run={runs / 'dqn'}", *FEW, "hydra.run.dir=out")
-    assert out.splitlines()[-1].startswith(
-        "coil_dqn depends most on spline: other advice of it changes the action by"
-    )
+    out = listen(runs / "dqn", tmp_path)
+    assert out.splitlines()[-1].startswith("coil_dqn depends most on spline: other advice of it")
     assert "gradient" not in out
     files = {path.name for path in (tmp_path / "out").iterdir() if path.is_file()}
     assert files == FILES - {"listening_gradient.png"}
@@ -87,7 +73,7 @@ def test_discrete_actions_are_equal_or_different(runs, tmp_path):
 @pytest.mark.slow
 def test_numbers_are_reproducible(runs, tmp_path):
     for folder in ("one", "other"):
-        listen(tmp_path, f"run={runs / 'coil'}", *FEW, f"hydra.run.dir={folder}")
+        listen(runs / "coil", tmp_path, folder)
     for name in ("listening.csv", "listening_sections.csv", "listening.md"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
 
@@ -97,22 +83,16 @@ def test_numbers_are_reproducible(runs, tmp_path):
     ("arguments", "message"),
     [
         ("", "run must be given: write run=VALUE"),
-        (
-            "run={runs}/ppo",
-            "does not use advice: the policy does not read guide_action; it reads observation",
-        ),
+        ("run={runs}/ppo", "the policy does not read guide_action; it reads observation"),
         ("run={runs}/guide", "has no agent, only a guide"),
-        (
-            "run={runs}/coil evaluation.sections.bin=0",
-            "evaluation.sections.bin=0 must be at least 0.1",
-        ),
+        ("run={runs}/coil evaluation.sections.bin=0", "sections.bin=0 must be at least 0.1"),
     ],
 )
 def test_mistakes_are_one_sentence_with_exit_code_2_and_leave_no_file(
     arguments, message, runs, tmp_path
 ):
-    _, error = listen(tmp_path, *arguments.format(runs=runs).split(), *TRACKS, code=2)
-    (sentence,) = error.splitlines()
+    words = [*arguments.format(runs=runs).split(), *TRACKS]
+    (sentence,) = called("listen", *words, cwd=tmp_path, code=2).stderr.splitlines()
     assert sentence.startswith("listen: ")
     assert message in sentence
     assert not list(tmp_path.iterdir())

@@ -1,10 +1,9 @@
 """Surveys of an env without sections."""
 
-import csv
-
 import numpy as np
 import pytest
 import torch
+from programs import read_csv
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 from worlds import Script
@@ -24,14 +23,9 @@ from coil_studies.listening.survey import (
 LENGTHS = [250, 3, 7, 120]
 SECTIONS = WholeEpisode()
 EVALUATION = Evaluation(["a", "b"], {}, {})
-FOLLOW = TensorDictModule(
-    lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"]
-)
-CHOOSE = TensorDictModule(
-    lambda advice: (advice[:, 0] > 0).to(advice.dtype),
-    in_keys=["guide_action"],
-    out_keys=["action"],
-)
+KEYS = {"in_keys": ["guide_action"], "out_keys": ["action"]}
+FOLLOW = TensorDictModule(lambda advice: advice[:, 0], **KEYS)
+CHOOSE = TensorDictModule(lambda advice: (advice[:, 0] > 0).to(advice.dtype), **KEYS)
 FILES = {"listening.csv", "listening.png", "listening_agreement.png", "listening_gradient.png"}
 
 
@@ -56,10 +50,8 @@ def test_every_state_is_measured_in_no_section(found):
     assert found.guides == ["time", "opposite"]
     assert [episode["case"] for episode in found.result.episodes] == ["a", "b", "a", "b"]
     assert [episode["steps"] for episode in found.result.episodes] == LENGTHS
-    steps = []
-    for step in range(max(LENGTHS)):
-        steps += [step for length in LENGTHS if step < length]
-    assert found.step.tolist() == steps
+    assert np.bincount(found.step).tolist() == [4] * 3 + [3] * 4 + [2] * 113 + [1] * 130
+    assert (np.diff(found.step) >= 0).all()
     assert (found.section == 0).all()
     assert found.section.shape == found.step.shape
     assert found.place == {}
@@ -70,8 +62,7 @@ def test_every_state_is_measured_in_no_section(found):
 def test_pictures_and_numbers_are_along_the_steps(found, tmp_path):
     SECTIONS.draw(found, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == FILES
-    with (tmp_path / "listening.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_csv(tmp_path / "listening.csv")
     assert [row["guide"] for row in rows] == [name for name in found.guides for _ in range(84)]
     for slot, guide in enumerate(found.guides):
         own = [row for row in rows if row["guide"] == guide]
@@ -99,10 +90,8 @@ def test_guides_are_removed_everywhere_only(found):
 
     removed = ablations(2, len(SECTIONS.names))
     assert removed == [Ablation(0), Ablation(1)]
-    agent = TensorDictModule(act, in_keys=["guide_action"], out_keys=["action"])
-    episodes = drive_ablated(
-        world(2), agent, SECTIONS, EVALUATION, removed, torch.tensor([[0.25], [0.5]])
-    )
+    agent, advised = TensorDictModule(act, **KEYS), torch.tensor([[0.25], [0.5]])
+    episodes = drive_ablated(world(2), agent, SECTIONS, EVALUATION, removed, advised)
     advice = torch.stack(seen).squeeze(-1)
     assert (advice[:, :4, 0] == 0.25).all()
     assert (advice[:, 4:, 1] == 0.5).all()
@@ -123,8 +112,7 @@ def test_completed_share_is_shown_if_it_is_measured(found):
     measures = {"completed": Measure("reward", "sum", at_least=100)}
     evaluation = Evaluation(["a", "b"], measures, {})
     intact = survey(world(), FOLLOW, SECTIONS, evaluation, donors=2)
-    (episodes,) = drive_ablated(
-        world(), FOLLOW, SECTIONS, evaluation, [Ablation(0)], torch.zeros(2, 1)
-    )
-    (row,) = table_by_section(intact, SECTIONS, evaluation, {Ablation(0): episodes})
+    removed, zero = [Ablation(0)], torch.zeros(2, 1)
+    (episodes,) = drive_ablated(world(), FOLLOW, SECTIONS, evaluation, removed, zero)
+    (row,) = table_by_section(intact, SECTIONS, evaluation, {removed[0]: episodes})
     assert row["completed"] == 0.5
