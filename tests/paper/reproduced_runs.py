@@ -1,7 +1,5 @@
 """Finished runs of reproduced results, with invented numbers, and readers of the results."""
 
-import csv
-
 import numpy as np
 from run_folders import driven, make_run
 
@@ -32,11 +30,6 @@ def make_runs(folder, gains, seeds=3, *, sampled=True, curve=True, **others):
             if curve:
                 write_csv(points, run / "metrics.csv")
     return read_runs([folder])
-
-
-def read_csv(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def cells(line):

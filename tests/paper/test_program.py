@@ -1,4 +1,5 @@
 import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -6,7 +7,7 @@ import pytest
 from drives import drive as circle
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
-from programs import TINY, called, program
+from programs import TINY, called, environment
 from run_folders import driven, make_run
 
 from coil_paper import conf, sweeps
@@ -20,6 +21,7 @@ from coil_rl.report import read_runs
 @pytest.fixture(autouse=True)
 def here(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", environment(tmp_path)["PYTHONPATH"])  # of the sweeps
 
 
 def outcome(*arguments):
@@ -31,18 +33,11 @@ def outcome(*arguments):
 @pytest.mark.slow
 def test_results_write_pages_numbers_and_pictures_and_print_the_pages():
     code, out, _ = outcome("table=1", "figure=6", "hydra.run.dir=run")
-    files = {path.name for path in Path("run").iterdir()}
-    made = {
-        "table_1.md",
-        "table_1.csv",
-        "table_1.png",
-        "figure_6.md",
-        "figure_6.csv",
-        "figure_6.png",
-    }
+    names, ends = ("table_1", "figure_6"), ("md", "csv", "png")
+    made = {f"{name}.{end}" for name in names for end in ends}
     assert code == 0
-    assert files == made | {"RESULTS.md"}
-    pages = [Path("run", f"{name}.md").read_text() for name in ("table_1", "figure_6")]
+    assert {path.name for path in Path("run").iterdir()} == made | {INDEX}
+    pages = [Path("run", f"{name}.md").read_text() for name in names]
     assert out.startswith(f"{pages[0]}\n{pages[1]}\nreproduce: table_1, figure_6 made; see ")
     assert "Made by `coil-reproduce table=1 budget=paper` at commit `" in pages[0]
 
@@ -58,21 +53,14 @@ def test_every_figure_of_the_paper_is_either_reproduced_or_named():
 
 
 def test_options_reach_the_result_and_the_command_on_its_page():
-    other_options = ("~results.table_5.worlds", "+results.table_4.labels=[]")
-    assert (
-        outcome("figure=6", "results.figure_6.iterations=7", *other_options, "hydra.run.dir=run")[0]
-        == 0
-    )
+    others = ["~results.table_5.worlds", "+results.table_4.labels=[]"]
+    iterations = "results.figure_6.iterations=7"
+    assert outcome("figure=6", iterations, *others, "hydra.run.dir=run")[0] == 0
     assert len(Path("run/figure_6.csv").read_text().splitlines()) == 1 + 8
-    assert (
-        "`coil-reproduce figure=6 budget=paper results.figure_6.iterations=7`"
-        in Path("run/figure_6.md").read_text()
-    )
-    text = Path("run/RESULTS.md").read_text()
-    everything = (
-        "results.figure_6.iterations=7 '~results.table_5.worlds' '+results.table_4.labels=[]'"
-    )
-    assert f"`coil-reproduce all=true budget=paper {everything}` writes this file" in text
+    own = f"`coil-reproduce figure=6 budget=paper {iterations}`"
+    assert own in Path("run/figure_6.md").read_text()
+    everything = shlex.join(["coil-reproduce", "all=true", "budget=paper", iterations, *others])
+    assert f"`{everything}` writes this file" in Path("run", INDEX).read_text()
 
 
 @pytest.mark.slow
@@ -112,22 +100,6 @@ def test_table_7_is_an_alias_of_table_6_and_recordings_need_no_runs():
     assert Path("again/table_6.csv").read_bytes() == Path("run/table_6.csv").read_bytes()
 
 
-@pytest.fixture
-def two_runs(monkeypatch):
-    """Finished runs of COIL and PPO, and the list of commands that a sweep starts."""
-    sweep = sweeps.planned("paper", ["compile=true"], [0])
-    for folder, label in zip(sweep.all_folders, ("coil", "ppo"), strict=True):
-        make_run(folder, label, 0, driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0}))
-    started = []
-
-    def start(words):
-        started.append(words)
-        return 3
-
-    monkeypatch.setattr(sweeps, "start", start)
-    return sweep, started
-
-
 def test_runs_of_one_label_with_other_configurations_are_not_pooled(tmp_path):
     for seed, gamma in ((0, 0.9), (1, 0.9), (2, 0.99)):
         run = make_run(tmp_path / str(seed), "coil", seed, driven("coil", {"a": 1.0}))
@@ -139,28 +111,6 @@ def test_runs_of_one_label_with_other_configurations_are_not_pooled(tmp_path):
     check_pools(result, {"one": alike, "two": differs})  # worlds are not pooled
     with pytest.raises(UserError, match=r"=one: the runs of coil differ in learner.gamma"):
         check_pools(result, {"one": runs, "two": []})
-
-
-@pytest.mark.slow
-def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs):
-    sweep, started = two_runs
-    choices = ["experiments=[paper]", "labels=[coil,ppo]"]
-    arguments = ["figure=22", "budgets.paper.seeds_of.paper=1", "~results.figure_22.worlds"]
-    arguments += [f"results.figure_22.{choice}" for choice in choices]
-    code, out, _ = outcome(*arguments)
-    assert (code, started) == (0, [])
-    assert (
-        "2 runs with the seeds 0, made at commit `unknown`. Training frames: 20,000 (coil, ppo)."
-        in out
-    )
-    assert outcome(*arguments)[1] == out
-    (sweep.all_folders[1] / "evaluation.csv").unlink()
-    code, _, error = outcome(*arguments, "hydra/launcher=basic")
-    assert code == 2
-    assert "the sweep of paper ended with exit code 3" in error
-    (command,) = started
-    words = ["-m", "+experiment=paper", "compile=true", "seed=0"]
-    assert command == [*words, "hydra/launcher=basic"]
 
 
 @pytest.mark.fast(5)
@@ -176,10 +126,7 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
         ("table=1 results.table_1.tolerance=0", "results.table_1.tolerance=0 must be more than 0"),
         ("table=1 results.table_1._target_=builtins.dict", "builtins.dict makes dict, not Result"),
         ("table=1 budget=small", "budget=small must be one of smoke, paper, full"),
-        (
-            "table=1 budgets.paper.seeds=0",
-            "budgets.paper.seeds=0 must be at least 1",
-        ),
+        ("table=1 budgets.paper.seeds=0", "budgets.paper.seeds=0 must be at least 1"),
         ("-m table=1,4", "leave out -m, and request several as in table=[1,4]"),
     ],
 )
@@ -216,20 +163,17 @@ def test_a_figure_trains_its_runs_and_a_lost_run_again():
     tiny = [word for word in TINY if word != "env.rate=6"]  # the budget sets it by the preset
     arguments = ["figure=22", "budget=smoke", "~results.figure_22.worlds", f"train={tiny}"]
     arguments += [f"results.figure_22.{choice}" for choice in choices]
-    program("reproduce", *arguments, cwd=Path())
-    pages = [
-        Path(f"outputs/reproduce/smoke/{name}").read_text()
-        for name in ("figure_22.md", "figure_22.csv")
-    ]
+    assert outcome(*arguments)[0] == 0
+    files = [Path("outputs/reproduce/smoke", f"figure_22.{end}") for end in ("md", "csv")]
+    pages = [file.read_text() for file in files]
     evaluated = {path: path.stat().st_mtime_ns for path in Path().rglob("evaluation.csv")}
     assert len(evaluated) == 4
     assert "> **Smoke test at the smallest budget" in pages[0]
+    assert "Training frames: 512 (coil, ppo)." in pages[0]
     lost = sorted(evaluated)[0]
     shutil.rmtree(lost.parent)
-    program("reproduce", *arguments, cwd=Path())
+    code, _, error = outcome(*arguments, "hydra/launcher=basic")
+    assert (code, "hydra/launcher=basic" in error) == (0, True)
     again = {path: path.stat().st_mtime_ns for path in Path().rglob("evaluation.csv")}
     assert {path for path in evaluated if evaluated[path] != again[path]} == {lost}
-    assert [
-        Path(f"outputs/reproduce/smoke/{name}").read_text()
-        for name in ("figure_22.md", "figure_22.csv")
-    ] == pages
+    assert [file.read_text() for file in files] == pages

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from reproduced_runs import read_csv
+from programs import read_csv
 
 from coil_paper.reproduce.figures import Figure10, Figure19, Figure21, Figure26, Figure30, Figure31
 from coil_rl.envs import robot_track, shipped_track

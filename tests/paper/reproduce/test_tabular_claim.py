@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
-from reproduced_runs import cells, read_csv
+from programs import read_csv
+from reproduced_runs import cells
 
 from coil_paper.reproduce.tabular_claim import TabularCoil
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from reproduced_runs import read_csv
+from programs import read_csv
 
 from coil_paper.reproduce.toymaker import Figure6, Table1, most_explained
 

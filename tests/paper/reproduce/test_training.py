@@ -1,7 +1,8 @@
 import itertools
 
 import pytest
-from reproduced_runs import make_runs, read_csv, row
+from programs import read_csv
+from reproduced_runs import make_runs, row
 
 from coil_paper.reproduce.training import Figure22, Table4
 from coil_rl.errors import UserError
