@@ -35,14 +35,8 @@ def count(image, colour):
 def test_figure_shows_tracks_cones_and_drivers(tmp_path):
     draw_lines(TRACKS, LINES, tmp_path / "lines.png")
     image = pixels(tmp_path / "lines.png")
-    for colour in (
-        style.ASPHALT,
-        style.LEFT_CONE,
-        style.RIGHT_CONE,
-        style.GUIDES[0],
-        style.AGENTS[0],
-    ):
-        assert count(image, colour)
+    shown = (style.ASPHALT, style.LEFT_CONE, style.RIGHT_CONE, style.GUIDES[0], style.AGENTS[0])
+    assert all(count(image, colour) for colour in shown)
     draw_lines(TRACKS, LINES, tmp_path / "crash.png", crashed={"agent": [False, True]})
     assert (image != pixels(tmp_path / "crash.png")).any()
 
@@ -79,10 +73,7 @@ def test_animation_moves_repeats_and_is_small(tmp_path):
     animate_lines(TRACKS, LINES, path, rate=24, crashed={"agent": [False, True]}, seconds=1)
     with Image.open(path) as image:
         assert image.info["loop"] == 0
-        frames = [
-            np.asarray(frame.convert("RGB")).astype(np.int64)
-            for frame in ImageSequence.Iterator(image)
-        ]
+        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)]
         durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
     assert durations == [100] * 10 + [1200]
     assert all((before != after).any() for before, after in itertools.pairwise(frames))

@@ -32,19 +32,12 @@ def advice(left, right, steering=0.0, **kwargs):
     for side, points in enumerate((left, right)):
         for slot, point in enumerate(sorted(points, key=lambda p: math.hypot(*p))):
             cones[0, side, slot] = torch.tensor(point)
-    count = torch.tensor([[len(left), len(right)]])
-    return (
-        RacingLineGuide(spacing=1.0, **kwargs)
-        .steer(cones, count, torch.full((1, 1), steering).double())
-        .item()
-    )
+    count, current = torch.tensor([[len(left), len(right)]]), torch.full((1, 1), steering)
+    return RacingLineGuide(spacing=1.0, **kwargs).steer(cones, count, current.double()).item()
 
 
 def arc(x, y, turn=1.4):
-    """Steering for `turn` times the curvature of the arc to (x, y), for a car of 2 m.
-
-    The curvature is 2 sin(alpha) / d.
-    """
+    """Steering for `turn` times the curvature 2 sin(alpha) / d of the arc, for a car of 2 m."""
     return math.asin(2 * turn * 2 * y / (x * x + y * y)) / math.radians(80)
 
 
@@ -72,12 +65,11 @@ def test_target_is_the_farthest_with_a_clear_arc_within_the_lookahead(options, e
 @pytest.mark.parametrize("margin", [0.0, 0.6, 1.9])
 def test_without_a_clear_arc_the_target_is_the_nearest(margin):
     assert advice(*ONE_TARGET, margin=margin, turn=1) == pytest.approx(arc(1.5, 0.5, 1))
-    assert advice(*ONE_TARGET, margin=margin, turn=3) == pytest.approx(1), (
-        "sharp arcs should be clamped"
-    )
-    assert advice([(2.0, 1.0), (4.0, 1.0)], [], -0.7) == pytest.approx(-0.7), (
-        "without a target steering is kept"
-    )
+    assert advice(*ONE_TARGET, margin=margin, turn=3) == pytest.approx(1), "it is clamped"
+
+
+def test_without_a_target_the_racing_line_keeps_the_steering():
+    assert advice([(2.0, 1.0), (4.0, 1.0)], [], -0.7) == pytest.approx(-0.7)
 
 
 @pytest.mark.slow
@@ -110,9 +102,8 @@ def test_laps_are_shorter_without_a_crash(ring):
 
 @pytest.mark.slow
 def test_laps_of_a_shipped_track_are_shorter_and_smoother():
-    racing, safe = (
-        lap(shipped_tracks("train")[5], guide) for guide in (RacingLineGuide(), SplineGuide())
-    )
+    track = shipped_tracks("train")[5]
+    racing, safe = (lap(track, guide) for guide in (RacingLineGuide(), SplineGuide()))
     assert racing["completed"]
     assert racing["lap_time"] < safe["lap_time"]
     assert racing["smoothness"] < safe["smoothness"] / 3

@@ -1,21 +1,18 @@
 """The spline guide with a memory, compared with the oracle and with the authors' program."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from oracle import OneCar, RememberingGuide
-from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-from coil_rl.envs import ConeTrackEnv, Track, random_tracks
+from coil_rl.envs import ConeTrackEnv, random_tracks
 from coil_rl.guides import FollowAdvice, SplineMemoryGuide
 from coil_rl.testing import check_guide
 from coil_rl.transforms import GuideActions
 
 SIGHT = 7.03125
-AUTHORS: dict[str, Any] = {
+AUTHORS = {
     "rate": 60.0,
     "spline": "quadratic",
     "cone_bonus": "every_sighting",
@@ -33,16 +30,14 @@ both_guides = pytest.mark.parametrize(
 RECORDED = [(835.4, 69.58, 0.088), (776.7, 63.55, 0.103), (536.1, 41.13, 0.107)]
 
 
-def guided(
-    tracks: list[Track], cars: int, world: dict[str, Any], options: dict[str, Any]
-) -> TransformedEnv:
+def guided(tracks, cars, world, options):
     env = ConeTrackEnv(tracks, cars, assignment="cyclic", **world)
     return TransformedEnv(env, GuideActions({"memory": SplineMemoryGuide(**options)})).eval()
 
 
 @pytest.mark.slow
 @both_guides
-def test_guide_agrees_with_the_oracle(world: dict[str, Any], options: dict[str, Any]) -> None:
+def test_guide_agrees_with_the_oracle(world, options):
     tracks, steps = random_tracks(2, seed=5), 180
     env = guided(tracks, 2, world, options)
     cars = [OneCar(track.left, track.right, track.start, **world) for track in tracks]
@@ -75,22 +70,15 @@ def test_guide_agrees_with_the_oracle(world: dict[str, Any], options: dict[str, 
 
 @pytest.mark.slow
 @both_guides
-def test_guide_contract_holds(
-    rings: list[Track], world: dict[str, Any], options: dict[str, Any]
-) -> None:
+def test_guide_contract_holds(rings, world, options):
     env = ConeTrackEnv(rings, 5, **world)
     check_guide(SplineMemoryGuide(**options), env, steps=30)
 
 
 @pytest.mark.slow
 @both_guides
-def test_rows_that_need_nothing_may_be_computed_too(
-    rings: list[Track],
-    world: dict[str, Any],
-    options: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def drive() -> TensorDictBase:
+def test_rows_that_need_nothing_may_be_computed_too(rings, world, options, monkeypatch):
+    def drive():
         env = guided(rings, 5, world, options)
         return env.rollout(40, FollowAdvice(env), break_when_any_done=False)
 
@@ -103,7 +91,7 @@ def test_rows_that_need_nothing_may_be_computed_too(
 
 
 @pytest.mark.slow
-def test_guide_knows_its_way_from_motion_alone() -> None:
+def test_guide_knows_its_way_from_motion_alone():
     tracks = random_tracks(2, seed=3)
     env = guided(tracks, 2, {}, {})
     start = torch.tensor([track.start for track in tracks])
@@ -121,11 +109,8 @@ def test_guide_knows_its_way_from_motion_alone() -> None:
 
 
 @pytest.mark.parametrize(("options", "kept"), [({}, 1.0), (ODD, 0.0)], ids=["default", "authors"])
-def test_without_a_target_the_steering_is_kept_or_zero(
-    rings: list[Track], options: dict[str, Any], kept: float
-) -> None:
-    env = ConeTrackEnv(rings, 3, sight=0.5)  # which sees no cone
-    env = TransformedEnv(env, GuideActions({"memory": SplineMemoryGuide(**options)})).eval()
+def test_without_a_target_the_steering_is_kept_or_zero(rings, options, kept):
+    env = guided(rings, 3, {"sight": 0.5}, options)  # which sees no cone
     state = env.reset()
     for steering in (0.25, -0.5, 0.125):
         state["action"] = torch.full((3, 1), steering)
@@ -134,7 +119,7 @@ def test_without_a_target_the_steering_is_kept_or_zero(
 
 
 @pytest.mark.slow
-def test_authors_preset_and_guide_earn_what_their_program_earns(levels: list[Track]) -> None:
+def test_authors_preset_and_guide_earn_what_their_program_earns(levels):
     env, steps = guided(levels, len(levels), AUTHORS, ODD), []
     over = torch.zeros(len(levels), 1, dtype=torch.bool)
     with torch.no_grad():
