@@ -1,6 +1,5 @@
 """The same problem in other units of the action gives the same digits, for every method."""
 
-import csv
 import math
 from functools import partial
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
-from programs import shipped
+from programs import read_csv, shipped
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
@@ -121,11 +120,9 @@ def learned(folder, box, method, *overrides, **options):
 def digits(folder, box, method, *overrides):
     """Return the numbers of the log of a run, and the returns of its policy, normalised actions."""
     run, actions = learned(folder, box, method, *overrides)
-    with open(run.folder / "metrics.csv", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    numbers = {
-        name: [float(row[name] or "nan") for row in rows] for name in rows[0] if "time" not in name
-    }
+    rows = read_csv(run.folder / "metrics.csv")
+    numbers = {name: [float(row[name] or "nan") for row in rows] for name in rows[0]}
+    numbers = {name: values for name, values in numbers.items() if "time" not in name}
     return numbers | {"actions": actions}
 
 

@@ -25,20 +25,13 @@ DRIVING = driving_measures()
 def test_measures_of_a_guide_that_completes_its_laps(ring):
     tracks = [ring, Track("wider", 1.1 * ring.left, 1.1 * ring.right)]
     env = ConeTrackEnv(tracks, 2, assignment="cyclic", laps=1, rate=6)
-    options = {
-        "cases": [track.name for track in tracks],
-        "measures": DRIVING,
-        "record": {"pose": ("info", "pose")},
-    }
+    options = {"cases": ["ring", "wider"], "measures": DRIVING}
+    options |= {"record": {"pose": ("info", "pose")}}
     result = evaluate_policy(env, SplineGuide(), **options)
     assert result.rate == 6
     for track, row, poses in zip(tracks, result.episodes, result.histories["pose"], strict=True):
-        assert (row["case"], row["completed"], row["crashed"], row["laps"]) == (
-            track.name,
-            True,
-            False,
-            1,
-        )
+        assert row["case"] == track.name
+        assert (row["completed"], row["crashed"], row["laps"]) == (True, False, 1)
         assert row["clearance"] > 0
         # The middle line at 2 m/s; the guide cuts corners.
         assert row["lap_time"] == pytest.approx(track.length / 2, rel=0.05)
@@ -62,18 +55,13 @@ def test_measures_of_a_crash():
 
 
 def test_return_of_several_agents_is_the_sum_of_their_rewards():
-    env = AnyEnv(
-        4, Bounded(-1, 1, (3, 2)), {("agents", "observation"): Unbounded((3, 4))}, agents=True
-    )
-    still = TensorDictModule(
-        lambda seen: 0 * seen[..., :2], [("agents", "observation")], [("agents", "action")]
-    )
-    rows = evaluate_policy(
-        env, still, measures={"each": Measure(("agents", "reward"), "min")}
-    ).episodes
-    assert [(row["reward"], row["steps"]) for row in rows] == [
-        (pytest.approx(3 * 5 * -0.25), 5)
-    ] * 4
+    seen, action = ("agents", "observation"), ("agents", "action")
+    env = AnyEnv(4, Bounded(-1, 1, (3, 2)), {seen: Unbounded((3, 4))}, agents=True)
+    still = TensorDictModule(lambda seen: 0 * seen[..., :2], [seen], [action])
+    measures = {"each": Measure(("agents", "reward"), "min")}
+    rows = evaluate_policy(env, still, measures=measures).episodes
+    assert [row["steps"] for row in rows] == [5] * 4
+    assert [row["reward"] for row in rows] == pytest.approx([3 * 5 * -0.25] * 4)
     assert rows[0]["each"] == pytest.approx(-0.75)
 
 
@@ -93,21 +81,14 @@ def test_sampled_actions_are_less_smooth_than_deterministic_ones():
 
 
 def test_reward_of_each_task_is_measured():
-    tasks = {
-        "left": {"alive": 1.0, "crash": 0.0, "cone": 0.0},
-        "right": {"alive": -1.0, "crash": 0.0, "cone": 0.0},
-    }
-    env = DrivingTasksEnv(
-        TRACKS, 6, assignment="cyclic", tasks=tasks, duration=0.5, reward={"smooth": 0.0}
-    )
-    measures = {
-        name: driving_measures("driving_tasks")[name]
-        for name in ("per_step_left", "per_step_right")
-    }
+    rewards = {"crash": 0.0, "cone": 0.0, "smooth": 0.0}
+    tasks = {"left": {"alive": 1.0}, "right": {"alive": -1.0}}
+    env = DrivingTasksEnv(TRACKS, 6, assignment="cyclic", tasks=tasks, duration=0.5, reward=rewards)
+    of_env = driving_measures("driving_tasks")
+    measures = {name: of_env[name] for name in ("per_step_left", "per_step_right")}
     record = {"reward": "reward", "left": ("info", "task", "left")}
-    result = evaluate_policy(
-        env, ConstantGuide(1.0), measures=measures, record=record, cases=["a", "b"]
-    )
+    options = {"measures": measures, "record": record, "cases": ["a", "b"]}
+    result = evaluate_policy(env, ConstantGuide(1.0), **options)
     for row, rewards, left in zip(result.episodes, *result.histories.values(), strict=True):
         assert row["reward"] == pytest.approx(rewards.sum())
         # Every step but that of the crash.
@@ -118,12 +99,9 @@ def test_reward_of_each_task_is_measured():
     *rows, mean = summarise(result.episodes, measures)
     assert all(0.8 < row["per_step_left"] <= 1 for row in rows)
     assert mean["per_step_left"] == pytest.approx(sum(row["per_step_left"] for row in rows) / 2)
-    env = DrivingTasksEnv(
-        TRACKS, 2, assignment="cyclic", tasks={"left": {}, "right": {}}, only="left"
-    )
-    *_, mean = summarise(
-        evaluate_policy(env, ConstantGuide(1.0), measures=measures).episodes, measures
-    )
+    env = DrivingTasksEnv(TRACKS, 2, assignment="cyclic", tasks=tasks, only="left")
+    result = evaluate_policy(env, ConstantGuide(1.0), measures=measures)
+    *_, mean = summarise(result.episodes, measures)
     assert math.isnan(mean["per_step_right"]), "there are no steps of the task"
 
 
@@ -161,58 +139,55 @@ REDUCE = {
 OF_NOTHING = dict.fromkeys(REDUCTIONS, math.nan) | {"sum": 0, "any": False, "count": 0}
 
 
+def results(measures, *steps):
+    """Return the results, [N] of each measure, of N episodes that show these entries, [N] each."""
+    totals = Totals(measures)
+    for step in steps:
+        entries = {name: torch.tensor(values).unsqueeze(-1) for name, values in step.items()}
+        running = torch.ones(len(next(iter(step.values()))), 1, dtype=torch.bool)
+        totals.add(TensorDict(entries, [len(running)]), running)
+    return {name: value.tolist() for name, value in totals.results().items()}
+
+
 def test_nan_is_no_event_and_shows_in_means():
-    totals = Totals({reduction: Measure("number", reduction) for reduction in REDUCTIONS})
-    for number in (0.0, math.nan, 0.0):
-        after = TensorDict({"number": torch.tensor([[number]])}, [1])
-        totals.add(after, torch.ones(1, 1, dtype=torch.bool))
-    found = {name: value.item() for name, value in totals.results().items()}
-    assert (found["any"], found["count"], found["min"], found["max"]) == (False, 0, 0, 0)
-    assert all(math.isnan(found[name]) for name in ("mean", "sum", "mean_nonzero"))
+    measures = {reduction: Measure("number", reduction) for reduction in REDUCTIONS}
+    found = results(measures, *({"number": [number]} for number in (0.0, math.nan, 0.0)))
+    nothing = {"any": [False], "count": [0], "min": [0], "max": [0]}
+    assert {name: found[name] for name in nothing} == nothing
+    assert all(math.isnan(*found[name]) for name in ("mean", "sum", "mean_nonzero"))
 
 
 @pytest.mark.parametrize("reduction", REDUCTIONS)
 def test_steps_without_a_number_of_info_do_not_count(reduction):
-    measures = {"all": Measure(("info", "x"), reduction), "none": Measure(("info", "y"), reduction)}
-    totals, numbers = Totals(measures), [3.0, math.nan, 0.0, 5.0, math.nan]
-    for number in numbers:
-        info = {"x": torch.tensor([[number]]), "y": torch.tensor([[math.nan]])}
-        after = TensorDict({"info": info}, [1])
-        totals.add(after, torch.ones(1, 1, dtype=torch.bool))
-    found = {name: value.item() for name, value in totals.results().items()}
-    assert found["all"] == REDUCE[reduction](np.array([3.0, 0.0, 5.0]))
-    assert found["none"] == pytest.approx(OF_NOTHING[reduction], nan_ok=True)
+    x, y = ("info", "x"), ("info", "y")
+    measures = {"all": Measure(x, reduction), "none": Measure(y, reduction)}
+    numbers = [3.0, math.nan, 0.0, 5.0, math.nan]
+    found = results(measures, *({x: [number], y: [math.nan]} for number in numbers))
+    assert found["all"] == [REDUCE[reduction](np.array([3.0, 0.0, 5.0]))]
+    assert found["none"] == pytest.approx([OF_NOTHING[reduction]], nan_ok=True)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.int64, torch.bool])
-def test_number_is_a_flag_where_it_is_neither_zero_nor_missing(dtype):
+@pytest.mark.parametrize("kind", [float, int, bool])
+def test_number_is_a_flag_where_it_is_neither_zero_nor_missing(kind):
     measures = {"sum": Measure("x", "sum", ("info", "on")), "count": Measure("x", "count")}
-    totals = Totals(measures)
-    steps = [(1.0, 1.0), (2.0, 0.0), (4.0, -1.0)]
-    if dtype.is_floating_point:
+    steps = [(1.0, kind(1)), (2.0, kind(0)), (4.0, kind(-1))]
+    if kind is float:
         steps.append((8.0, math.nan))
-    for number, flag in steps:
-        entries = {"x": torch.tensor([[number]]), "info": {"on": torch.tensor([[flag]]).to(dtype)}}
-        totals.add(TensorDict(entries, [1]), torch.ones(1, 1, dtype=torch.bool))
-    found = {name: value.item() for name, value in totals.results().items()}
-    assert found == {"sum": 5.0, "count": len(steps)}
+    found = results(measures, *({"x": [number], ("info", "on"): [flag]} for number, flag in steps))
+    assert found == {"sum": [5.0], "count": [len(steps)]}
 
 
 def test_last_number_is_that_of_the_last_step_that_has_one():
-    totals = Totals({"last": Measure("number", "last")})
-    for step in ([0.0, math.nan], [2.0, math.nan], [math.nan, math.nan]):
-        after = TensorDict({"number": torch.tensor(step)[:, None]}, [2])
-        totals.add(after, torch.ones(2, 1, dtype=torch.bool))
-    assert totals.results()["last"].tolist() == pytest.approx([2.0, math.nan], nan_ok=True)
+    steps = ([0.0, math.nan], [2.0, math.nan], [math.nan, math.nan])
+    found = results({"last": Measure("number", "last")}, *({"number": step} for step in steps))
+    assert found["last"] == pytest.approx([2.0, math.nan], nan_ok=True)
 
 
 @pytest.mark.parametrize("bound", ["at_least", "at_most"])
 @pytest.mark.parametrize("reduction", ["mean", "sum", "mean_nonzero", "last", "min", "max"])
 def test_bound_of_a_mean_or_sum_that_is_nan_is_undecided(reduction, bound):
-    totals = Totals({"flag": Measure("number", reduction, **{bound: 1.0})})
-    after = TensorDict({"number": torch.tensor([[1.0], [math.nan]])}, [2])
-    totals.add(after, torch.ones(2, 1, dtype=torch.bool))
-    within, without = totals.results()["flag"].tolist()
+    measures = {"flag": Measure("number", reduction, **{bound: 1.0})}
+    within, without = results(measures, {"number": [1.0, math.nan]})["flag"]
     assert within == 1
     assert math.isnan(without) if reduction in ("mean", "sum", "mean_nonzero") else not without
 
@@ -221,11 +196,10 @@ def test_bound_of_a_mean_or_sum_that_is_nan_is_undecided(reduction, bound):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_measures_are_those_of_numpy(batch, dtype):
     env = script(*batch, dtype=dtype)
-    measures = {
-        f"{reduction} {where}": Measure("number", reduction, where)
-        for reduction in REDUCTIONS
-        for where in (None, "flag")
-    }
+    measures = {}
+    for reduction in REDUCTIONS:
+        measures[reduction] = Measure("number", reduction)
+        measures[f"{reduction} flag"] = Measure("number", reduction, "flag")
     result = evaluate_policy(env, RandomPolicy(env.action_spec), measures=measures)
     flags = of_rows(env, "flag")
     for row, numbers, flag in zip(result.episodes, of_rows(env, "number"), flags, strict=True):
@@ -237,24 +211,18 @@ def test_measures_are_those_of_numpy(batch, dtype):
             assert isinstance(found, bool) == (reduction == "any")
 
 
-def test_bounds_make_flags_and_nan_is_within_no_bound():
+@pytest.mark.parametrize("reduction", ["max", "mean"])
+def test_bounds_make_flags_and_nan_is_within_no_bound(reduction):
     env = script(7)
-    bounds = {"at_least": 0.5, "at_most": 0.5}
     measures = {
-        f"{reduction} {bound}": Measure("number", reduction, "flag", **{bound: value})
-        for reduction in ("max", "mean")
-        for bound, value in bounds.items()
+        "at_least": Measure("number", reduction, "flag", at_least=0.5),
+        "at_most": Measure("number", reduction, "flag", at_most=0.5),
     }
     result = evaluate_policy(env, RandomPolicy(env.action_spec), measures=measures)
-    for row, numbers, flag in zip(
-        result.episodes, of_rows(env, "number"), of_rows(env, "flag"), strict=True
-    ):
-        for reduction in ("max", "mean"):
-            number = REDUCE[reduction](numbers[flag == 1]) if flag.any() else math.nan
-            assert [row[f"{reduction} {bound}"] for bound in bounds] == [
-                number >= 0.5,
-                number <= 0.5,
-            ]
+    flags = of_rows(env, "flag")
+    for row, numbers, flag in zip(result.episodes, of_rows(env, "number"), flags, strict=True):
+        number = REDUCE[reduction](numbers[flag == 1]) if flag.any() else math.nan
+        assert (row["at_least"], row["at_most"]) == (number >= 0.5, number <= 0.5)
 
 
 def test_totals_can_be_read_during_the_episodes():
@@ -271,15 +239,9 @@ def test_totals_can_be_read_during_the_episodes():
 def test_env_of_any_batch_is_evaluated_row_by_row(batch):
     env = script(*batch)
     record = {"place": "place", "number": "number", "plain": "plain"}
-    ticks = []
-    result = evaluate_policy(
-        env,
-        RandomPolicy(env.action_spec),
-        record=record,
-        cases=["a", "b"],
-        tick=lambda: ticks.append(1),
-    )
-    rows = math.prod(batch)
+    ticks, policy, rows = [], RandomPolicy(env.action_spec), math.prod(batch)
+    options = {"cases": ["a", "b"], "tick": lambda: ticks.append(1)}
+    result = evaluate_policy(env, policy, record=record, **options)
     assert [episode["case"] for episode in result.episodes] == [*"ababab"][:rows]
     assert [episode["steps"] for episode in result.episodes] == env.lengths.view(-1).tolist()
     rewards = [float(each.sum()) for each in of_rows(env, "reward")]
@@ -289,16 +251,15 @@ def test_env_of_any_batch_is_evaluated_row_by_row(batch):
         for found, expected in zip(result.histories[name], of_rows(env, name), strict=True):
             np.testing.assert_array_equal(found, expected.reshape(-1, *shape))
     assert max(env.lengths.view(-1).tolist()) <= len(ticks) + 1 <= 16
-    numbered = evaluate_policy(env, RandomPolicy(env.action_spec))
+    numbered = evaluate_policy(env, policy)
     assert [episode["case"] for episode in numbered.episodes] == list(map(str, range(rows)))
     assert not numbered.histories
 
 
 def test_parts_of_a_result_keep_their_histories():
     env = script(6)
-    whole = evaluate_policy(
-        env, RandomPolicy(env.action_spec), record={"place": "place"}, cases=["a", "b", "c"]
-    )
+    options = {"record": {"place": "place"}, "cases": ["a", "b", "c"]}
+    whole = evaluate_policy(env, RandomPolicy(env.action_spec), **options)
     first, second = whole[:3], whole[3:]
     assert [*first.episodes, *second.episodes] == whole.episodes
     assert [episode["case"] for episode in second.episodes] == ["a", "b", "c"]

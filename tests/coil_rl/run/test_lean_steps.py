@@ -37,12 +37,18 @@ def gym(name, **options):
     return TransformedEnv(env, Compose(RewardSum(), NormalisedAction()))
 
 
+PENDULUM, CART_POLE = partial(gym, "Pendulum-v1"), partial(gym, "CartPole-v1")
+
+
+def brake(state):
+    return -state[..., 2:].clamp(-2, 2)
+
+
 def advised_pendulum():
-    brakes = TensorDictModule(
-        lambda state: (-state[..., 2:]).clamp(-2, 2), ["observation"], ["action"]
+    env = PENDULUM()
+    env.append_transform(
+        GuideActions({"brake": TensorDictModule(brake, ["observation"], ["action"])})
     )
-    env = gym("Pendulum-v1")
-    env.append_transform(GuideActions({"brakes": brakes}))
     return env
 
 
@@ -88,8 +94,8 @@ def collected(make_env, correlation, lean, options):
         pytest.param(choices, {"in_keys": ADVISED}, id="choices"),
         pytest.param(several_choices, {}, id="several choices"),
         pytest.param(advised_pendulum, {"in_keys": ADVISED, "anchor": Anchor()}, id="anchored"),
-        pytest.param(partial(gym, "Pendulum-v1"), {"normalise": True}, id="pendulum"),
-        pytest.param(partial(gym, "CartPole-v1"), {"normalise": "auto"}, id="cart pole"),
+        pytest.param(PENDULUM, {"normalise": True}, id="pendulum"),
+        pytest.param(CART_POLE, {"normalise": "auto"}, id="cart pole"),
     ],
 )
 def test_lean_steps_are_those_of_torchrl_to_the_bit(make_env, options, correlation):
@@ -101,9 +107,7 @@ def test_lean_steps_are_those_of_torchrl_to_the_bit(make_env, options, correlati
     assert any(batch["next", "done"].any() for batch in ours)
 
 
-@pytest.mark.parametrize(
-    "make_env", [cones, partial(gym, "Pendulum-v1"), partial(gym, "CartPole-v1")]
-)
+@pytest.mark.parametrize("make_env", [cones, PENDULUM, CART_POLE])
 def test_episodes_are_those_of_torchrl_to_the_bit(make_env, monkeypatch):
     kept = []
     for lean in (True, False):

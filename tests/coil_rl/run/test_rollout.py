@@ -31,14 +31,6 @@ def test_batches_are_consecutive():
     assert long.frames == 300
 
 
-def test_next_entry_is_the_following_step_unless_the_episode_ended():
-    batch = rollout(steps=60).collect()
-    after, now = batch["next", "observation"][:, :-1], batch["observation"][:, 1:]
-    running = ~batch["next", "done"][:, :-1].squeeze(-1)
-    assert torch.equal(after[running], now[running])
-    assert not torch.equal(after[~running], now[~running])
-
-
 def test_only_the_requested_keys_are_kept():
     keys = {"observation", ("next", "reward"), ("next", "info", "lap")}
     batch = rollout(keys=[*keys, *keys]).collect()
@@ -78,14 +70,12 @@ def test_noise_is_correlated_over_steps_and_batches_and_each_action_has_the_poli
     assert float(noise.mean()) == pytest.approx(0.0, abs=0.05)
     assert float(noise.std()) == pytest.approx(1.0, abs=0.04)
     for lag in (1, 2, 5):
-        assert float((noise[:, lag:] * noise[:, :-lag]).mean()) == pytest.approx(
-            correlation**lag, abs=0.06
-        )
+        found = float((noise[:, lag:] * noise[:, :-lag]).mean())
+        assert found == pytest.approx(correlation**lag, abs=0.06)
     assert float((noise[:, 50] * noise[:, 49]).mean()) == pytest.approx(correlation, abs=0.25)
     with torch.no_grad():
-        density = ppo.policy.get_dist(batch).log_prob(
-            batch["action" if squash else "unclipped_action"]
-        )
+        drawn = batch["action" if squash else "unclipped_action"]
+        density = ppo.policy.get_dist(batch).log_prob(drawn)
     torch.testing.assert_close(batch["action_log_prob"], density)
 
 
@@ -110,9 +100,11 @@ def test_noise_fits_envs_without_a_batch_and_does_not_concern_discrete_actions()
     noise = ((batch["action"] / 2).atanh() - batch["loc"]) / batch["scale"]
     torch.testing.assert_close(noise, noise[:1].expand_as(noise), rtol=0, atol=1e-4)
     env = worlds.carts()
-    assert (
-        "exploration_noise" not in Rollout(env, PPO(env).policy, 3, noise_correlation=0.9).collect()
-    )
+    discrete = Rollout(env, PPO(env).policy, 3, noise_correlation=0.9)
+    assert "exploration_noise" not in discrete.collect()
+
+
+POSE = ("next", "info", "pose")
 
 
 def zeros():
@@ -125,14 +117,8 @@ def zeros():
     ("places", "message"),
     [
         ([("observation", 3, 2, 1)], "observation is nan at step 103 of row 3"),
-        (
-            [(("next", "info", "pose"), 2, 5, 0), ("observation", 2, 5, 0)],
-            "observation is nan at step 106 of row 2",
-        ),
-        (
-            [(("next", "info", "pose"), 0, 1, 0), ("observation", 3, 4, 0)],
-            "next/info/pose is nan at step 102 of row 0",
-        ),
+        ([(POSE, 2, 5, 0), ("observation", 2, 5, 0)], "observation is nan at step 106 of row 2"),
+        ([(POSE, 0, 1, 0), ("observation", 3, 4, 0)], "next/info/pose is nan at step 102 of row 0"),
     ],
 )
 def test_first_nan_is_reported_with_its_entry_step_and_row(places, message):
