@@ -35,30 +35,12 @@ import coil_rl.config.check  # noqa: E402, F401
 from coil_rl.programs.train import main as train  # noqa: E402
 from coil_rl.run import checkpoint  # noqa: E402
 
-SMALL = [
-    "budget.frames=5120",
-    "budget.num_envs=32",
-    "budget.steps=16",
-    "evaluation.repeats=2",
-    "evaluation.gif=false",
-    "learner.epochs=2",
-    "checkpoint_every=1",
-]
-CONES = [
-    "track=generated",
-    "track.train.count=1",
-    "track.test.count=1",
-    "env.laps=1",
-    "env.time_limit=2",
-]
-MILESTONES = [
-    "config.yaml",
-    "guide_return.json",
-    "policy_last.pt",
-    "learning_curve.png",
-    "lines.png",
-    "evaluation.csv",
-]
+SMALL = ["budget.frames=5120", "budget.num_envs=32", "budget.steps=16", "learner.epochs=2"]
+SMALL += ["evaluation.repeats=2", "evaluation.gif=false", "checkpoint_every=1"]
+CONES = ["track=generated", "track.train.count=1", "track.test.count=1"]
+CONES += ["env.laps=1", "env.time_limit=2"]
+MILESTONES = ["config.yaml", "guide_return.json", "policy_last.pt", "learning_curve.png"]
+MILESTONES += ["lines.png", "evaluation.csv"]
 LOGS = ["metrics.csv", "evaluation.csv", "episodes.csv", "guide_return.json"]
 STATES = ["policy_last.pt", "checkpoint.pt"]
 TIMEOUT = 600  # s
@@ -152,27 +134,22 @@ def describe_state(folder: Path) -> str:
     if (folder / "metrics.csv").exists():
         with (folder / "metrics.csv").open(newline="") as file:
             frames = max((int(row["frames"]) for row in csv.DictReader(file)), default=0)
+    if names := unfinished(folder):
+        return f"{frames} frames, writing {', '.join(names)}"
     files = {file.name for file in folder.iterdir()}
-    state = "training" if "checkpoint.pt" in files else "before the first checkpoint"
-    if "policy_last.pt" in files:
-        state = "evaluating"
-    if "checkpoint_previous.pt" in files and "checkpoint.pt" not in files:
-        state = "between two renames"
-    elif unfinished(folder):
-        state = "writing " + ", ".join(
-            re.sub(r"\.(.+)\.\d+(\.\w+)", r"\1\2", name) for name in unfinished(folder)
-        )
-    return f"{frames} frames, {state}"
+    if "checkpoint.pt" not in files:
+        between = "checkpoint_previous.pt" in files
+        return f"{frames} frames, {'between two renames' if between else 'no checkpoint'}"
+    return f"{frames} frames, {'evaluating' if 'policy_last.pt' in files else 'training'}"
 
 
 def differences(one: Path, other: Path) -> list[str]:
     """Return the files in which two runs differ."""
     wrong = [name for name in LOGS if (one / name).read_bytes() != (other / name).read_bytes()]
-    return wrong + [
-        name
-        for name in STATES
-        if not same(checkpoint.load(one / name), checkpoint.load(other / name))
-    ]
+    for name in STATES:
+        if not same(checkpoint.load(one / name), checkpoint.load(other / name)):
+            wrong.append(name)
+    return wrong
 
 
 def same(one: object, other: object) -> bool:

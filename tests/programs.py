@@ -39,59 +39,23 @@ GUESTS = {
 TRACK = ["track=folder", f"track.dir={ROOT / 'tests' / 'ring.csv'}"]
 LAP = [*TRACK, "env.laps=1", "env.rate=6"]
 SHORT_LAP = [*LAP, "env.time_limit=2"]
-TINY = [
-    *SHORT_LAP,
-    "budget.frames=512",
-    "budget.num_envs=8",
-    "budget.steps=32",
-    "evaluation.repeats=1",
-    "evaluation.curve.env.time_limit=1",
-    "logger=none",
-]
+TINY = [*SHORT_LAP, "budget.frames=512", "budget.num_envs=8", "budget.steps=32", "logger=none"]
+TINY += ["evaluation.repeats=1", "evaluation.curve.env.time_limit=1"]
 
 # Episodes of a second on one track.
-ONE_SECOND = [
-    "track=generated",
-    "track.train.count=1",
-    "track.test.count=1",
-    "env.laps=1",
-    "env.time_limit=1",
-    "evaluation.curve.env.time_limit=1",
-    "evaluation.repeats=1",
-    "evaluation.gif=false",
-    "logger=none",
-    "budget.num_envs=4",
-    "budget.steps=16",
-    "budget.frames=128",
-]
+SECOND = ["env.laps=1", "env.time_limit=1", "evaluation.curve.env.time_limit=1"]
+SECOND += ["evaluation.repeats=1", "logger=none"]
+SECOND += ["budget.num_envs=4", "budget.steps=16", "budget.frames=128"]
+ONE_SECOND = ["track=generated", "track.train.count=1", "track.test.count=1", *SECOND]
+ONE_SECOND += ["evaluation.gif=false"]
 
 # One arm of an experiment on tasks of Gymnasium.
-TINY_ARM = [
-    "budget.frames=300",
-    "budget.num_envs=2",
-    "budget.steps=50",
-    "evaluation.cases=2",
-    "evaluation.curve.num_envs=2",
-    "evaluation.curve.points=1",
-]
+TINY_ARM = ["budget.frames=300", "budget.num_envs=2", "budget.steps=50", "evaluation.cases=2"]
+TINY_ARM += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1"]
 # The smallest run of any experiment in the cone world.
-TINY_SWEEP = [
-    "track=generated",
-    "track.train.count=2",
-    "track.test.count=2",
-    "env.laps=1",
-    "env.time_limit=1",
-    "env.rate=12",
-    "evaluation.curve.env.time_limit=1",
-    "evaluation.repeats=1",
-    "logger=none",
-    "budget.num_envs=4",
-    "budget.steps=16",
-    "budget.frames=128",
-    "proxy.budget.frames=64",
-    "proxy.budget.num_envs=2",
-    "proxy.budget.steps=16",
-]
+TINY_SWEEP = ["track=generated", "track.train.count=2", "track.test.count=2", *SECOND]
+TINY_SWEEP += ["env.rate=12", "proxy.budget.frames=64"]
+TINY_SWEEP += ["proxy.budget.num_envs=2", "proxy.budget.steps=16"]
 
 
 def composed(*words, name="train", **options):
@@ -131,22 +95,14 @@ def command(name, *arguments):
 
 
 def environment(cwd):
-    return os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(ROOT), str(cwd), os.environ.get("PYTHONPATH", "")])
-    }
+    places = [str(ROOT), str(cwd), os.environ.get("PYTHONPATH", "")]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(places)}
 
 
 def program(name, *arguments, cwd, code=0):
     """Run a program in a process of its own, which takes seconds to import PyTorch."""
-    done = subprocess.run(
-        command(name, *arguments),
-        cwd=cwd,
-        env=environment(cwd),
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
+    options = {"capture_output": True, "text": True, "timeout": 600, "check": False}
+    done = subprocess.run(command(name, *arguments), cwd=cwd, env=environment(cwd), **options)
     assert done.returncode == code, done.stderr
     return done
 

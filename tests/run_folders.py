@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 import yaml
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
+from programs import composed
 
 import coil_rl.config.schema  # noqa: F401 registers the configuration schema
 from coil_rl.config.parts import build_learner, env_maker
@@ -48,24 +48,16 @@ def make_run(
 ) -> Path:
     """Write a run; without rows it is not finished."""
     folder.mkdir(parents=True)
-    config: Row = {
-        "seed": seed,
-        "label": label,
-        "method": {"name": "any", "needs_guide": needs_guide},
-        "evaluation": {"measures": MEASURES},
-        **(settings or {}),
-    }
+    config: Row = {"seed": seed, "label": label, "evaluation": {"measures": MEASURES}}
+    config["method"] = {"name": "any", "needs_guide": needs_guide}
+    config |= settings or {}
     (folder / "config.yaml").write_text(json.dumps(config))  # JSON is YAML
     (folder / "guide_return.json").write_text(json.dumps({"guide": guide}))
-    frames = range(1000, 20_001, 1000)
-    write_csv(
-        [
-            {"frames": n, "evaluation/return": value, "selection/return": value - 1}
-            for n in frames
-            for value in [400 * (1 - math.exp(-n / 5000)) + seed]
-        ],
-        folder / "metrics.csv",
-    )
+    curve = []
+    for n in range(1000, 20_001, 1000):
+        value = 400 * (1 - math.exp(-n / 5000)) + seed
+        curve.append({"frames": n, "evaluation/return": value, "selection/return": value - 1})
+    write_csv(curve, folder / "metrics.csv")
     if rows is not None:
         write_csv(rows, folder / "evaluation.csv")
     return folder
@@ -78,22 +70,13 @@ def make_sweep(folder: Path) -> Path:
     """
     guide = driven("guide", {"a": 500.0, "b": 600.0})
     for seed in range(3):
-        coil = [
-            *driven("coil", {"a": 520.0 + seed, "b": 620.0 + seed}, smoothness=0.2),
-            *driven("coil", {"a": 510.0 + seed, "b": 610.0 + seed}, "sampled"),
-            *driven(
-                "coil",
-                {"a": -100.0, "b": -200.0 - seed},
-                advice="zeroed",
-                lap_time=math.nan,
-                completed=0.0,
-                crashed=1.0,
-            ),
-        ]
+        coil = driven("coil", {"a": 520.0 + seed, "b": 620.0 + seed}, smoothness=0.2)
+        coil += driven("coil", {"a": 510.0 + seed, "b": 610.0 + seed}, "sampled")
+        crash = {"lap_time": math.nan, "completed": 0.0, "crashed": 1.0}
+        coil += driven("coil", {"a": -100.0, "b": -200.0 - seed}, advice="zeroed", **crash)
         make_run(folder / f"{seed}_coil", "coil", seed, guide + coil)
-        ppo = driven("ppo", {"a": 540.0 + seed, "b": 640.0 + seed}) + driven(
-            "ppo", {"a": 505.0, "b": 615.0}, "sampled"
-        )
+        ppo = driven("ppo", {"a": 540.0 + seed, "b": 640.0 + seed})
+        ppo += driven("ppo", {"a": 505.0, "b": 615.0}, "sampled")
         make_run(folder / f"{seed + 3}_ppo", "ppo", seed, guide + ppo, needs_guide=False)
     make_run(folder / "6_coil", "coil", 3, None)
     make_run(folder / "7_ppo", "ppo", 3, None)
@@ -104,8 +87,7 @@ def make_untrained_run(folder: Path, *overrides: str) -> Path:
     """Write the configuration and the untrained policy of a run."""
     folder.mkdir()
     torch.manual_seed(0)
-    with initialize_config_module(config_module="coil_rl.conf", version_base="1.3"):
-        config = compose("train", [*overrides, f"run_dir={folder}"])
+    config = composed(*overrides, f"run_dir={folder}")
     if config.method.observes is not None:
         policy = build_learner(config, env_maker(config)()).policy
         for which in ("last", "handed_over")[: 2 if config.delivery == "tested" else 1]:

@@ -2,20 +2,11 @@ import full_disk
 import kill_and_resume
 import pytest
 
-FMU = [
-    "env=fmu",
-    "env.step=0.01",
-    "env.seconds=0.5",
-    "env.workers=0",
-    "env.setpoints={speed: {low: 50, high: 150, every: 0.1}}",
-    "env.parameters={inertia: {low: 0.008, high: 0.012}}",
-    "method=ppo",
-    "budget.num_envs=4",
-    "budget.frames=3200",
-    "evaluation.cases=4",
-    "evaluation.curve.num_envs=2",
-    "trust=[coil_fmu]",
-]
+FMU = ["env=fmu", "env.step=0.01", "env.seconds=0.5", "env.workers=0", "trust=[coil_fmu]"]
+FMU += ["env.setpoints={speed: {low: 50, high: 150, every: 0.1}}"]
+FMU += ["env.parameters={inertia: {low: 0.008, high: 0.012}}"]
+FMU += ["method=ppo", "budget.num_envs=4", "budget.frames=3200"]
+FMU += ["evaluation.cases=4", "evaluation.curve.num_envs=2"]
 
 
 @pytest.mark.slow

@@ -14,15 +14,8 @@ from programs import LAP, called, read_csv
 
 PINS = Path(__file__).parent / "pins"
 FILES = ("metrics.csv", "evaluation.csv")
-SMALL = [
-    *LAP,
-    "budget.frames=2048",
-    "budget.num_envs=8",
-    "budget.steps=64",
-    "evaluation.repeats=1",
-    "evaluation.gif=false",
-    "logger=none",
-]
+SMALL = [*LAP, "budget.frames=2048", "budget.num_envs=8", "budget.steps=64", "logger=none"]
+SMALL += ["evaluation.repeats=1", "evaluation.gif=false"]
 RUNS = {
     "ppo": ["method=ppo"],
     "coil": ["method=coil"],

@@ -53,12 +53,7 @@ def floors() -> list[str]:
 
 
 def run(command: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Return what a command did, with its output as text, where nothing but packages is imported.
-
-    Args:
-        command: with its arguments.
-        cwd: where it runs.
-    """
+    """Return what a command did, as text, where nothing but packages is imported."""
     env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     env |= {"OMP_NUM_THREADS": "1"}
     return subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, check=False)
@@ -70,13 +65,7 @@ def row(*cells: str) -> str:
 
 
 def installed(interpreter: str, pins: list[str], place: Path) -> str | None:
-    """Make an environment, and return what went wrong.
-
-    Args:
-        interpreter: its Python, as "3.12".
-        pins: versions to install.
-        place: folder of the environment.
-    """
+    """Make an environment with a Python, as "3.12", and versions; return what went wrong."""
     python = shutil.which(f"python{interpreter}")
     if python is None or run([python, "--version"], ROOT).returncode:
         return f"Python {interpreter} is not on this machine"
@@ -90,13 +79,7 @@ def installed(interpreter: str, pins: list[str], place: Path) -> str | None:
 
 
 def tried(name: str, place: Path, tests: list[str]) -> str:
-    """Return the line of the table for an environment, and name failed tests on standard error.
-
-    Args:
-        name: of the environment.
-        place: its folder.
-        tests: what pytest runs.
-    """
+    """Return the line of the table for an environment, and name failed tests on standard error."""
     python = str(place / "bin" / "python")
     info = run([python, "-m", "coil_rl.programs.info"], place).stdout
     versions = dict(line.split(maxsplit=1) for line in info.splitlines())

@@ -39,24 +39,14 @@ EXTRAS = "gym,export,imitate,robot,tensorboard,tune"  # whose parts the tests us
 
 
 def run(*command: str | Path, cwd: Path, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a command where nothing but packages is imported.
-
-    Args:
-        command: with its arguments.
-        cwd: where it runs.
-        options: of `subprocess.run`; without them, a failure ends this program.
-    """
+    """Run a command where nothing but packages is imported; by default a failure ends all."""
     env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     options = {"check": True, "text": True} | options
     return subprocess.run([*map(str, command)], cwd=cwd, env=env, **options)
 
 
 def built(folder: Path) -> tuple[Path, Path]:
-    """Return the wheel of the checkout, and the unpacked sdist, which gives the same wheel.
-
-    Args:
-        folder: where both are made.
-    """
+    """Make the wheel of the checkout, and the unpacked sdist, which gives the same wheel."""
     build = [sys.executable, "-m", "build", "--no-isolation"]
     shutil.rmtree(ROOT / "build" / "lib", ignore_errors=True)  # or removed files are in the wheel
     run(*build, "--wheel", "--sdist", "--outdir", folder, cwd=ROOT, stdout=subprocess.DEVNULL)
@@ -81,13 +71,7 @@ def contents(wheel: Path) -> set[tuple[str, int]]:
 
 
 def environment(place: Path, packages: list[str], site: str | None) -> Path:
-    """Return the interpreter of a new environment.
-
-    Args:
-        place: its folder.
-        packages: what pip installs.
-        site: folder with all other packages; None: they are installed too.
-    """
+    """Return the interpreter of a new environment, with a folder of all other packages or not."""
     run(sys.executable, "-m", "venv", place, cwd=place.parent)
     if site is not None:
         (own,) = place.glob("lib/python*/site-packages")
@@ -99,12 +83,7 @@ def environment(place: Path, packages: list[str], site: str | None) -> Path:
 
 
 def collected(unpacked: Path, place: Path) -> str:
-    """Return how many tests of an sdist can be collected, installed as by `make venv`.
-
-    Args:
-        unpacked: the sdist.
-        place: folder of an environment with the developer tools of this one.
-    """
+    """Return how many tests of an sdist can be collected, installed as by `make venv`."""
     python = environment(place, ["-e", str(unpacked)], sysconfig.get_path("purelib"))
     pytest = [python, "-m", "pytest", "-q", "--collect-only"]
     done = run(*pytest, cwd=unpacked, check=False, stdout=subprocess.PIPE)
