@@ -24,9 +24,9 @@ class AnyEnv(SeededEnv):
         super().__init__(batch_size=[count])
         action = Bounded(-1, 1, (2,)) if action is None else action
         shown = observations or {"observation": Unbounded((3,), dtype=dtype)}
-        self.key, self.reward = (
-            (("agents", "action"), ("agents", "reward")) if agents else ("action", "reward")
-        )
+        self.key, self.reward = "action", "reward"
+        if agents:
+            self.key, self.reward = ("agents", "action"), ("agents", "reward")
         self.observation_spec = Composite(
             {key: spec.expand(count, *spec.shape) for key, spec in shown.items()}, shape=(count,)
         )
@@ -59,19 +59,16 @@ class AnyEnv(SeededEnv):
             score = -(action - 0.5).square()
         elif hasattr(spec, "nvec"):
             score = (action == spec.nvec - 1).float()
+        elif isinstance(spec, OneHot):
+            score = action[..., -1].float()
         else:
-            score = (
-                action[..., -1] if isinstance(spec, OneHot) else action == spec.space.n - 1
-            ).float()
+            score = (action == spec.space.n - 1).float()
         reward = self.full_reward_spec[self.reward]
         score = score.reshape(*reward.shape[:-1], -1).mean(-1, keepdim=True).to(reward.dtype)
         self.steps += 1
         truncated = self.steps >= 5
-        ends = {
-            "done": truncated,
-            "truncated": truncated,
-            "terminated": torch.zeros_like(truncated),
-        }
+        ends = {"done": truncated, "truncated": truncated}
+        ends["terminated"] = torch.zeros_like(truncated)
         return TensorDict(self.observe() | {self.reward: score} | ends, self.batch_size)
 
 

@@ -30,11 +30,8 @@ class CartPoles(SeededEnv):
 
     def _reset(self, tensordict=None, **_):
         everywhere = torch.ones(*self.batch_size, 1, dtype=torch.bool)
-        mask = (
-            (everywhere if tensordict is None else tensordict.get("_reset", everywhere))
-            .view(-1)
-            .numpy()
-        )
+        begins = everywhere if tensordict is None else tensordict.get("_reset", everywhere)
+        mask = begins.view(-1).numpy()
         state = torch.rand(*self.batch_size, 4, generator=self.generator).numpy() * 0.1 - 0.05
         self.carts.state[:, mask], self.carts.steps[mask] = state.T[:, mask], 0
         observation = torch.from_numpy(self.carts.state.T.astype(np.float32))

@@ -44,7 +44,7 @@ def model(
 
 def write(folder: Path, change: Change = lambda contract: None, content: bytes = b"") -> Path:
     """Write the file and its contract, perhaps changed, and return the folder."""
-    content = content or model()
+    content, one = content or model(), {"shape": [1], "dtype": "float32"}
     contract = {
         "format": FORMAT,
         "version": VERSION,
@@ -52,25 +52,10 @@ def write(folder: Path, change: Change = lambda contract: None, content: bytes =
         "env": {"title": "Sum"},
         "inputs": [
             {"name": "observation", "key": ["observation"], "shape": [2], "dtype": "float32"},
-            {"name": "guide_action", "key": ["guide_action"], "shape": [1], "dtype": "float32"},
+            {"name": "guide_action", "key": ["guide_action"], **one},
         ],
-        "outputs": [
-            {
-                "name": "action",
-                "shape": [1],
-                "dtype": "float32",
-                "space": {"shape": [1], "dtype": "float64"},
-            }
-        ],
-        "state": [
-            {
-                "input": "state.sum",
-                "output": "next.sum",
-                "shape": [1],
-                "dtype": "float32",
-                "first": 1.0,
-            }
-        ],
+        "outputs": [{"name": "action", **one, "space": {"shape": [1], "dtype": "float64"}}],
+        "state": [{"input": "state.sum", "output": "next.sum", **one, "first": 1.0}],
         "guide": {"place": "outside", "names": ["sum"], "reason": "it is Python"},
     }
     change(contract)

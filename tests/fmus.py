@@ -4,7 +4,6 @@ pythonfmu writes neither units nor bounds, so that they are written into the des
 """
 
 import re
-import shutil
 import textwrap
 import zipfile
 from functools import cache
@@ -77,15 +76,19 @@ def built(code: str, name: str, options: tuple[tuple[str, bool], ...] = ()) -> P
     """Return an FMU with the only class of some code, and units where `UNITS` has them."""
     from pythonfmu.builder import FmuBuilder
 
+    path = packed(FmuBuilder, HEAD + textwrap.dedent(code), name, **dict(options))
+    units = {rf'(name="{each}"[^>]*>\s*<Real)': rf"\g<1> {text}" for each, text in UNITS.items()}
+    return edited(path, path, units)
+
+
+def packed(builder, code: str, name: str, **options: bool) -> Path:
+    """Return an FMU that a builder makes of some code."""
     place = folder() / name
     place.mkdir()
     source = place / f"{name}_plant.py"
-    source.write_text(HEAD + textwrap.dedent(code))
-    made = place / FmuBuilder.build_FMU(str(source), dest=str(place), **dict(options))
-    path = place / f"{name}.fmu"
-    shutil.move(made, path)
-    units = {rf'(name="{each}"[^>]*>\s*<Real)': rf"\g<1> {text}" for each, text in UNITS.items()}
-    return edited(path, path, units)
+    source.write_text(code)
+    made = place / builder.build_FMU(str(source), dest=str(place), **options)
+    return made.rename(place / f"{name}.fmu")
 
 
 def edited(
@@ -112,11 +115,9 @@ def edited(
 
 def motor(*, state: bool = False) -> Path:
     """Return a motor: voltage in, speed and current out, an inertia; with FMU state or without."""
-    return (
-        built(MOTOR, "motor_state", (("canGetAndSetFMUstate", True),))
-        if state
-        else built(MOTOR, "motor")
-    )
+    if state:
+        return built(MOTOR, "motor_state", (("canGetAndSetFMUstate", True),))
+    return built(MOTOR, "motor")
 
 
 def tank() -> Path:
@@ -154,12 +155,6 @@ def heaters() -> Path:
     pytest.importorskip("pythonfmu3")
     from pythonfmu3.builder import FmuBuilder
 
-    place = folder() / "heaters"
-    place.mkdir()
-    source = place / "heaters_plant.py"
-    source.write_text(HEATERS)
-    made = place / FmuBuilder.build_FMU(str(source), dest=str(place))
-    path = place / "heaters.fmu"
-    shutil.move(made, path)
+    path = packed(FmuBuilder, HEATERS, "heaters")
     bounds = {r'name="(left|right)"': r'name="\1" unit="kW" min="0" max="5"'}
     return edited(path, path, bounds)

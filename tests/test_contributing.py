@@ -15,13 +15,8 @@ PACKAGES = ("coil_rl", "envs", "transforms")
 
 
 def walks():
-    text = (
-        (ROOT / "CONTRIBUTING.md")
-        .read_text()
-        .partition("## How the code runs")[2]
-        .partition("\n## ")[0]
-    )
-    lists = text.split("One step of a tensor")
+    text = (ROOT / "CONTRIBUTING.md").read_text().partition("## How the code runs")[2]
+    lists = text.partition("\n## ")[0].split("One step of a tensor")
     return [re.findall(r"^\d+\. `([^`]+)`", part, flags=re.MULTILINE) for part in lists]
 
 
@@ -36,10 +31,8 @@ def test_walks_name_every_file_between_the_command_and_the_optimiser_step_and_th
     tmp_path, monkeypatch
 ):
     training, step = walks()
-    assert all(
-        len(walk) <= 10 and all((ROOT / file).is_file() for file in walk)
-        for walk in (training, step)
-    )
+    assert len(training) <= 10 >= len(step)
+    assert all((ROOT / file).is_file() for file in (*training, *step))
     stacks = {}
     adam_step, advise = torch.optim.Adam.step, SplineGuide.forward
 
@@ -60,11 +53,8 @@ def test_walks_name_every_file_between_the_command_and_the_optimiser_step_and_th
     for method, *words in (["coil_anchored", "training.tests.time_limit=0.5"], ["coil"]):
         run = f"hydra.run.dir={tmp_path / method}"
         called("train", f"method={method}", *words, *short, run)
-    assert (
-        {"coil_rl/programs/train.py", "coil_rl/learners/ppo.py"}
-        <= set(stacks["optimiser"])
-        <= set(training)
-    )
+    ends = {"coil_rl/programs/train.py", "coil_rl/learners/ppo.py"}
+    assert ends <= set(stacks["optimiser"]) <= set(training)
     assert {"transforms/guide_actions.py"} <= set(stacks["advice"]) <= set(step)
 
 

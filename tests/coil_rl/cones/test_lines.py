@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.colors import to_rgb
-from ovals import oval_line, oval_track, ring_track
+from ovals import ring_track
 from PIL import Image, ImageSequence
 
-from coil_rl.cones import draw_listening_map
 from coil_rl.cones.lines import animate_lines, draw_lines
 from coil_rl.report import style
 
@@ -78,23 +77,3 @@ def test_animation_moves_repeats_and_is_small(tmp_path):
     assert durations == [100] * 10 + [1200]
     assert all((before != after).any() for before, after in itertools.pairwise(frames))
     assert path.stat().st_size < 250_000
-
-
-def test_unknown_format_is_an_error_and_leaves_no_file(tmp_path):
-    with pytest.raises(ValueError, match="xyz"):
-        draw_lines(TRACKS, LINES, tmp_path / "x.xyz")
-    assert not list(tmp_path.iterdir())
-
-
-OVALS = [oval_track("one"), oval_track("two", clockwise=True)]
-OVAL_LINES = [oval_line(10), oval_line(10) * [1, -1]]
-
-
-def constant(*values):
-    return [np.full(len(line), value) for line, value in zip(OVAL_LINES, values, strict=True)]
-
-
-def test_listening_map_is_drawn_where_there_are_values(tmp_path):
-    both = {"used": constant(np.nan, 0.4), "ignored": constant(0, 0)}
-    draw_listening_map(OVALS, OVAL_LINES, both, tmp_path / "map.png", label="moved", title="t")
-    assert pixels(tmp_path / "map.png").std() > 0

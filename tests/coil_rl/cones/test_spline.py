@@ -84,30 +84,6 @@ def test_parameters_of_equation_103():
     assert advice(*TWO_MIDPOINTS, max_steering=40) == pytest.approx(default, abs=1e-12)
 
 
-@both_splines
-def test_pairs_are_less_than_four_metres_apart(spline):
-    assert advice([(2.0, 3.0)], [(2.0, -1.0), (3.0, -1.0)], 0.25, spline=spline) == 0.25
-    assert advice([(2.0, 2.9)], [(2.0, -1.0), (2.5, -1.0)], 0.25, spline=spline) != 0.25
-
-
-@both_splines
-@pytest.mark.parametrize(
-    ("left", "right"),
-    [
-        ([], []),
-        ([(2.0, 1.0), (4.0, 1.0)], []),
-        ([], [(2.0, -1.0), (4.0, -1.0)]),
-        ([(2.0, 1.0)], [(2.0, -1.0)]),
-        ([(0.2, 1.0)], [(0.2, -1.0), (0.4, -1.0)]),
-        ([(0.5, 3.0)], [(0.5, 2.0), (0.5, 1.0)]),
-    ],
-    ids=["no cones", "left only", "right only", "one pair", "all reached", "all to the side"],
-)
-def test_without_a_target_steering_is_kept(left, right, spline):
-    for steering in (0.0, -0.7, 1.0):
-        assert advice(left, right, steering, spline=spline) == steering
-
-
 @every_guide
 def test_advice_is_antisymmetric_and_independent_of_padding(guide):
     cones, count, steering = roads(7, cars=1000)

@@ -28,18 +28,9 @@ class Tank(gymnasium.Env):
         self.level = float(np.clip(self.level + 0.1 * action[0], -1, 1))
         return np.array([self.level], np.float32), -cost(self.level), False, self.time >= 8, {}
 """
-TINY = [
-    "learner=ppo",
-    "learner.minibatches=1",
-    "budget.num_envs=2",
-    "budget.steps=8",
-    "evaluation.cases=2",
-    "evaluation.curve.points=1",
-    "evaluation.curve.num_envs=2",
-    "evaluation.gif=false",
-    "logger=none",
-    "env.workers=0",
-]
+TINY = ["learner=ppo", "learner.minibatches=1", "budget.num_envs=2", "budget.steps=8"]
+TINY += ["evaluation.cases=2", "evaluation.curve.points=1", "evaluation.curve.num_envs=2"]
+TINY += ["evaluation.gif=false", "logger=none", "env.workers=0"]
 
 
 @pytest.fixture

@@ -66,9 +66,8 @@ def test_policy_learns_the_same_with_flags_as_with_numbers(method, learner, tmp_
     observation = np.array([0.5, -0.5], np.float32)
     for env in (Flags, Numbers):
         run = trained(env, tmp_path / env.__name__, method, *words)
-        logs += [
-            tuple((run.folder / file).read_text() for file in ("metrics.csv", "evaluation.csv"))
-        ]
+        files = ("metrics.csv", "evaluation.csv")
+        logs.append([(run.folder / file).read_text() for file in files])
         actions.append(run.controller().act(observation))
     assert logs[0] == logs[1]
     for action, space in zip(actions, SPACES, strict=True):

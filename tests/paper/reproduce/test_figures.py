@@ -30,9 +30,8 @@ def test_figure_10_is_the_clipped_term_and_red_where_it_is_flat(tmp_path):
     for title, sign in (("A < 0", -1), ("A > 0", 1)):
         ratio, term = series[title, "one term"].T
         assert ratio == pytest.approx(np.linspace(0.005, 1.995, 200), abs=1e-5)
-        assert term == pytest.approx(
-            np.minimum(sign * ratio, sign * ratio.clip(0.8, 1.2)), abs=1e-5
-        )
+        clipped = np.minimum(sign * ratio, sign * ratio.clip(0.8, 1.2))
+        assert term == pytest.approx(clipped, abs=1e-5)
         clipped = series[title, "clipped"]
         assert clipped[:, 1] == pytest.approx(sign * (1 + 0.2 * sign), abs=1e-5)
         assert len(clipped) == 80
@@ -63,9 +62,8 @@ def test_figure_21_shows_the_cones_of_four_training_tracks(tmp_path):
 
 def test_figure_26_detects_cones_among_the_points_of_the_scan(tmp_path):
     page, series = series_of(Figure26(), tmp_path)
-    points, left, right = (
-        series["", name] for name in ("LiDAR points", "left cones", "right cones")
-    )
+    names = ("LiDAR points", "left cones", "right cones")
+    points, left, right = (series["", name] for name in names)
     assert f"{len(points)} returns" in page
     assert f"{len(left)} thin cones, the left side, and {len(right)} thick ones" in page
     for cone in np.concatenate([left, right]):
@@ -87,10 +85,8 @@ def test_figure_30_is_equation_103(tmp_path):
 @pytest.mark.slow
 def test_figure_31_has_midpoints_of_pairs_and_targets_on_the_spline(tmp_path):
     page, series = series_of(Figure31(), tmp_path)
-    left, right, midpoints = (
-        series["midpoints", f"{name}"]
-        for name in ("left cones", "right cones", "midpoints of pairs")
-    )
+    names = ("left cones", "right cones", "midpoints of pairs")
+    left, right, midpoints = (series["midpoints", name] for name in names)
     pairs = (left[:, None] + right)[np.hypot(*np.moveaxis(left[:, None] - right, -1, 0)) < 4] / 2
     assert in_order(midpoints) == pytest.approx(in_order(pairs), abs=1e-5)
     spline, targets = series["targets", "smoothing spline"], series["targets", "targets"]

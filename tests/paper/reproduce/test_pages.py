@@ -29,10 +29,7 @@ def test_the_origin_has_command_commits_seeds_and_frames(tmp_path):
         "5 runs with the seeds 0, 1, made at "
         "commit `abc`, `abc` with local changes, `unknown`. Training frames: 4,000 (coil, ppo)."
     )
-    assert (
-        pages.origin("coil-reproduce table=1", "def")
-        == "Made by `coil-reproduce table=1` at commit `def`."
-    )
+    assert pages.origin("make table=1", "def") == "Made by `make table=1` at commit `def`."
 
 
 def test_results_md_has_the_claims_the_pages_and_the_missing_results():
@@ -60,19 +57,17 @@ def test_results_md_has_the_claims_the_pages_and_the_missing_results():
     assert text.count("A note.") == text.count("| more |") == 1
 
 
+BETTER, WORSE = (1.5, 1.0, 2.0, 3), (-1.5, -2.0, -1.0, 3)
+
+
 @pytest.mark.parametrize(
     ("number", "sign", "p", "cell"),
     [
-        ((1.5, 1.0, 2.0, 3), 1, 0.049, "**held up**: +1.5 (+1.0 to +2.0), 3 seeds, p 0.049"),
-        (
-            (-1.5, -2.0, -1.0, 3),
-            1,
-            0.01,
-            "**did not hold up**: -1.5 (-2.0 to -1.0), 3 seeds, p 0.010",
-        ),
-        ((-1.5, -2.0, -1.0, 3), -1, 0.01, "**held up**: -1.5 (-2.0 to -1.0), 3 seeds, p 0.010"),
-        ((1.5, 1.0, 2.0, 3), 1, 0.06, "**undecided**: +1.5 (+1.0 to +2.0), 3 seeds, p 0.060"),
-        ((1.5, 1.0, 2.0, 3), 1, 0.0, "**held up**: +1.5 (+1.0 to +2.0), 3 seeds, p < 0.001"),
+        (BETTER, 1, 0.049, "**held up**: +1.5 (+1.0 to +2.0), 3 seeds, p 0.049"),
+        (WORSE, 1, 0.01, "**did not hold up**: -1.5 (-2.0 to -1.0), 3 seeds, p 0.010"),
+        (WORSE, -1, 0.01, "**held up**: -1.5 (-2.0 to -1.0), 3 seeds, p 0.010"),
+        (BETTER, 1, 0.06, "**undecided**: +1.5 (+1.0 to +2.0), 3 seeds, p 0.060"),
+        (BETTER, 1, 0.0, "**held up**: +1.5 (+1.0 to +2.0), 3 seeds, p < 0.001"),
         ((2.0,), 1, math.nan, "**undecided**: +2.0, 1 seed"),
         ((math.nan,), 1, math.nan, None),
     ],
@@ -85,15 +80,11 @@ def test_the_verdicts_of_a_world_are_one_family():
     alone = Claim(estimate([1.0, 1.1, 1.3]), ".1f")
     undecided = Claim(estimate([1.0, -1.0, 0.5]), ".1f")
     assert 0.005 < alone.estimate.p < 0.025
+    first, other = {"claim": "first", "ours": alone}, {"claim": "other", "ours": undecided}
     for others, word in [(1, "held up"), (8, "undecided")]:
-        page = claims_section(
-            [{"claim": "first", "ours": alone}, *[{"claim": "other", "ours": undecided}] * others],
-            {"ours": "ours"},
-        )
+        page = claims_section([first, *[other] * others], {"ours": "ours"})
         assert row(page, "first")[1].startswith(f"**{word}**")
-    elsewhere = [{"world": "rain", "claim": "other", "ours": undecided}] * 8
-    page = claims_section(
-        [{"world": "", "claim": "first", "ours": alone}, *elsewhere], {"ours": "ours"}
-    )
+    elsewhere = [other | {"world": "rain"}] * 8
+    page = claims_section([first | {"world": ""}, *elsewhere], {"ours": "ours"})
     assert row(page, "first")[1].startswith("**held up**")
     assert row(page, "other, rain")[1].startswith("**undecided**")

@@ -5,12 +5,14 @@ from reproduced_runs import cells
 
 from coil_paper.reproduce.tabular_claim import TabularCoil
 
+SMALL = {"states": 6, "actions": 2, "classes": 2, "steps": [50, 500, 5_000]}
+
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """The page, the rows of the CSV by view and guide, and the output path."""
     stem = tmp_path_factory.mktemp("claim") / "c"
-    page = TabularCoil(worlds=3, states=6, actions=2, classes=2, steps=[50, 500, 5_000]).make(stem)
+    page = TabularCoil(worlds=3, **SMALL).make(stem)
     groups = {}
     for row in read_csv(stem.with_suffix(".csv")):
         groups.setdefault((row["view"], row["guide"]), []).append(row)
@@ -31,10 +33,8 @@ def test_scores_of_the_guides_are_ordered_and_at_most_optimal(made):
         if guide in ("optimal", "random"):
             np.testing.assert_allclose(own, guide == "optimal", atol=1e-9)
         assert (own.max(axis=1) == own.min(axis=1)).all()
-    worst, noisy = (
-        column(groups["state", guide], "guide_score") for guide in ("worst", "noisy (20%)")
-    )
-    assert (worst < 0).all()
+    assert (column(groups["state", "worst"], "guide_score") < 0).all()
+    noisy = column(groups["state", "noisy (20%)"], "guide_score")
     assert ((noisy > 0) & (noisy < 1)).all()
 
 
@@ -45,14 +45,6 @@ def test_deterministic_advice_changes_nothing_with_the_whole_state(made):
         np.testing.assert_allclose(coil, plain, rtol=0, atol=1e-12)
     coil, plain = (column(groups["state", "random"], key) for key in ("coil_score", "plain_score"))
     assert np.abs(coil - plain).max() > 1e-3
-
-
-def test_optimal_advice_helps_with_partial_observations(made):
-    _, groups, _ = made
-    rows = groups["class", "optimal"]
-    assert (
-        column(rows, "coil_score")[:, -1].mean() > column(rows, "plain_score")[:, -1].mean() + 0.1
-    )
 
 
 def test_the_page_counts_the_worlds_in_which_coil_reaches_its_guide(made):
@@ -68,9 +60,7 @@ def test_the_page_counts_the_worlds_in_which_coil_reaches_its_guide(made):
 
 
 def test_worlds_do_not_depend_on_their_number(made, tmp_path):
-    TabularCoil(worlds=1, states=6, actions=2, classes=2, steps=[50, 500, 5_000]).make(
-        tmp_path / "c"
-    )
+    TabularCoil(worlds=1, **SMALL).make(tmp_path / "c")
     again = (tmp_path / "c.csv").read_text()
     assert made[2].with_suffix(".csv").read_text().startswith(again)
 

@@ -7,13 +7,8 @@ from coil_paper.reproduce.toymaker import Figure6, Table1, most_explained
 
 def test_table_1_solves_the_bellman_equation_next_to_the_paper(tmp_path):
     page = Table1().make(tmp_path / "t")
-    # By hand: 7640/181 and 5840/181 with advertising.
-    exact = [
-        6 + 0.95 * (7640 + 5840) / 2 / 181,
-        7640 / 181,
-        -3 + 0.95 * (0.4 * 7640 + 0.6 * 5840) / 181,
-        5840 / 181,
-    ]
+    good, poor = 7640 / 181, 5840 / 181  # by hand, with advertising
+    exact = [6 + 0.95 * (good + poor) / 2, good, -3 + 0.95 * (0.4 * good + 0.6 * poor), poor]
     rows = read_csv(tmp_path / "t.csv")
     assert [float(row["ours"]) for row in rows] == pytest.approx(exact, abs=1e-8)
     assert [float(row["paper"]) for row in rows] == [41.37, 42.21, 31.42, 32.26]
@@ -48,7 +43,5 @@ def test_figure_6_has_both_values_after_each_iteration(tmp_path):
 
 
 def test_values_out_of_range_are_rejected():
-    with pytest.raises(ValueError, match="tolerance=0 must be more than 0"):
-        Table1(0)
     with pytest.raises(ValueError, match="iterations=0 must be at least 1"):
         Figure6(0)

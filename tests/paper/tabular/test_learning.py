@@ -42,9 +42,8 @@ def test_transition_frequencies_match_the_probabilities():
         assert counts[~possible].sum() == 0
         expected = mdp.P[s, a, possible] / mdp.P[s, a, possible].sum() * len(next_states)
         assert chisquare(counts[possible], expected).pvalue > 1e-4
-    np.testing.assert_array_equal(
-        sample.reward, mdp.R[sample.state, sample.action, sample.next_state]
-    )
+    rewards = mdp.R[sample.state, sample.action, sample.next_state]
+    np.testing.assert_array_equal(sample.reward, rewards)
     np.testing.assert_array_equal(sample.next_state[:-1], sample.state[1:])
 
 
@@ -62,15 +61,9 @@ def test_transitions_and_q_depend_on_the_seed_only():
 
 def test_an_episode_ends_at_a_terminal_state_or_after_its_steps():
     world, right = corridor(3), np.full(3, 1)
-    assert (
-        sample_transitions(world, right, 6, np.random.default_rng(0)).state.tolist() == [0, 1] * 3
-    )
-    assert (
-        sample_transitions(
-            world, right, 3, np.random.default_rng(0), episode_steps=1
-        ).state.tolist()
-        == [0] * 3
-    )
+    rng = np.random.default_rng(0)
+    assert sample_transitions(world, right, 6, rng).state.tolist() == [0, 1] * 3
+    assert sample_transitions(world, right, 3, rng, episode_steps=1).state.tolist() == [0] * 3
     with pytest.raises(ValueError, match="episode_steps=0 must be at least 1"):
         Simulator(world, np.random.default_rng(0), episode_steps=0)
 
@@ -90,21 +83,14 @@ def test_rounded_probabilities_never_lead_to_impossible_states():
 
 def test_a_model_estimate_has_relative_frequencies_and_mean_rewards():
     model = ModelEstimate(2, 2)
-    model.add(
-        Transitions(
-            state=np.array([0, 0, 0, 0, 1]),
-            action=np.array([1, 1, 1, 1, 0]),
-            reward=np.array([1.0, 2.0, 3.0, 7.0, 5.0]),
-            next_state=np.array([0, 1, 1, 1, 0]),
-        )
-    )
+    steps = [(0, 1, 1.0, 0), (0, 1, 2.0, 1), (0, 1, 3.0, 1), (0, 1, 7.0, 1), (1, 0, 5.0, 0)]
+    state, action, reward, next_state = map(np.array, zip(*steps, strict=True))
+    model.add(Transitions(state, action, reward, next_state))
     np.testing.assert_array_equal(model.P[0, 1], [0.25, 0.75])
     np.testing.assert_array_equal(model.R[0, 1], [1.0, 4.0])
     np.testing.assert_array_equal(model.P[1, 0], [1.0, 0.0])
     assert np.isnan(model.P[0, 0]).all()
-    with pytest.raises(
-        ValueError, match="action 0 has no sample in state 0, nor have 1 other pairs"
-    ):
+    with pytest.raises(ValueError, match="action 0 has no sample in state 0, nor have 1 other"):
         model.mdp(0.9)
 
 
@@ -148,9 +134,8 @@ def test_q_of_a_corridor_follows_equation_52():
     assert learned.Q[0, 1] == pytest.approx(2)
     assert 0.9 < learned.Q[0, 0] < 1
     assert learned.visits.sum() == learned.visits[0].sum() == 400
-    assert learn(toymaker(), observations=[0, 0], steps=500).Q.shape == (1, 2), (
-        "states share an observation"
-    )
+    shared = learn(toymaker(), observations=[0, 0], steps=500)
+    assert shared.Q.shape == (1, 2)
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,8 @@ def changed(array, index, value):
 def test_expected_reward_and_q_weigh_by_probability():
     np.testing.assert_allclose(MDP(P, R, 0.9).r, [[1.5, 3.0], [0.0, 5.7]])
     np.testing.assert_allclose(toymaker().r, [[6, 4], [-3, -5]])
-    np.testing.assert_allclose(
-        MDP(P, R, 0.5).q(np.array([10.0, 20.0])), [[1.5 + 7.5, 3 + 5], [10, 5.7 + 8.5]]
-    )
+    found = MDP(P, R, 0.5).q(np.array([10.0, 20.0]))
+    np.testing.assert_allclose(found, [[1.5 + 7.5, 3 + 5], [10, 5.7 + 8.5]])
 
 
 def test_a_state_without_exit_and_reward_is_terminal():
@@ -31,18 +30,12 @@ def test_a_state_without_exit_and_reward_is_terminal():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            {"P": changed(P, (1, 0), [0.1, 0.8])},
-            r"P\[1, 0\]=.* \(state low, action go\); they sum to 0.9",
-        ),
+        ({"P": changed(P, (1, 0), [0.1, 0.8])}, r"\(state low, action go\); they sum to 0.9"),
         ({"P": changed(P, (0, 1), [1.5, -0.5])}, r"P\[0, 1\]=.* \(state high, action stay\)"),
         ({"P": changed(P, (0, 1, 0), np.nan)}, "they sum to nan"),
         ({"P": P[0]}, r"P must have the shape \[S, A, S\]"),
         ({"R": R[0]}, r"R must have the shape of P, \(2, 2, 2\); it has \(2, 2\)"),
-        (
-            {"R": changed(R, (1, 1, 0), np.inf)},
-            r"R\[1, 1\]=.* must be finite \(state low, action stay\)",
-        ),
+        ({"R": changed(R, (1, 1, 0), np.inf)}, r"finite \(state low, action stay\)"),
         ({"gamma": 1.0}, "gamma=1.0 must be at least 0 and less than 1"),
         ({"gamma": np.nan}, "gamma=nan"),
         ({"start": [0.5, 0.6]}, "start must be 2 probabilities"),
@@ -67,15 +60,6 @@ def test_a_policy_is_given_as_actions_or_probabilities():
     }.items():
         with pytest.raises(ValueError, match=message):
             mdp.probabilities(policy)
-
-
-def test_the_toymaker_has_howards_numbers():
-    mdp = toymaker()
-    assert mdp.gamma == 0.95
-    assert mdp.P[:, 0].tolist() == [[0.5, 0.5], [0.4, 0.6]]
-    assert mdp.R[:, 0].tolist() == [[9, 3], [3, -7]]
-    assert mdp.P[:, 1].tolist() == [[0.8, 0.2], [0.7, 0.3]]
-    assert mdp.R[:, 1].tolist() == [[4, 4], [1, -19]]
 
 
 def test_a_garnet_has_the_given_branches_and_is_reproducible():
