@@ -68,9 +68,6 @@ def test_method_takes_choices_or_is_refused_with_those_that_do(method, tmp_path)
         checked(method, tmp_path)
 
 
-GUIDE = "(method=guide); leave it out"
-
-
 def unread(*words):
     """Return the reason why the last of some words is not read; empty if it is."""
     try:
@@ -85,36 +82,22 @@ def unread(*words):
     ("words", "message"),
     [
         ("method=dagger budget.minibatches=3", "nothing in this run reads budget.minibatches"),
-        (
-            "learner=sac training.learning_rate=1",
-            "reads training.learning_rate (method=coil); leave it out",
-        ),
+        ("learner=sac training.learning_rate=1", "(method=coil); leave it out"),
         ("training.imitation_env.assignment=random", "reads training.imitation_env.assignment"),
         ("training.tests.starts=5", "reads training.tests.starts (method=coil)"),
-        ("recording=drive.mcap", "nothing in this run reads recording (method=coil); leave it out"),
+        ("recording=drive.mcap", "nothing in this run reads recording (method=coil)"),
         ("method.needs_guide=false", "the file of method=coil says whether its policy needs a"),
-        ("method=guide learner.gamma=0.9", GUIDE),
-        ("method=guide learner=sac", GUIDE),
-        ("method=guide training.noise_correlation=0.5", GUIDE),
-        ("method=guide budget.num_envs=3", GUIDE),
-        ("method=guide budget.frames=100", GUIDE),
-        ("method=guide evaluation.curve.points=2", GUIDE),
-        ("method=guide logger=csv", GUIDE),
+        ("method=guide learner.gamma=0.9", "(method=guide); leave it out"),
+        ("method=guide training.noise_correlation=0.5", "(method=guide)"),
+        ("method=guide budget.num_envs=3", "(method=guide)"),
+        ("method=guide evaluation.curve.points=2", "(method=guide)"),
+        ("method=guide logger=csv", "(method=guide)"),
+        ("action=choices training.noise_correlation=0.5", "noise_correlation (method=coil)"),
+        ("method=oil training.noise_correlation=0.5", "noise_correlation (method=oil)"),
+        ("method=ppo +degrade@evaluation.advice.a=zeroed", "evaluation.advice.a (method=ppo)"),
         (
-            "action=choices training.noise_correlation=0.5",
-            "reads training.noise_correlation (method=coil)",
-        ),
-        (
-            "method=oil training.noise_correlation=0.5",
-            "reads training.noise_correlation (method=oil)",
-        ),
-        (
-            "method=ppo +degrade@evaluation.advice.zeroed=zeroed",
-            "reads evaluation.advice.zeroed (method=ppo)",
-        ),
-        (
-            "method=dynamic_coil_sequential +degrade@evaluation.advice.zeroed=zeroed",
-            "reads evaluation.advice.zeroed (method=dynamic_coil_sequential)",
+            "method=dynamic_coil_sequential +degrade@evaluation.advice.a=zeroed",
+            "evaluation.advice.a (method=dynamic_coil_sequential)",
         ),
     ],
 )
@@ -128,46 +111,28 @@ def test_cases_of_comparisons_are_read_where_policies_are_compared(word):
 
 
 @pytest.mark.parametrize(
-    ("word", "read"),
+    "words",
     [
-        ("learner.gamma=0.9", False),
-        ("network=mlp", False),
-        ("training.learning_rate=1", False),
-        ("budget.minibatches=3", False),
-        ("checkpoint_every=3", False),
-        ("budget.frames=1000", True),
-        ("training.tests.starts=5", True),
-        ("evaluation.curve.points=2", True),
-        ("preset.rate=10", True),
+        "method=tune budget.frames=1000",
+        "method=tune training.tests.starts=5",
+        "method=tune evaluation.curve.points=2",
+        "method=guide env.rate=10",
+        "method=guide preset.rate=10",
+        "method=guide track=generated track.test.count=2",
+        "method=guide evaluation.gif=false",
+        "method=guide seed=3",
+        "method=guide degrade=[noisy]",
+        "method=guide env.time_limit=${budget.steps} budget.steps=3",  # the env refers to it
+        "method=coil training.noise_correlation=0.5",
     ],
 )
-def test_search_of_the_numbers_of_a_guide_reads_nothing_of_a_learner(word, read):
-    assert (unread("method=tune", word) == "") == read
+def test_override_that_something_reads_is_taken(words):
+    assert unread(*words.split()) == ""
 
 
-@pytest.mark.parametrize(
-    "word",
-    [
-        "guide.spline.gain=0.5",
-        "env.rate=10",
-        "preset.rate=10",
-        "track.test.count=2",
-        "evaluation.gif=false",
-        "seed=3",
-        "device=cpu",
-        "label=mine",
-        "disturb=[late]",
-        "degrade=[noisy]",
-    ],
-)
-def test_guide_alone_reads_what_says_how_it_drives(word):
-    assert unread("method=guide", "track=generated", word) == ""
-
-
-def test_value_that_an_env_refers_to_is_read_by_a_guide_alone():
-    words = ["method=guide", "env.time_limit=${budget.steps}", "budget.steps=3"]
-    assert unread(*words) == ""
-    assert "(method=guide)" in unread("method=guide", "budget.steps=3")
+@pytest.mark.parametrize("word", ["learner.gamma=0.9", "network=mlp", "checkpoint_every=3"])
+def test_search_of_the_numbers_of_a_guide_reads_nothing_of_a_learner(word):
+    assert "(method=tune)" in unread("method=tune", word)
 
 
 @pytest.mark.slow
@@ -177,36 +142,21 @@ def test_each_run_of_a_sweep_says_what_it_does_not_read(tmp_path):
     assert said.count("learner.gamma=0.9 has no effect: nothing in this run reads") == 2
 
 
-def test_noise_is_read_where_actions_are_numbers():
-    assert unread("method=coil", "training.noise_correlation=0.5") == ""
-
-
 @pytest.mark.slow
 def test_words_from_python_are_read_too(tmp_path):
     words = ["logger=none", "proxy.seed=3"]
     folder = tmp_path / "run"
-    with pytest.raises(
-        UserError, match=r"proxy\.seed=3 has no effect: nothing in this run reads proxy\.seed"
-    ):
+    with pytest.raises(UserError, match=r"proxy\.seed=3 has no effect"):
         coil_rl.prepare("cone_track", method="ppo", folder=folder, overrides=words)
-    with pytest.raises(UserError, match=r"budget\.frames=64 has no effect: .*method=guide"):
+    with pytest.raises(UserError, match=r"budget\.frames=64 has no effect"):
         coil_rl.prepare("cone_track", guide="spline", method="guide", frames=64, folder=folder)
     assert not folder.exists()
 
 
 SMALL = ["evaluation.cases=2", "evaluation.curve.num_envs=2", "logger=none"]
-NAMES = [  # guide.controller.of
-    ("odd_parts", "of=odd_parts must be MODULE:NAME"),
-    ("odd_parts.first", "of=odd_parts.first must be MODULE:NAME"),
-    ("", "of= must be MODULE:NAME"),
-    ("3", "of=3 is int; name a class, a function"),
-    ("odd_parts:firts", "odd_parts has no firts; did you mean first?"),
-    ("odd_party:first", "there is no module odd_party; install its package"),
-]
 WORDS = [  # of a run of PPO in env=gym env.id=odd_parts:Plain
-    ("env.id=odd_parts:Nothing", "odd_parts has no env Nothing, and registers none of this name"),
+    ("guide=controller guide.controller.of=odd_parts:firts", "did you mean first?"),
     ("env.id=", "env.id is empty; write env.id=MODULE:NAME"),
-    ("env.id=no_such-v3", "or PACKAGE:no_such-v3 if a package registers"),
     ("env.id=7", "env.id=7 must be a valid string or callable"),
     ("+env.options.speed=3", "it raised TypeError: Plain() takes no arguments"),
     ("env.max_steps=-5", "max_steps=-5 must be at least 1"),
@@ -214,30 +164,18 @@ WORDS = [  # of a run of PPO in env=gym env.id=odd_parts:Plain
     ("observes=observation", "observes=observation must be a list; write observes=[observation]"),
     ("observes=[speed]", "the env has no entry speed to observe; it has observation"),
     ("budget.frames=1.5", "Value '1.5' of type 'float' could not be converted to Integer"),
-    ("budget.frames=many", "Value 'many' of type 'str' could not be converted to Integer"),
-    ("budget.steps=100000000", "budget.steps=100000000 must be at most 65536"),
-    ("training.noise_correlation=much", "'much' of type 'str' could not be converted to Float"),
     ("compile=maybe", "Value 'maybe' is not a valid bool"),
     ("label=a/b", "label=a/b cannot be used: it must not be empty"),
-    ("evaluation.cases=two", "evaluation.cases=two must be at least 1, or the names of the"),
-    ("learner.hidden=64", "learner.hidden=64 must be a list"),
-    ("learner=[ppo,sac]", "chooses several files of a group that takes one; for a run with each"),
-    ("method=[ppo,coil]", "write -m method=ppo,coil"),
+    ("method=[ppo,coil]", "several files of a group that takes one; for a run with each write -m"),
     ("degrade=[noisy]", "degrade=[noisy] has no effect, because there is no guide"),
-    ("network=gru learner=sac", "SAC cannot train a network with a memory; take network=mlp"),
-    ("method=mixing guide=random method.transforms.mixing.weight=2", "weight=2 must be at most 1"),
     ("track=unseen", "Could not override 'track'. No match in the defaults list"),
     ("+track=unseen", "+track=unseen has no effect: nothing in this run reads track"),
-    ("+preset=paper", "+preset=paper has no effect: nothing in this run reads preset"),
     ("+evaluation.measures.speed.entry=speed", "measures.speed=speed is no entry of the env"),
     ("evaluation.measures.speed=speed", "write evaluation.measures.speed.entry=ENTRY"),
     ("evaluation.measures.speed.entrry=reward", "no key entrry; evaluation.measures.speed"),
-    ("evaluation.measures.steps.entry=reward", "steps is already a column of the tables"),
-    ("guide.controller.of=odd_parts:first", "it belongs to guide=controller: write"),
 ]
 OTHER_ENVS = [
     ("env.id=odd_parts:Plain", "it belongs to env=gym: write env=gym env.id=VALUE"),
-    ("env=odd_parts:Plain", "for an env of Gymnasium write env=gym env.id=odd_parts:Plain"),
     ("env=gym", "env.id must be given: write env.id=VALUE"),
     ("env=torchrl env.of._target_=odd_parts.Plain", "of makes Plain, which is no env of TorchRL"),
 ]
@@ -259,20 +197,12 @@ def answer(*words):
     return ""
 
 
-def in_gym(env, *words):
-    return answer("env=gym", f"env.id=odd_parts:{env}", *SMALL, "method=ppo", *words)
-
-
-@pytest.mark.parametrize(("of", "expected"), NAMES)
-def test_odd_name_of_a_controller_is_answered(of, expected):
-    assert expected in in_gym("Plain", "guide=controller", f"guide.controller.of={of}")
-
-
 @pytest.mark.fast(8)
 @pytest.mark.parametrize(("words", "expected"), WORDS)
 def test_odd_word_is_answered(words, expected, caplog):
     caplog.set_level(logging.CRITICAL)
-    assert expected in in_gym("Plain", *words.split())
+    of_env = ["env=gym", "env.id=odd_parts:Plain", *SMALL, "method=ppo"]
+    assert expected in answer(*of_env, *words.split())
 
 
 @pytest.mark.parametrize(("words", "expected"), OTHER_ENVS)
