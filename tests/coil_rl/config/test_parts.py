@@ -1,6 +1,5 @@
 """The parts of a configuration are those that it describes, and its proxies are trained once."""
 
-import csv
 import shutil
 import sys
 from itertools import product
@@ -64,33 +63,16 @@ def test_env_of_every_method_passes_check_env(method, preset):
     assert env.rate == {"default": 12, "paper": 24, "authors": 60}[preset]
 
 
-NOT_ALONE = {
-    "cone_planner",
-    "controller",
-    "entry",
-    "exported",
-    "learned",
-    "pid",
-    "recorded",
-    "recording",
-}  # need a package, a class, an entry, a run, an entry to control, a file or recordings
+# They need a package, a class, an entry, a run, an entry to control, a file or recordings.
+NOT_ALONE = {"cone_planner", "controller", "entry", "exported", "learned", "pid", "recorded"}
+NOT_ALONE |= {"recording", "none"}
 WITH_MEMORY = {"authors", "spline_memory"}
-OF_OTHER_ENVS = {
-    "bot",
-    "energy_pump",
-    "lander",
-    "linear_feedback",
-    "oscillator",
-    "swing_tip",
-    "swing_up",
-    "walker",
-}
+OF_OTHER_ENVS = {"bot", "energy_pump", "lander", "linear_feedback", "oscillator", "swing_tip"}
+OF_OTHER_ENVS |= {"swing_up", "walker"}
 
 
 @pytest.mark.fast(3)
-@pytest.mark.parametrize(
-    "guide", sorted({*shipped("guide")} - {"none", *NOT_ALONE, *OF_OTHER_ENVS})
-)
+@pytest.mark.parametrize("guide", sorted({*shipped("guide")} - NOT_ALONE - OF_OTHER_ENVS))
 def test_every_guide_acts_on_the_observations_of_the_env(guide):
     config = small(f"guide={guide}")
     (guide_module,), env = build_guides(config).values(), build_bare_env(config)
@@ -219,9 +201,6 @@ def test_the_view_of_the_agent_alone_is_late_behind_the_guides():
     assert kinds.index(GuideActions) < kinds.index(ObservationDelay)
 
 
-pytest.importorskip("gymnasium.envs.classic_control")
-
-
 def push(env, observation):
     """Push a cart where its pole leans to."""
     return int(observation[2] > 0)
@@ -247,13 +226,12 @@ def beside(env):
     return list(env.base_env.held.plants[0].controllers)
 
 
-def test_agent_without_a_guide_has_no_controllers():
-    assert beside(env_maker(composed_beside("method=ppo"))(2)) == []
-
-
-def test_agent_with_a_guide_has_the_one_that_its_guide_reads():
-    for method in ("coil", "coil_rfc", "kickstart"):
-        assert beside(env_maker(composed_beside(f"method={method}"))(2)) == ["leaning"]
+@pytest.mark.parametrize(
+    ("method", "kept"),
+    [("ppo", []), ("coil", ["leaning"]), ("coil_rfc", ["leaning"]), ("kickstart", ["leaning"])],
+)
+def test_agent_has_the_controllers_that_its_guide_reads(method, kept):
+    assert beside(env_maker(composed_beside(f"method={method}"))(2)) == kept
 
 
 def test_guide_alone_has_its_controllers_whatever_the_method():
@@ -310,12 +288,8 @@ class Gain:
 @pytest.fixture(scope="module")
 def proxies(tmp_path_factory):
     folder = tmp_path_factory.mktemp("distill")
-    config = composed_of_proxy(
-        "guide=[spline,constant]",
-        f"proxy.folder={folder / 'proxies'}",
-        f"run_dir={folder}",
-        name="distill",
-    )
+    words = ["guide=[spline,constant]", f"proxy.folder={folder / 'proxies'}", f"run_dir={folder}"]
+    config = composed_of_proxy(*words, name="distill")
     distill(config)
     return folder / "proxies"
 
@@ -371,68 +345,67 @@ def test_proxies_of_other_objects_are_other_ones():
     assert folder_of_proxy(one) == folder_of_proxy(Gain(1.0)) != folder_of_proxy(other)
 
 
-@pytest.mark.parametrize("code", ["class Mine:\n    def act(self, o):\n", "def Mine(o):\n"])
-def test_proxy_of_a_controller_is_another_one_after_a_change_of_its_code(
-    code, tmp_path, monkeypatch
-):
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    folders = []
-    for gain in (1.0, 1.0, 2.0):
-        (tmp_path / "changing.py").write_text(f"{code}        return [{gain} * o[0]]\n")
-        monkeypatch.delitem(sys.modules, "changing", raising=False)
-        folders.append(folder_of_proxy("changing:Mine"))
-    assert folders[0] == folders[1] != folders[2]
-
-
-PLANT = """
+CODE = """
 import gymnasium
 
 class Plant(gymnasium.Env):
     observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
     gain = {gain}
 
+class Controller:
+    def act(self, observation):
+        return [{gain} * observation[0]]
+
+def rule(observation):
+    return [{gain} * observation[0]]
+
 gymnasium.register("Changing-v0", Plant)
 """
+PLANT = "{_target_: changing.Plant, _partial_: true}"
 
 
-@pytest.mark.fast(2)
+@pytest.mark.fast(3)
 @pytest.mark.parametrize(
     "words",
     [
-        ["env.id=changing:Plant"],
-        ["env.id=changing:Changing-v0"],
-        ["env.id=Pendulum-v1", "+env.controllers.mine={_target_: changing.Plant, _partial_: true}"],
-        ["env.id=Pendulum-v1", "env.wrappers=[{_target_: changing.Plant, _partial_: true}]"],
+        ["env.id=changing:Plant", "guide=constant"],
+        ["env.id=changing:Changing-v0", "guide=constant"],
+        ["env.id=Pendulum-v1", f"+env.controllers.mine={PLANT}", "guide=constant"],
+        ["env.id=Pendulum-v1", f"env.wrappers=[{PLANT}]", "guide=constant"],
+        ["env.id=Pendulum-v1", "guide=controller", "guide.controller.of=changing:Controller"],
+        ["env.id=Pendulum-v1", "guide=controller", "guide.controller.of=changing:rule"],
     ],
-    ids=["class", "registered", "controller", "wrapper"],
+    ids=["class", "registered", "beside", "wrapper", "controller", "function"],
 )
-def test_proxy_in_an_env_is_another_one_after_a_change_of_its_code(words, tmp_path, monkeypatch):
+def test_proxy_is_another_one_after_a_change_of_the_code_that_it_imitates(
+    words, tmp_path, monkeypatch
+):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     folders = []
     for gain in (1.0, 1.0, 2.0):
-        (tmp_path / "changing.py").write_text(PLANT.format(gain=gain))
+        (tmp_path / "changing.py").write_text(CODE.format(gain=gain))
         monkeypatch.delitem(sys.modules, "changing", raising=False)
         monkeypatch.delitem(gymnasium.registry, "Changing-v0", raising=False)
-        given = ["env=gym", *words, "guide=constant", "method=dynamic_coil_sequential"]
-        config = composed(*given, "run_dir=unused")
-        folders.append(proxy_config(config, "constant").run_dir)
+        given = ["env=gym", *words, "method=dynamic_coil_sequential", "run_dir=unused"]
+        config = composed(*given)
+        folders.append(proxy_config(config, next(iter(config.guide))).run_dir)
     assert folders[0] == folders[1] != folders[2]
+
+
+def distilled(folder):
+    """Make the proxy of a constant guide, or find it."""
+    words = ["guide=constant", f"proxy.folder={folder}", f"run_dir={folder.parent}"]
+    distill(composed_of_proxy(*words, name="distill"))
 
 
 @pytest.mark.slow
 def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, capsys):
     folder = next(proxies.glob("constant_*"))
-    with (folder / "metrics.csv").open(newline="") as file:
-        *_, last = csv.DictReader(file)
-    assert float(last["learner/mse_training"]) < 0.01
-    assert float(last["learner/mse_ahead"]) < 0.01
-    distill(
-        composed_of_proxy(
-            "guide=constant", f"proxy.folder={proxies}", f"run_dir={proxies.parent}", name="distill"
-        )
-    )
+    last = METRICS.read(folder)[-1]
+    assert last["learner/mse_training"] < 0.01
+    assert last["learner/mse_ahead"] < 0.01
+    distilled(proxies)
     output = capsys.readouterr().out
     assert str(folder) in output
     assert "distill: made 0, found 1; the lowest mean reward is" in output
@@ -443,17 +416,10 @@ def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path, ca
     whole = next(proxies.glob("constant_*"))
     stopped = tmp_path / whole.name
     stopped.mkdir()
-    for name in (
-        "config.yaml",
-        "versions.json",
-        "guide_return.json",
-    ):  # before the first checkpoint
+    # Before the first checkpoint.
+    for name in ("config.yaml", "versions.json", "guide_return.json"):
         shutil.copy(whole / name, stopped)
-    distill(
-        composed_of_proxy(
-            "guide=constant", f"proxy.folder={tmp_path}", f"run_dir={tmp_path}", name="distill"
-        )
-    )
+    distilled(tmp_path)
     assert "distill: made 1, found 0;" in capsys.readouterr().out
     resumed = torch.load(stopped / "policy_last.pt", weights_only=True)
     for key, value in torch.load(whole / "policy_last.pt", weights_only=True).items():
@@ -469,43 +435,32 @@ def test_frames_of_a_proxy_are_whole_batches(asked, taken):
 
 @pytest.mark.slow
 def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
-    (tmp_path / "run").mkdir()
+    run = tmp_path / "run"
+    run.mkdir()
     overrides = [
-        "method=dynamic_coil_sequential",
-        "guide=[spline,zero]",
-        f"proxy.folder={proxies}",
-        "budget.frames=576",
-        "learner.epochs=1",
-        "learner.minibatches=2",
-        f"run_dir={tmp_path / 'run'}",
+        *("method=dynamic_coil_sequential", "guide=[spline,zero]", f"proxy.folder={proxies}"),
+        *("budget.frames=576", "learner.epochs=1", "learner.minibatches=2", f"run_dir={run}"),
     ]
     with pytest.raises(UserError, match="as the proxies of its guides take 512 frames"):
         check(composed_of_proxy(*overrides, "budget.frames=512"))
     config = composed_of_proxy(*overrides)
     check(config)
     train(config)
-    assert sorted(path.name for path in (tmp_path / "run" / "proxies").iterdir()) == [
-        "spline",
-        "zero",
-    ]
+    assert sorted(path.name for path in (run / "proxies").iterdir()) == ["spline", "zero"]
     assert len(list(proxies.glob("zero_*"))) == 1
-    used = [next(proxies.glob(f"{name}_*")) / "metrics.csv" for name in ("spline", "zero")]
-    taken = sum(METRICS.read(curve.parent)[-1]["frames"] for curve in used)
-    assert METRICS.read(tmp_path / "run")[0]["frames/before"] == taken
-    guides = load_guides(tmp_path / "run", config)
-    network, state = (
-        guides["spline"],
-        torch.load(next(proxies.glob("spline_*")) / "policy_last.pt", weights_only=True),
+    used = [next(proxies.glob(f"{name}_*")) for name in ("spline", "zero")]
+    assert METRICS.read(run)[0]["frames/before"] == sum(
+        METRICS.read(folder)[-1]["frames"] for folder in used
     )
+    network = load_guides(run, config)["spline"]
+    state = torch.load(used[0] / "policy_last.pt", weights_only=True)
     assert all(torch.equal(value, state[key]) for key, value in network.state_dict().items())
-    assert open_run(tmp_path / "run").policy()[0].names == ["spline", "zero"]
+    assert open_run(run).policy()[0].names == ["spline", "zero"]
 
 
 def test_degraded_advice_is_refused_for_guides_that_learn():
     config = composed_of_proxy("method=dynamic_coil_joint", "degrade=[noisy]", "run_dir=unused")
-    with pytest.raises(
-        UserError, match=r"degrade=\['noisy'\] has no effect on guides that are trained"
-    ):
+    with pytest.raises(UserError, match="has no effect on guides that are trained"):
         check(config)
 
 
@@ -514,9 +469,7 @@ def test_proxies_are_copied_whole_or_not_at_all(tmp_path):
     for made in (run, folder):
         made.mkdir()
     (folder / PROXIES).write_text("a file in their place")
-    with pytest.raises(
-        UserError, match="proxies is a file, but a folder is to be made there; remove it"
-    ):
+    with pytest.raises(UserError, match="proxies is a file, but a folder is to be made there"):
         copy_proxies({"guide": run}, folder)
     (folder / PROXIES).unlink()
     with pytest.raises(FileNotFoundError):

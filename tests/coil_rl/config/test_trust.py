@@ -44,6 +44,10 @@ CODE = """
 """.split()  # noqa: SIM905
 
 
+SHIPPED = {path.stem: yaml.safe_load(path.read_text()) for path in (CONF / "logger").iterdir()}
+NAMES = sorted(name for name, node in SHIPPED.items() if node)
+
+
 @pytest.fixture(autouse=True)
 def forget():
     yield
@@ -90,105 +94,48 @@ def no_import(name, *_):
     raise AssertionError(f"{name} was imported")
 
 
-@pytest.mark.fast(6)
-@pytest.mark.parametrize("target", CODE)
-def test_target_outside_the_list_is_refused_before_any_import(target, saved, tmp_path, monkeypatch):
+PATHS = ["os:system", "posix:system", "os.system", "builtins:eval", "coil_rl.files:os.system"]
+NAMING_CODE = [
+    *(("method.transforms.x._target_", target) for target in CODE),
+    *((key, path) for key in ("guide.theirs.of", "env.of") for path in PATHS),
+]
+
+
+@pytest.mark.fast(10)
+@pytest.mark.parametrize(("key", "name"), NAMING_CODE)
+def test_name_outside_the_list_is_refused_before_any_import(
+    key, name, saved, tmp_path, monkeypatch
+):
     modules = set(sys.modules)
     monkeypatch.setattr(hydra.utils, "get_object", no_import)
     monkeypatch.setattr(importlib, "import_module", no_import)
     with pytest.raises(UserError, match="could run code") as error:
-        read(tmp_path, changed(saved, "method.transforms.x", {"_target_": target, "a": 1}))
-    assert str(tmp_path / "config.yaml") in str(error.value)
-    assert "method.transforms.x._target_" in str(error.value)
-    assert target in str(error.value)
+        read(tmp_path, changed(saved, key, name))
+    assert f"{tmp_path / 'config.yaml'}: {key} names {name!r}" in str(error.value)
     assert set(sys.modules) == modules
 
 
-@pytest.mark.fast(4)
-@pytest.mark.parametrize(
-    "path", ["os:system", "posix:system", "os.system", "builtins:eval", "coil_rl.files:os.system"]
-)
-@pytest.mark.parametrize("key", ["guide.theirs.of", "env.of"])
-def test_controller_outside_the_list_is_refused_before_any_import(
-    key, path, saved, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(hydra.utils, "get_object", no_import)
-    monkeypatch.setattr(importlib, "import_module", no_import)
-    with pytest.raises(
-        UserError, match=rf"{key} names '.*', which is no part of a run and could run code"
-    ):
-        read(tmp_path, changed(saved, key, path))
-
-
 def test_gymnasium_env_of_a_module_is_refused_like_the_module(package, saved, tmp_path):
-    for env, message in (
-        ("os:x-v0", "no part of a run"),
-        ("their_package:Env-v0", r"trust=\[their_package\]"),
-    ):
-        with pytest.raises(UserError, match=message):
-            read(tmp_path, changed(saved, "env.id", env))
+    theirs = changed(saved, "env.id", "their_package:Env-v0")
+    with pytest.raises(UserError, match=r"trust=\[their_package\]"):
+        read(tmp_path, theirs)
     assert "their_package" not in sys.modules
     trust.trust_packages(["their_package"])
-    assert (
-        read(tmp_path, changed(saved, "env.id", "their_package:Env-v0")).env.id
-        == "their_package:Env-v0"
-    )
+    assert read(tmp_path, theirs).env.id == "their_package:Env-v0"
+    with pytest.raises(UserError, match="no part of a run"):
+        read(tmp_path, changed(saved, "env.id", "os:x-v0"))
     assert read(tmp_path, changed(saved, "env.id", "LunarLander-v3")).env.id == "LunarLander-v3"
 
 
-def test_controller_of_a_trusted_package_and_of_the_command_may_be_used(package, saved, tmp_path):
-    theirs = changed(
-        saved,
-        "guide.theirs",
-        {"_target_": "coil_rl.guides.ControllerGuide", "of": "their_package:TheirGuide"},
-    )
-    with pytest.raises(
-        UserError,
-        match=r"guide\.theirs\.of names .*; if you know .* allow it with trust=\[their_package\]",
-    ):
-        read(tmp_path, theirs)
-    assert "their_package" not in sys.modules
-    trust.trust_packages(
-        [], OmegaConf.create({"guide": {"mine": {"of": "their_package:TheirGuide"}}})
-    )
-    assert read(tmp_path, theirs).guide.theirs
-    trust.trust_packages(["their_package"])
-    assert read(tmp_path, theirs).guide.theirs
-    with pytest.raises(UserError, match="which is defined elsewhere"):
-        read(tmp_path, changed(theirs, "guide.theirs.of", "their_package:os.system"))
+KEYS = ["guide.spline", "env.reward", "track.test.deep.er", "logger", "watch.step.x"]
+KEYS += ["proxy.method.x", "preset.perception", "budget.x", "unknown.key", "label"]
 
 
-@pytest.mark.fast(4)
-@pytest.mark.parametrize(
-    "key",
-    [
-        "guide.spline",
-        "guide.other",
-        "env",
-        "env.reward",
-        "learner.x",
-        "track.train",
-        "track.test.deep.er",
-        "logger",
-        "evaluation.advice.x",
-        "evaluation.env.tracks",
-        "watch.step.x",
-        "proxy.learner",
-        "proxy.method.x",
-        "action",
-        "degrade.x",
-        "preset.perception",
-        "budget.x",
-        "unknown.key",
-        "label",
-    ],
-)
+@pytest.mark.fast(2)
+@pytest.mark.parametrize("key", KEYS)
 def test_target_is_refused_wherever_it_is(key, saved, tmp_path):
     for value in ({"_target_": "os.system"}, [[1, {"deep": [{"_target_": "os.system"}]}]]):
-        with pytest.raises(
-            UserError,
-            match=r"config\.yaml: .*_target_ names 'os\.system', which is no part of a run",
-        ):
+        with pytest.raises(UserError, match=r"_target_ names 'os\.system', which is no part of a"):
             read(tmp_path, changed(saved, key, value))
 
 
@@ -196,28 +143,12 @@ def test_target_is_refused_wherever_it_is(key, saved, tmp_path):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        (
-            "env.x",
-            {"_target_": ["os.system"]},
-            r"names \['os.system'\], which is not the full name of a class",
-        ),
-        (
-            "env.x",
-            {"_target_": {"_target_": "os.system"}},
-            "names {.*}, which is not the full name of a class",
-        ),
+        ("env.x", {"_target_": ["os.system"]}, "which is not the full name of a class"),
+        ("env.x", {"_target_": {"_target_": "os.system"}}, "which is not the full name of a"),
         ("env.x", {"_target_": "${label}"}, "which is not the full name of a class"),
         ("env.x", {"_target_": None}, "names None, which is not the full name of a class"),
-        (
-            "env.x",
-            {"_target_": "my_package.Part"},
-            r'trust=\[my_package\] on the command line, or trust=\["my_package"\] in Python$',
-        ),
-        (
-            "env.x",
-            {"_target_": "coil_rl.guides.SplinGuide"},
-            "did you mean coil_rl.guides.SplineGuide",
-        ),
+        ("env.x", {"_target_": "my_package.Part"}, r'or trust=\["my_package"\] in Python$'),
+        ("env.x", {"_target_": "coil_rl.guides.SplinGuide"}, "mean coil_rl.guides.SplineGuide"),
         ("env.x", {"_args_": ["x"]}, "_args_ is not a key of a run's configuration"),
         ("env.x", {"_recursive_": False}, "_recursive_ is not a key"),
         ("env.x", {"_convert_": "none"}, "_convert_ is not a key"),
@@ -226,11 +157,7 @@ def test_target_is_refused_wherever_it_is(key, saved, tmp_path):
         ("logger", {"x": "${oc.env:HOME}"}, "is a reference"),
         ("logger", {"x": "${logger.exp_name}"}, "is a reference"),
         ("logger", {"x": "a ${${label}}"}, "is a reference"),
-        (
-            "env.x",
-            {"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "a"},
-            "could run code",
-        ),
+        ("env.x", {"_target_": "torchrl.record.loggers.CSVLogger"}, "could run code"),
         ("guide", {"../../x": {}}, "must not contain / or"),
         ("label", "../../x", "label must not contain / or"),
     ],
@@ -248,34 +175,21 @@ def test_run_with_a_logger_of_its_own_is_evaluated_without_it(saved, tmp_path):
 
 
 def test_shipped_logger_writes_only_where_it_is_shipped_to_write(saved, tmp_path):
-    for key, value in (
-        ("log_dir", "/tmp/elsewhere"),
-        ("exp_name", "../x"),
-        ("x", {"_target_": "os.system"}),
-    ):
-        config = read(tmp_path, changed(saved, f"logger.{key}", value))
-        assert OmegaConf.to_container(config.logger) == {
-            "_target_": "torchrl.record.loggers.TensorboardLogger",
-            "exp_name": "tensorboard",
-            "log_dir": "${run_dir}",
-        }
+    theirs = changed(saved, "logger.log_dir", "/tmp/elsewhere")
+    assert read(tmp_path, theirs).logger == OmegaConf.create(SHIPPED["tensorboard"])
+
+
+NINEFOLD = [f"a{n + 1}: &a{n + 1} [{', '.join([f'*a{n}'] * 9)}]" for n in range(30)]
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("a: &a [1, 1]\nb: *a\n", r"repeats a part of itself by \*a"),
-        (
-            "a0: &a0 [x]\n"
-            + "".join(f"a{n + 1}: &a{n + 1} [{', '.join([f'*a{n}'] * 9)}]\n" for n in range(30)),
-            "repeats",
-        ),
+        ("\n".join(["a0: &a0 [x]", *NINEFOLD]), "repeats"),
         ("a: &a\n  b: *a\n", "repeats a part of itself"),
         ("a: " + "[" * 5000 + "]" * 5000, "has more than 32 levels"),
-        (
-            "a: " + "x" * 200_000,
-            r"is not the configuration of a run \(it has more than 200,000 bytes\)",
-        ),
+        ("a: " + "x" * 200_000, r"is not the configuration of a run \(it has more than 200,000"),
         ("a: !!python/object/apply:os.system [ls]\n", "is not the configuration of a run"),
         ("label: " + "9" * 5000, "is not the configuration of a run"),
     ],
@@ -287,18 +201,12 @@ def test_file_that_no_run_writes_is_refused(text, message, tmp_path):
     assert str(tmp_path / "config.yaml") in str(error.value)
 
 
-GROUPS = (
-    "guide",
-    "degrade",
-    "learner",
-    "logger",
-    "method",
-    "track",
-    "action",
-    "preset",
-)  # of the cone world
-MISSING = ["+track.dir=levels", "+guide.learned.run=other", "+guide.exported.file=a"]
-MISSING += [
+# Of the cone world.
+GROUPS = ("guide", "degrade", "learner", "logger", "method", "track", "action", "preset")
+MISSING = [
+    "+track.dir=levels",
+    "+guide.learned.run=other",
+    "+guide.exported.file=a",
     "+guide.pid.measured=observation",
     "+guide.controller.of=coil_rl.guides:SplineGuide",
     "+guide.recorded.file=a.csv",
@@ -311,17 +219,13 @@ OF_ENV = {
 }
 
 
-def files(group):
-    return shipped(group)
-
-
 @pytest.mark.slow
 def test_every_choice_of_the_configuration_can_be_saved_and_read(tmp_path, monkeypatch):
     monkeypatch.setattr(run_folder, "versions", dict)
     monkeypatch.setattr(trust, "_packages", frozenset({"coil_fmu"}))  # an FMU is a program
-    columns = [[f"{group}={name}" for name in files(group)] for group in GROUPS]
+    columns = [[f"{group}={name}" for name in shipped(group)] for group in GROUPS]
     choices = [[*filter(None, row), *MISSING] for row in zip_longest(*columns)]
-    choices += [[f"env={name}", *OF_ENV.get(name, [])] for name in files("env")]
+    choices += [[f"env={name}", *OF_ENV.get(name, [])] for name in shipped("env")]
     for number, overrides in enumerate(choices):
         begun(tmp_path / str(number), *overrides)
         assert read_config(tmp_path / str(number), "run").label
@@ -358,28 +262,40 @@ def with_target(saved, target, **others):
     return changed(saved | others, "guide.theirs", {"_target_": target})
 
 
-@pytest.mark.slow
-def test_trusted_package_may_be_used_and_nothing_that_it_imports(package, saved, tmp_path):
-    theirs = with_target(saved, "their_package.TheirGuide")
-    with pytest.raises(UserError, match=r"trust=\[their_package\]"):
+def with_controller(saved, path):
+    theirs = {"_target_": "coil_rl.guides.ControllerGuide", "of": path}
+    return changed(saved, "guide.theirs", theirs)
+
+
+@pytest.mark.parametrize(("naming", "sep"), [(with_target, "."), (with_controller, ":")])
+def test_trusted_package_may_be_used_and_nothing_that_it_imports(
+    naming, sep, package, saved, tmp_path
+):
+    theirs = naming(saved, f"their_package{sep}TheirGuide")
+    with pytest.raises(UserError, match=r"allow it with trust=\[their_package\]"):
         read(tmp_path, theirs)
     assert "their_package" not in sys.modules
     trust.trust_packages(["their_package"])
-    assert read(tmp_path, theirs).guide.theirs._target_ == "their_package.TheirGuide"
-    for target in (
-        "their_package.os.system",
-        "their_package.ZeroGuide",
-        "their_package.TheirGuide.__init__.__globals__",
-    ):
+    assert read(tmp_path, theirs).guide.theirs
+    for name in ("os.system", "ZeroGuide", "TheirGuide.__init__.__globals__"):
         with pytest.raises(UserError, match="which is defined elsewhere"):
-            read(tmp_path, with_target(saved, target))
+            read(tmp_path, naming(saved, f"their_package{sep}{name}"))
     with pytest.raises(UserError, match="which their_package does not have"):
-        read(tmp_path, with_target(saved, "their_package.Missing"))
-    with pytest.raises(UserError, match=r"'their_package2\.TheirGuide', which could run code"):
-        read(tmp_path, with_target(saved, "their_package2.TheirGuide"))
+        read(tmp_path, naming(saved, f"their_package{sep}Missing"))
+    with pytest.raises(UserError, match="which could run code"):
+        read(tmp_path, naming(saved, f"their_package2{sep}TheirGuide"))
     trust.trust_packages([])
     with pytest.raises(UserError, match=r"trust=\[their_package\]"):
         read(tmp_path, theirs)
+
+
+@pytest.mark.parametrize(("naming", "sep"), [(with_target, "."), (with_controller, ":")])
+def test_what_the_command_itself_names_is_trusted_in_folders(naming, sep, package, saved, tmp_path):
+    theirs = naming(saved, f"their_package{sep}TheirGuide")
+    trust.trust_packages([], OmegaConf.create({"guide": theirs["guide"]}))
+    assert read(tmp_path, theirs).guide.theirs
+    with pytest.raises(UserError, match=r"trust=\[their_package\]"):
+        read(tmp_path, naming(saved, f"their_package{sep}Other"))
 
 
 def test_folder_cannot_grant_itself_trust_and_a_run_does_not_save_it(package, saved, tmp_path):
@@ -400,28 +316,14 @@ def test_installed_package_with_an_entry_point_is_trusted(package, saved, tmp_pa
         read(tmp_path, with_target(saved, "os.system"))
 
 
-def test_what_the_command_itself_names_is_trusted_in_folders(package, saved, tmp_path):
-    theirs = with_target(saved, "their_package.TheirGuide")
-    trust.trust_packages(
-        [], OmegaConf.create({"guide": {"theirs": {"_target_": "their_package.TheirGuide"}}})
-    )
-    assert read(tmp_path, theirs).guide.theirs
-    with pytest.raises(UserError, match=r"trust=\[their_package\]"):
-        read(tmp_path, with_target(saved, "their_package.Other"))
-
-
 @pytest.mark.parametrize("name", ["os", "builtins", "torch", "hydra", "coil_rl"])
 def test_package_that_runs_any_code_is_never_trusted(name):
-    with pytest.raises(
-        UserError, match=rf"trust=\[{name}\] cannot be: functions of {name} run any code"
-    ):
+    with pytest.raises(UserError, match=rf"functions of {name} run any code"):
         trust.trust_packages([name])
 
 
 def test_trust_is_a_list_of_packages():
-    with pytest.raises(
-        UserError, match=r"trust=\[a.b\] must be a list of names of installed packages"
-    ):
+    with pytest.raises(UserError, match=r"trust=\[a.b\] must be a list of names of installed"):
         trust.trust_packages(["a.b"])
 
 
@@ -454,18 +356,10 @@ def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatc
         train.resume(folder)
 
 
-SHIPPED = {path.stem: yaml.safe_load(path.read_text()) for path in (CONF / "logger").iterdir()}
-NAMES = sorted(name for name, node in SHIPPED.items() if node)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_shipped_logger_is_taken_by_its_class(name):
     assert shipped_logger({"_target_": SHIPPED[name]["_target_"]}) == SHIPPED[name]
     assert shipped_logger(SHIPPED[name]) == SHIPPED[name]
-
-
-def test_five_loggers_are_shipped():
-    assert NAMES == ["csv", "mlflow", "tensorboard", "trackio", "wandb"]
 
 
 def test_plain_names_and_flags_of_a_folder_are_kept():
@@ -497,16 +391,7 @@ def test_nothing_else_of_a_folder_is_taken(name, key, value):
 
 @pytest.mark.parametrize(
     "node",
-    [
-        None,
-        "wandb",
-        [],
-        {},
-        {"_target_": None},
-        {"_target_": ["os.system"]},
-        {"_target_": "os.system"},
-        {"_target_": "torchrl.record.loggers.get_logger"},
-    ],
+    [None, "wandb", {}, {"_target_": None}, {"_target_": ["os.system"]}, {"_target_": "os.system"}],
 )
 def test_what_is_not_shipped_is_none_of_them(node):
     assert shipped_logger(node) is None
