@@ -1,4 +1,4 @@
-"""Envs and controllers of other people, each with something unusual, for `test_odd_words.py`."""
+"""Envs and controllers of other people, each with something unusual."""
 
 import gymnasium
 import numpy as np
@@ -33,6 +33,7 @@ SPACES = {
     "scalar": spaces.Box(0, 10, ()),
     "from5": spaces.Discrete(3, start=5),
     "half_floats": spaces.Box(-1, 1, (1,), np.float16),
+    "switches": spaces.MultiBinary(3),
 }
 
 
@@ -61,3 +62,7 @@ def six(observation):
 
 def far(observation):
     return np.array([5e6])
+
+
+def on(observation):
+    return np.array([1, 0, 1])

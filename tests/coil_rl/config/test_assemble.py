@@ -12,7 +12,7 @@ from torchrl.data import Bounded, Categorical, Unbounded
 from coil_rl.config.assemble import LONGEST_CHAIN, LearnedGuide, assemble
 from coil_rl.config.compose import compose_train
 from coil_rl.config.folder import holds
-from coil_rl.config.parts import build_guides, env_maker
+from coil_rl.config.parts import env_maker
 from coil_rl.config.python import open_run
 from coil_rl.envs import McapReplayEnv
 from coil_rl.errors import UserError
@@ -32,17 +32,23 @@ def run(request, tmp_path_factory):
     )
 
 
-@pytest.mark.slow
-def test_guide_drives_as_the_policy_in_its_own_env(run):
+def rewards(env, policy):
+    return [row["reward"] for row in evaluate_policy(env, policy).episodes]
+
+
+def rewards_of_both(run, *words):
+    """Return the rewards of a policy in the env of its run, and as a guide in an env of words."""
     opened = open_run(run)
     env = opened.make_env(3, "evaluation", count=3)
-    policy = evaluate_policy(env, opened.policy(env))
-    guided = composed(
-        *ONE_SECOND, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
-    )
-    guided_env = env_maker(guided)(3, "evaluation", count=3)
-    learned = evaluate_policy(guided_env, build_guides(guided)["learned"])
-    assert [row["reward"] for row in learned.episodes] == [row["reward"] for row in policy.episodes]
+    guided = ["method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"]
+    as_guide = env_maker(composed(*words, *guided)).guided(3, "evaluation", count=3)
+    return rewards(env, opened.policy(env)), rewards(*as_guide)
+
+
+@pytest.mark.slow
+def test_guide_drives_as_the_policy_in_its_own_env(run):
+    own, as_guide = rewards_of_both(run, *ONE_SECOND)
+    assert as_guide == own
 
 
 @pytest.mark.slow
@@ -52,9 +58,8 @@ def test_guide_is_deterministic_and_advises_another_agent(run):
     check_guide(guide, data, tolerance=1e-6)
     assert not any(p.requires_grad for p in guide.parameters())
     assert set(guide(data.select(*guide.in_keys)).keys()) == {*guide.in_keys, "action"}
-    config = composed(
-        *ONE_SECOND, "method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
-    )
+    learned = ["method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"]
+    config = composed(*ONE_SECOND, *learned)
     step = env_maker(config)().rollout(5, break_when_any_done=False)[:, -1]
     # Not to the bit: some processors round other numbers of rows differently.
     expected = guide(step.clone())["action"]
@@ -63,36 +68,22 @@ def test_guide_is_deterministic_and_advises_another_agent(run):
 
 def test_run_without_an_agent_is_refused(tmp_path):
     run = make_untrained_run(tmp_path / "guide", *ONE_SECOND, "method=guide")
-    with pytest.raises(
-        ValueError, match="trained no agent: its method is guide; name its guide instead"
-    ):
+    with pytest.raises(ValueError, match="trained no agent: its method is guide"):
         LearnedGuide(str(run))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
-    [
-        ["guide=recorded", "method=coil"],
-        ["guide=spline_memory", "method=coil"],
-        ["network=gru"],
-    ],
+    [["guide=recorded", "method=coil"], ["guide=spline_memory", "method=coil"], ["network=gru"]],
 )
 def test_policy_with_a_past_acts_as_in_its_own_env(options, tmp_path):
     (tmp_path / "actions.csv").write_text("0.1\n0.2\n-0.3\n")
     if "guide=recorded" in options:
         options = [*options, f"guide.recorded.file={tmp_path / 'actions.csv'}"]
     run = make_untrained_run(tmp_path / "run", *ONE_SECOND, "learner.action_gain=3", *options)
-    opened = open_run(run)
-    env = opened.make_env(3, "evaluation", count=3)
-    policy = evaluate_policy(env, opened.policy(env))
-    guided = composed(
-        *ONE_SECOND, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
-    )
-    learned = evaluate_policy(*env_maker(guided).guided(3, "evaluation", count=3))
-    assert [row["reward"] for row in learned.episodes] == pytest.approx(
-        [row["reward"] for row in policy.episodes], abs=1e-5
-    )
+    own, as_guide = rewards_of_both(run, *ONE_SECOND)
+    assert as_guide == pytest.approx(own, abs=1e-5)
 
 
 def guided_by(run, guide):
@@ -124,14 +115,8 @@ def test_policy_that_observes_its_last_actions_acts_as_in_its_own_env(env_id, tm
     own = ["method=ppo", "+transform=last_action", "method.observes=[last_action]"]
     own.append("method.transforms.last_action.steps=2")
     run = make_untrained_run(tmp_path / "run", *words, *own, "learner.action_gain=3")
-    opened = open_run(run)
-    env = opened.make_env(2, "evaluation", count=2)
-    policy = evaluate_policy(env, opened.policy(env))
-    learned = ["method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"]
-    guided = env_maker(composed(*words, *learned)).guided(2, "evaluation", count=2)
-    assert [row["reward"] for row in evaluate_policy(*guided).episodes] == pytest.approx(
-        [row["reward"] for row in policy.episodes], rel=1e-5
-    )
+    own, as_guide = rewards_of_both(run, *words)
+    assert as_guide == pytest.approx(own, rel=1e-5)
 
 
 def test_env_with_another_action_is_refused(tmp_path):
@@ -190,14 +175,14 @@ def test_tracks_of_the_training_are_not_needed(replay, tmp_path):
     assert acts(run, replay)["action"].shape == (6, 1)
 
 
+TASKS = ["method=ppo", "env=driving_tasks", "observes=[observation,task]"]
+
+
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
         (["method=guide"], "has no agent: its guide drives alone; give that guide instead"),
-        (
-            ["method=ppo", "env=driving_tasks", "observes=[observation,task]"],
-            "the env has no entry task to observe",
-        ),
+        (TASKS, "the env has no entry task to observe"),
     ],
 )
 def test_run_that_cannot_act_in_the_env_is_refused_with_its_folder(

@@ -3,12 +3,10 @@
 import logging
 import warnings
 
-import gymnasium
 import numpy as np
 import odd_parts
 import pytest
 import torch
-from gymnasium import spaces
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from programs import SHORT_LAP, called, composed, shipped
@@ -30,42 +28,25 @@ WITH_CHOICES = (
 OTHERS = ("guide", "coil_multi", "tune")
 
 
-class Switches(gymnasium.Env):
-    """Three switches are set at once, for five steps."""
-
-    observation_space = spaces.Box(-1, 1, (2,))
-    action_space = spaces.MultiBinary(3)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return self.np_random.uniform(-1, 1, 2).astype(np.float32), {}
-
-    def step(self, action):
-        self.steps += 1
-        observation = self.np_random.uniform(-1, 1, 2).astype(np.float32)
-        return observation, float(np.sum(action)), False, self.steps >= 5, {}
+SMALL = ["evaluation.cases=2", "evaluation.curve.num_envs=2", "logger=none"]
 
 
-def on(observation):
-    return np.array([1, 0, 1])
-
-
-def checked(method, tmp_path, *words):
-    env = ["env=gym", f"env.id={__name__}:Switches", "evaluation.cases=2"]
-    guide = ["guide=controller", f"guide.controller.of={__name__}:on"]
-    check(composed(*env, *guide, f"method={method}", f"run_dir={tmp_path}", *words))
+def check_switches(method, folder):
+    """Check a run of a method in an env whose actions are several switches."""
+    env = ["env=gym", "env.id=odd_parts:Acts", "+env.options.space=switches", *SMALL]
+    guide = ["guide=controller", "guide.controller.of=odd_parts:on"]
+    check(composed(*env, *guide, f"method={method}", f"run_dir={folder}"))
 
 
 @pytest.mark.fast(2)
 @pytest.mark.parametrize("method", sorted({*METHODS} - {*OTHERS}))
 def test_method_takes_choices_or_is_refused_with_those_that_do(method, tmp_path):
     if method in WITH_CHOICES:
-        checked(method, tmp_path)
+        check_switches(method, tmp_path)
         return
     message = r" needs continuous actions, but this env .* method=coil_anchored"
     with pytest.raises(UserError, match=message):
-        checked(method, tmp_path)
+        check_switches(method, tmp_path)
 
 
 def unread(*words):
@@ -153,7 +134,6 @@ def test_words_from_python_are_read_too(tmp_path):
     assert not folder.exists()
 
 
-SMALL = ["evaluation.cases=2", "evaluation.curve.num_envs=2", "logger=none"]
 WORDS = [  # of a run of PPO in env=gym env.id=odd_parts:Plain
     ("guide=controller guide.controller.of=odd_parts:firts", "did you mean first?"),
     ("env.id=", "env.id is empty; write env.id=MODULE:NAME"),

@@ -80,11 +80,7 @@ Part.__module__ = "coil_rl.part"  # only classes of this project are known to pa
         ({}, (), r"part: Part needs needed; give part\.needed=VALUE"),
         ({"needed": 1, "scal": 1}, (), "Part takes no scal; it takes own, .*; did you mean scale?"),
         ({"needed": 1}, ("needed",), "needed of Part is set by the program; leave it out"),
-        (
-            {"table": {"a": 1, "b": "x"}},
-            ("needed",),
-            r"^part\.table\.b='x' must be a valid number$",
-        ),
+        ({"table": {"b": "x"}}, ("needed",), r"^part\.table\.b='x' must be a valid number$"),
         ({"own": [1, "x"]}, ("needed",), r"^part\.own\[1\]='x' must be a valid integer$"),
         ({"needed": 1, "_args_": [1]}, (), "Part takes no _args_"),
     ],
@@ -99,7 +95,11 @@ def test_arguments_without_annotations_are_not_checked():
     check_arguments(dict, {"anything": 1}, "part")
 
 
-WRAPPERS = "gymnasium.wrappers."
+def wrapped(wrapper, arguments):
+    """Return an env in a wrapper of Gymnasium, built from nodes."""
+    node = {"_target_": f"gymnasium.wrappers.{wrapper}", "_partial_": True, **arguments}
+    env = {"_target_": "coil_rl.GymnasiumEnv", "id": "Pendulum-v1", "wrappers": [node]}
+    return build(env, "env")
 
 
 @pytest.mark.parametrize(
@@ -110,20 +110,14 @@ WRAPPERS = "gymnasium.wrappers."
         ("ClipReward", {"min_reward": -1, "max_reward": 0}, [3]),
         ("FrameStackObservation", {"stack_size": 2, "padding_type": "zero"}, [2, 3]),
         ("ReshapeObservation", {"shape": [3, 1]}, [3, 1]),
-        ("TimeLimit", {"max_episode_steps": 7}, [3]),
         ("DtypeObservation", {"dtype": "float64"}, [3]),
-        ("DiscretizeAction", {"bins": [5]}, [3]),
         ("DiscretizeObservation", {"bins": [2, 2, 2]}, [8]),
-        ("TimeAwareObservation", {}, [4]),
         ("RepeatAction", {"num_repeats": 2}, [3]),
     ],
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_wrappers_of_gymnasium_are_used_from_yaml(wrapper, arguments, shape):
-    node = {"_target_": WRAPPERS + wrapper, "_partial_": True, **arguments}
-    env = {"_target_": "coil_rl.GymnasiumEnv", "id": "Pendulum-v1", "wrappers": [node]}
-    built = build(env, "env")
-    assert list(built.rollout(3)["observation"].shape[2:]) == shape
+    assert list(wrapped(wrapper, arguments).rollout(3)["observation"].shape[2:]) == shape
 
 
 @pytest.mark.parametrize(
@@ -140,10 +134,8 @@ def test_wrappers_of_gymnasium_are_used_from_yaml(wrapper, arguments, shape):
     ],
 )
 def test_wrapper_that_cannot_be_is_refused_in_one_sentence(wrapper, arguments, message):
-    node = {"_target_": WRAPPERS + wrapper, "_partial_": True, **arguments}
-    env = {"_target_": "coil_rl.GymnasiumEnv", "id": "Pendulum-v1", "wrappers": [node]}
     with pytest.raises(UserError, match=message):
-        build(env, "env")
+        wrapped(wrapper, arguments)
 
 
 class Thing:

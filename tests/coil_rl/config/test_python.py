@@ -179,30 +179,33 @@ def test_controller_as_a_guide_is_the_policy_that_was_asked_for(tmp_path):
     assert actions[0] == actions[2] != actions[1]
 
 
+@pytest.fixture
+def alone(tmp_path):
+    """Return a run of a guide alone that has not begun."""
+    return coil_rl.prepare(ENV, guide=proportional, method="guide", folder=tmp_path / "run")
+
+
 @pytest.mark.fast(2)
 @pytest.mark.parametrize("number", [0, -1, 2.5, True, "3"])
-def test_number_that_is_none_is_refused_by_its_name(number, tmp_path):
-    run = coil_rl.prepare(ENV, guide=proportional, method="guide", folder=tmp_path / "run")
-    for argument, use in {"cases": run.evaluate, "frames": run.train}.items():
+def test_number_that_is_none_is_refused_by_its_name(number, alone):
+    for argument, use in {"cases": alone.evaluate, "frames": alone.train}.items():
         with pytest.raises(UserError, match=rf"^{argument}={number!r} must be a whole number of"):
             use(**{argument: number})
-    assert not (run.folder / "config.yaml").exists()
+    assert not (alone.folder / "config.yaml").exists()
 
 
-def test_other_name_of_a_policy_is_refused(tmp_path):
-    run = coil_rl.prepare(ENV, guide=proportional, method="guide", folder=tmp_path / "run")
+def test_other_name_of_a_policy_is_refused(alone):
     with pytest.raises(UserError, match="which='best' must be handed_over or last; with del"):
-        run.controller("best")
+        alone.controller("best")
 
 
 @pytest.mark.parametrize(
     "others", [{"seed": 5}, {"method": "ppo"}, {"folder": "x"}, {"overrides": ["learner.gamma=1"]}]
 )
-def test_run_is_trained_as_it_is(others, tmp_path):
-    run = coil_rl.prepare(ENV, guide=proportional, method="guide", folder=tmp_path / "run")
+def test_run_is_trained_as_it_is(others, alone):
     with pytest.raises(UserError, match=f"^{next(iter(others))}: a Run is trained as it is"):
-        coil_rl.train(run, frames=32, **others)
-    assert not (run.folder / "config.yaml").exists()
+        coil_rl.train(alone, frames=32, **others)
+    assert not (alone.folder / "config.yaml").exists()
 
 
 @pytest.mark.slow
