@@ -3,9 +3,8 @@
 from importlib.util import find_spec
 
 import pytest
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from programs import CONFS, TINY_SWEEP, shipped_file
+from programs import CONFS, TINY_SWEEP, composed, shipped_file
 
 from coil_rl.config.check import check
 from coil_rl.programs.train import train
@@ -48,8 +47,7 @@ def first(experiment, run_dir):
         chosen = [word for word in chosen if not word.startswith("+arm")] + ["+arm=intact"]
     if not with_tracks(experiment):
         tiny = [word for word in TINY_SWEEP if not word.startswith(OF_TRACKS)]
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return compose("train", [f"+experiment={experiment}", *chosen, *tiny, f"run_dir={run_dir}"])
+    return composed(f"+experiment={experiment}", *chosen, *tiny, f"run_dir={run_dir}")
 
 
 @pytest.mark.fast(1)

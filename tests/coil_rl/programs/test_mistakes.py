@@ -10,11 +10,10 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from programs import called, command, environment
+from programs import called, command, composed, environment
 from run_folders import make_untrained_run
 
 import coil_rl.run.run  # noqa: F401  before `started` replaces functions that it imports
@@ -31,6 +30,7 @@ TINY = [
     "track.train.count=1",
     "track.test.count=1",
 ]
+ERRORS = (UserError, OmegaConfBaseException, HydraException, ValueError, OSError, AssertionError)
 
 
 @pytest.fixture
@@ -109,19 +109,8 @@ def refusal(name, *arguments):
 )
 def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, message):
     monkeypatch.chdir(tmp_path)
-    errors = (
-        UserError,
-        OmegaConfBaseException,
-        HydraException,
-        ValueError,
-        OSError,
-        AssertionError,
-    )
-    with (
-        initialize_config_module("coil_rl.conf", version_base="1.3"),
-        pytest.raises(errors) as caught,
-    ):
-        check(compose("train", [*TINY, "run_dir=run", *arguments.split()]))
+    with pytest.raises(ERRORS) as caught:
+        check(composed(*TINY, "run_dir=run", *arguments.split()))
     text = sentence(caught.value)
     assert message in text
     assert len(text.splitlines()) == 1
@@ -356,7 +345,5 @@ def test_folder_in_place_of_a_file_is_named(tmp_path):
 def test_warning_is_one_line_of_the_program(monkeypatch):
     monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
     with app.program("replay"):
-        assert (
-            warnings.formatwarning("a topic is ignored", UserWarning, "reading.py", 189)
-            == "replay: a topic is ignored\n"
-        )
+        said = warnings.formatwarning("a topic is ignored", UserWarning, "reading.py", 189)
+    assert said == "replay: a topic is ignored\n"

@@ -3,20 +3,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from programs import TINY, called, program
+from programs import TINY, called
 from run_folders import driven, make_run, make_sweep
 
-FILES = {
-    "report.md",
-    "report.html",
-    "report.csv",
-    "report_cases.csv",
-    "report.png",
-    "report_curves.png",
-    "report_cases.png",
-    "report_curves.csv",
-    "report.tex",
-}
+KINDS = ("", "_cases", "_curves")
+FILES = {f"report{kind}.{end}" for kind in KINDS for end in ("csv", "png")}
+FILES |= {"report.md", "report.html", "report.tex"}
 
 
 @pytest.fixture
@@ -55,9 +47,8 @@ def test_report_prints_the_page_and_writes_its_files_again_and_again(sweep):
     assert tables.count(r"\bottomrule") == 3
     assert r"0\% to 71\%" in tables
     assert report("folder=sweep", "figures=pdf") == (code, out, error)
-    assert {path for path in all_files() - after if path.endswith("pdf")} == {
-        f"sweep/report{kind}.pdf" for kind in ("", "_cases", "_curves")
-    }
+    pictures = {path for path in all_files() - after if path.endswith("pdf")}
+    assert pictures == {f"sweep/report{kind}.pdf" for kind in KINDS}
 
 
 @pytest.mark.parametrize(
@@ -75,20 +66,17 @@ def test_folder_of_hydra_is_refused_where_files_go_elsewhere(sweep, name, argume
 @pytest.mark.slow
 def test_files_have_full_precision(sweep):
     report("folder=sweep", "actions=both")
-    rows = {
-        (row["actions"], row["driver"], row["advice"]): row
-        for row in read_csv(sweep / "report.csv")
-    }
+    rows = read_csv(sweep / "report.csv")
     assert len(rows) == 7
-    coil = rows["deterministic", "coil", ""]
+    (coil,) = [
+        row
+        for row in rows
+        if (row["actions"], row["driver"], row["advice"]) == ("deterministic", "coil", "")
+    ]
     assert float(coil["reward"]) == pytest.approx(571)
     assert float(coil["low"]) < 571 < float(coil["high"])
-    assert (coil["better"], coil["needs_guide"], coil["guide"], coil["seeds"]) == (
-        "1.0",
-        "True",
-        "guide",
-        "3",
-    )
+    said = [coil[name] for name in ("better", "needs_guide", "guide", "seeds")]
+    assert said == ["1.0", "True", "guide", "3"]
     cases = {
         tuple(row.values())[1:6]: row["reward"] for row in read_csv(sweep / "report_cases.csv")
     }
@@ -109,10 +97,8 @@ def test_several_folders_make_one_report_in_the_first(sweep):
     assert not FILES & {file.name for file in sweep.iterdir()}
     (make_run(Path("guides/zero"), "zero", 0, rows[:3], needs_guide=None) / "metrics.csv").unlink()
     assert report("folder=guides", "against=guide")[0] == 0
-    assert {file.name for file in Path("guides").iterdir()} == FILES - {
-        "report_curves.png",
-        "report_cases.png",
-    } | {"zero"}
+    pictures = {"report_curves.png", "report_cases.png"}
+    assert {file.name for file in Path("guides").iterdir()} == FILES - pictures | {"zero"}
 
 
 @pytest.mark.slow
@@ -124,7 +110,6 @@ def test_page_says_that_a_guide_changed_and_that_no_seed_is_in_common(monkeypatc
     out = report("folder=runs", "against=ppo")[1]
     assert "No seed in common with ppo: coil." in out
     assert "runs of the same configuration (ppo seeds 0 / 1)" in out
-    assert "No seed in common" not in report("folder=runs")[1]
 
 
 @pytest.mark.parametrize(
@@ -135,18 +120,11 @@ def test_page_says_that_a_guide_changed_and_that_no_seed_is_in_common(monkeypatc
         ("folder=empty", "folder=empty holds no run of coil-train"),
         ("folder=[]", "folder=[] must be a folder, or a list of them"),
         ("folder=[sweep,3]", "must be a folder, or a list of them"),
-        (
-            "folder=[sweep/6_coil,sweep/7_ppo]",
-            "is finished; continue one with coil-train resume=sweep/6_coil",
-        ),
+        ("folder=[sweep/6_coil,sweep/7_ppo]", "continue one with coil-train resume=sweep/6_coil"),
         ("folder=sweep against=pop", "there are coil, ppo, guide; did you mean ppo?"),
-        (
-            "folder=sweep actions=sample",
-            "actions='sample' must be 'deterministic', 'sampled' or 'both'",
-        ),
+        ("folder=sweep actions=sample", "must be 'deterministic', 'sampled' or 'both'"),
         ("foldr=sweep", "no key foldr; the configuration has folder, actions, against"),
         ("-m folder=sweep,empty", "leave out -m"),
-        ("folder=sweep,empty", "Ambiguous value for argument 'folder=sweep,empty'"),
         ("folder=damaged", "damaged/evaluation.csv is damaged ("),
     ],
 )
@@ -163,27 +141,24 @@ def test_mistakes_are_one_sentence_with_exit_code_2_and_leave_no_file(arguments,
     assert all_files() == before
 
 
+def is_mean(row):
+    return row["case"] == "mean" and not row["advice"]
+
+
 @pytest.mark.slow
 def test_report_reads_the_runs_of_coil_train(tmp_path):
     sweep = ["method=coil,ppo", "evaluation.gif=false", "hydra.sweep.dir=sweep"]
-    program("train", "-m", *TINY, *sweep, cwd=tmp_path)
-    done = program("report", "folder=sweep", "actions=both", cwd=tmp_path)
+    called("train", "-m", *TINY, *sweep, cwd=tmp_path)
+    done = called("report", "folder=sweep", "actions=both", cwd=tmp_path)
     assert "All 2 runs that were started are finished.\nreport:" in done.stdout
     assert done.stderr == ""
     assert {file.name for file in (tmp_path / "sweep").iterdir()} > FILES
-    reward = {
-        row["driver"]: float(row["reward"])
-        for row in read_csv(tmp_path / "sweep" / "report.csv")[:3]
-    }
+    table = read_csv(tmp_path / "sweep" / "report.csv")[:3]
+    reward = {row["driver"]: float(row["reward"]) for row in table}
     for run in (tmp_path / "sweep").glob("*_seed0"):
-        means = [
-            row
-            for row in read_csv(run / "evaluation.csv")
-            if row["case"] == "mean" and not row["advice"]
-        ]
-        guide, agent = means[0], means[1]
+        guide, agent, *_ = (row for row in read_csv(run / "evaluation.csv") if is_mean(row))
         assert reward["guide"] == pytest.approx(float(guide["reward"]))
         assert reward[agent["driver"]] == pytest.approx(float(agent["reward"]))
     shutil.rmtree(run)  # as where the sweep was stopped before it
-    left = program("report", "folder=sweep", cwd=tmp_path).stdout
+    left = called("report", "folder=sweep", cwd=tmp_path).stdout
     assert "Runs of the sweeps that were not started: 1; repeat their command." in left
