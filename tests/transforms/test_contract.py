@@ -137,10 +137,7 @@ def degraded(transform):
         (lambda: Guides({"half": ZeroGuide()}), "'half' cannot be the name of a guide"),
         (lambda: Guides({"a": ZeroGuide(out_key="b")}), r"must write 'action'; it writes \['b'\]"),
         (lambda: Guides({"zero": ZeroGuide()}, trainable=True), "guide 'zero' has no parameters"),
-        (
-            lambda: worlds.cones(RewardCoupling(1, guide=1)).rollout(1),
-            "reads row 1 of guide_action",
-        ),
+        (lambda: worlds.cones(RewardCoupling(1, guide=1)).rollout(1), "reads row 1 of guide"),
         (lambda: worlds.carts(DiscreteActions(5)).reset(), "the action of this env is choices"),
         (lambda: AdaptiveMixedAction(low=0.4), "low=0.4, .* must be in this order"),
         (lambda: AdaptiveMixedAction(certain=0.2), "certain=0.2 .* less than uncertain=0.15"),

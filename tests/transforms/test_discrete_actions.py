@@ -1,8 +1,6 @@
 import pytest
 import torch
-import worlds
 from tensordict.nn import TensorDictModule
-from torchrl.data import Categorical
 from torchrl.envs import Compose, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -35,12 +33,6 @@ def step(env, *choices):
 
 def close(tensor, numbers):
     return tensor.flatten().tolist() == pytest.approx(numbers)
-
-
-def test_choices_are_equally_spaced_from_bound_to_bound():
-    env = worlds.pendulum(DiscreteActions(5))
-    assert isinstance(env.action_spec, Categorical)
-    assert env.transform[-1].values.tolist() == [-2, -1, 0, 1, 2]
 
 
 def test_env_gets_the_value_and_the_data_keep_the_choice():

@@ -54,37 +54,22 @@ def test_guide_without_agent_has_no_curve(tmp_path):
 
 
 HEAD = "driver,advice,actions,case,reward,lap_time,smoothness,completed,crashed,clearance\n"
+ROW = "guide,,sampled,a,"
 DRIVERS = "\n".join(f"guide {number},,deterministic,a,1,1,1,1,1,1" for number in range(201))
 
 
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
-        (
-            "evaluation.csv",
-            "",
-            r"\(No columns.*\); remove the file and write it again by coil-train",
-        ),
+        ("evaluation.csv", "", r"\(No columns.*\); remove the file and write it again"),
         ("evaluation.csv", HEAD, r"is damaged \(0 rows, not 1 to 50,000\)"),
         ("evaluation.csv", HEAD + DRIVERS, r"is damaged \(201 drivers, not 1 to 200\)"),
         ("evaluation.csv", "driver,actions\nguide,sampled\n", r"is damaged \(it lacks advice\)"),
-        (
-            "evaluation.csv",
-            HEAD.replace("lap_", "") + "guide,,sampled,a,1,1,1,1,1,1",
-            "no column lap_",
-        ),
-        (
-            "evaluation.csv",
-            HEAD + "guide,,sampled,a,much,1,1,1,1,1\n",
-            "could not convert .* 'much'",
-        ),
-        ("evaluation.csv", HEAD + "guide,,sampled,a,1,1,1,1,1,1,1", "more values than columns"),
+        ("evaluation.csv", HEAD.replace("lap_", "") + ROW + "1,1,1,1,1,1", "no column lap_"),
+        ("evaluation.csv", HEAD + ROW + "much,1,1,1,1,1\n", "could not convert .* 'much'"),
+        ("evaluation.csv", HEAD + ROW + "1,1,1,1,1,1,1", "more values than columns"),
         ("evaluation.csv", b"\xff\xfe", "codec can't decode"),
-        (
-            "metrics.csv",
-            "frames,evaluation/return\n1,2\n3,\n",
-            "metrics.csv is damaged .*; put the file back",
-        ),
+        ("metrics.csv", "frames,evaluation/return\n1,2\n3,\n", "is damaged .*; put the file back"),
         ("metrics.csv", "1,2\n3,4\n", r"\(not every row has its number of frames\)"),
         ("guide_return.json", "[1", "guide_return.json is damaged"),
         ("config.yaml", "seed: 0\n", r"no valid label, seed and .* \(Missing key label\)"),
