@@ -9,7 +9,7 @@ from torchrl.envs import TransformedEnv
 
 from coil_rl import GymnasiumEnv, evaluate_policy
 from coil_rl.foreign.controllers import PerRow
-from coil_rl.guides.classic import ClassicGuide, Oscillator
+from coil_rl.guides.classic import Oscillator
 from coil_rl.guides.simple import ConstantGuide, FollowAdvice
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_memory import GuideMemory
@@ -81,8 +81,3 @@ def test_controllers_are_not_asked_after_the_end_of_an_episode():
 def test_memory_of_the_guides_is_declared_once():
     memory = GuideMemory("swim", Candidates([Oscillator(), Oscillator(frequency=0.3)]))
     assert list(memory.specs) == ["swum_steps"]
-
-
-def test_what_a_guide_reads_and_writes_is_that_of_the_first():
-    candidates = Candidates([ClassicGuide("swing_up"), ClassicGuide("swing_up", {"gain": 1.0})])
-    assert (candidates.in_keys, candidates.out_keys) == (["observation"], ["action"])

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from functools import partial
 
+import programs
 import pytest
-from hydra import compose, initialize_config_module
 
 from coil_rl.config.nodes import build, keep
 from coil_rl.errors import UserError
@@ -27,17 +27,13 @@ class PID:
         return [self.kp * float(observation[0])]
 
 
+composed = partial(programs.composed, "method=tune", "run_dir=unused")
 CONTROLLER = {
     "_target_": "coil_rl.guides.ControllerGuide",
     "of": f"{__name__}:PID",
     "in_keys": None,
     "options": {"kp": 2.0},
 }
-
-
-def composed(*overrides):
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return compose("train", ["method=tune", "run_dir=unused", *overrides])
 
 
 def test_numbers_of_a_controller_are_the_arguments_of_its_class():
@@ -55,12 +51,8 @@ def test_numbers_of_a_partial_of_a_class_are_those_that_it_gives():
 
 def test_numbers_of_a_function_are_its_arguments_and_the_items_of_lists():
     node = composed("env=cart_pole").guide.linear_feedback
-    assert numbers_of(node, "guide") == {
-        "weights.0": (0.1, False),
-        "weights.1": (0.3, False),
-        "weights.2": (1.0, False),
-        "weights.3": (0.5, False),
-    }
+    weights = enumerate([0.1, 0.3, 1.0, 0.5])
+    assert numbers_of(node, "guide") == {f"weights.{n}": (each, False) for n, each in weights}
 
 
 class Whole:
@@ -92,12 +84,6 @@ def test_whole_numbers_are_those_annotated_as_such_also_in_lists_and_unions():
     assert (window, delay, list(orders), list(lags)) == (6, 1, [1, 7], [2])
 
 
-def test_numbers_of_the_spline_guide_are_the_arguments_of_its_class():
-    assert {"gain", "smoothing", "sharpness"} <= set(
-        numbers_of(dict(composed().guide.spline), "guide.spline")
-    )
-
-
 def test_node_gets_other_numbers_and_keeps_the_rest():
     changed = with_numbers(CONTROLLER, "guide.controller", {"ki": 0.5, "horizon": 3.0})
     assert changed["options"] == {"kp": 2.0, "ki": 0.5, "horizon": 3}
@@ -111,15 +97,12 @@ def test_guide_is_built_with_other_items_of_a_list():
 
 
 def test_bounds_are_read_with_the_own_value():
+    nested = composed("env=cart_pole", "tune={weights: {2: [0, 2]}}")
+    assert [number.name for number in numbers_to_tune(nested)] == ["weights.2"]
     [kp] = numbers_to_tune(composed("env=pendulum", "tune={gain: [0.1, 10, log]}"))
     assert (kp.name, kp.low, kp.high, kp.own, kp.log) == ("gain", 0.1, 10.0, 5.0, True)
     assert kp.value(kp.place(2.5)) == pytest.approx(2.5)
     assert kp.value(0.5) == pytest.approx(1.0)
-
-
-def test_items_of_lists_may_be_named_by_nested_keys():
-    config = composed("env=cart_pole", "tune={weights: {2: [0, 2]}}")
-    assert [number.name for number in numbers_to_tune(config)] == ["weights.2"]
 
 
 def test_bounds_of_a_whole_number_are_whole():

@@ -5,7 +5,7 @@ import shlex
 from types import SimpleNamespace
 
 import pytest
-from hydra import compose, initialize_config_module
+from programs import composed
 
 from coil_rl import UserError, extras
 from coil_rl.record import DELIVERY
@@ -23,31 +23,29 @@ def test_search_beyond_its_budget_is_said_from_a_file_that_may_be_missing(tmp_pa
 
 def test_missing_extra_is_named(monkeypatch):
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("train", ["method=tune", "env=pendulum", "run_dir=unused"])
+    config = composed("method=tune", "env=pendulum", "run_dir=unused")
     with pytest.raises(UserError, match=r"method=tune needs cmaes: .* 'coil-rl\[tune\]'"):
         Tuning().check(config)
+
+
+def tuned_run(folder, words):
+    """Return a run whose guide gets its numbers by some words."""
+    run = TunedRun.__new__(TunedRun)
+    run.folder, run.in_python, run.numbers = folder, False, ()
+    run.make_guide = SimpleNamespace(words=lambda values: words)
+    return run
 
 
 @pytest.mark.parametrize("mark", ["", "+", "++"])
 def test_next_command_names_each_number_of_the_guide_once(mark, tmp_path, capsys):
     words = ["env=pendulum", f"{mark}guide.swing_up.gain=2", "++guide.swing_up.other=1", "seed=3"]
-    run = TunedRun.__new__(TunedRun)
-    run.folder, run.in_python, run.numbers = tmp_path, False, ()
+    run = tuned_run(tmp_path, ["guide.swing_up.gain=3.5", "+guide.swing_up.more=1"])
     run.command = ["coil-train", "method=tune", "tune={gain: [1, 4]}", *words]
-    said = ["guide.swing_up.gain=3.5", "+guide.swing_up.more=1"]
-    run.make_guide = SimpleNamespace(words=lambda values: said.copy())
     run._say_next()
-    said = shlex.split(capsys.readouterr().out)
-    kept = [word for word in words if "gain" not in word]
-    assert said == [
-        "Next:",
-        "coil-train",
-        *kept,
-        f"{mark}guide.swing_up.gain=3.5",
-        "+guide.swing_up.more=1",
-        "method=coil_anchored",
-    ]
+    kept = ["env=pendulum", "++guide.swing_up.other=1", "seed=3"]
+    tuned = [f"{mark}guide.swing_up.gain=3.5", "+guide.swing_up.more=1"]
+    expected = ["Next:", "coil-train", *kept, *tuned, "method=coil_anchored"]
+    assert shlex.split(capsys.readouterr().out) == expected
 
 
 @pytest.mark.parametrize(
@@ -57,12 +55,9 @@ def test_next_command_names_each_number_of_the_guide_once(mark, tmp_path, capsys
         ("guide.pid.kp=3.5", "guide=GUIDE, overrides=['guide.pid.kp=3.5']"),
     ],
 )
-def test_next_step_in_python_gives_the_numbers_as_the_guide_takes_them(
-    word, said, tmp_path, capsys, monkeypatch
-):
+def test_next_step_in_python_gives_numbers_to_the_guide(word, said, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("coil_rl.tune.run.read_tuned", lambda folder, numbers: {"gain": 3.5})
-    run = TunedRun.__new__(TunedRun)
-    run.folder, run.in_python, run.numbers = tmp_path, True, ()
-    run.make_guide = SimpleNamespace(words=lambda values: [word])
+    run = tuned_run(tmp_path, [word])
+    run.in_python = True
     run._say_next()
     assert capsys.readouterr().out == f"Next: coil_rl.train(ENV, {said})\n"

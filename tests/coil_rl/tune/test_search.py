@@ -48,13 +48,14 @@ def rows_of(path):
         return list(csv.DictReader(file))
 
 
+def mean_rewards(run):
+    """Return the mean rewards by driver, which are the last of its rows."""
+    return {row["driver"]: float(row["reward"]) for row in rows_of(run / "evaluation.csv")}
+
+
 @pytest.mark.slow
 def test_tuned_guide_is_better_on_cases_that_the_search_did_not_see(run):
-    rewards = {
-        row["driver"]: float(row["reward"])
-        for row in rows_of(run / "evaluation.csv")
-        if row["case"] == "mean"
-    }
+    rewards = mean_rewards(run)
     assert rewards["tune"] > rewards["guide"] + 10
     assert json.loads((run / "tuned.json").read_text())["gain"] > 0.1
 
@@ -102,28 +103,19 @@ def test_noise_of_a_case_is_the_same_for_all_numbers(tmp_path):
 @pytest.mark.slow
 def test_tuned_guide_is_a_guide_that_acts_as_the_policy_of_its_run(run):
     opened = open_run(run)
-    evaluation = opened.trial.evaluation
-    of_run = opened.evaluate()
-    mean = of_run[(of_run["driver"] == "tune") & (of_run["case"] == "mean")]["reward"].item()
-    guides = {"learned": LearnedGuide(str(run))}
+    of_run = opened.evaluate().groupby("driver")["reward"].last()
+    evaluation, guides = opened.trial.evaluation, {"learned": LearnedGuide(str(run))}
     result = evaluation.run(*opened.make_env.guided(len(evaluation.cases), TEST, guides))
-    assert result.mean_reward == pytest.approx(mean)
+    assert result.mean_reward == pytest.approx(of_run["tune"])
 
 
 @pytest.mark.slow
 def test_policy_may_be_anchored_at_a_tuned_guide(run, tmp_path):
-    called(
-        "train",
-        "method=coil_anchored",
-        "env=pendulum",
-        "env.max_steps=60",
-        "guide=learned",
-        f"guide.learned.run={run}",
-        "budget={frames: 1000, num_envs: 2, steps: 50, minibatches: 2}",
-        *SMALL[1:],
-        f"hydra.run.dir={tmp_path / 'anchored'}",
-    )
-    [start, *_] = rows_of(tmp_path / "anchored" / "metrics.csv")
+    folder = tmp_path / "anchored"
+    words = ["method=coil_anchored", "guide=learned", f"guide.learned.run={run}", *SMALL[1:]]
+    words += ["budget={frames: 1000, num_envs: 2, steps: 50, minibatches: 2}"]
+    called("train", "env=pendulum", "env.max_steps=60", *words, f"hydra.run.dir={folder}")
+    [start, *_] = rows_of(folder / "metrics.csv")
     assert float(start["start/guide"]) > -600
 
 
@@ -166,13 +158,8 @@ def test_other_numbers_in_the_file_are_refused(run, tmp_path):
 @pytest.mark.slow
 def test_number_beyond_its_bounds_is_kept_where_nothing_is_better(tmp_path):
     run = tmp_path / "run"
-    tuned(
-        run,
-        "env=mountain_car",
-        "env.max_steps=150",
-        "tune={power: [-1, -0.5]}",
-        "budget.frames=8000",
-    )
+    words = ["env=mountain_car", "env.max_steps=150", "tune={power: [-1, -0.5]}"]
+    tuned(run, *words, "budget.frames=8000")
     assert json.loads((run / "tuned.json").read_text()) == {"power": 1.0}
     assert json.loads((run / "delivery.json").read_text())["policy"] == "guide"
 
@@ -188,7 +175,7 @@ def test_weights_of_a_rule_with_choices_are_tuned(tmp_path):
         "env.max_steps=100",
         "budget.frames=6000",
     )
-    rewards = {r["driver"]: float(r["reward"]) for r in rows_of(run / "evaluation.csv")}
+    rewards = mean_rewards(run)
     assert rewards["tune"] > 90 > rewards["guide"]
 
 
@@ -213,17 +200,13 @@ def test_spline_guide_is_tuned_side_by_side_in_one_env(tmp_path):
 
 @pytest.mark.slow
 def test_candidates_of_a_generation_act_in_the_same_cases_side_by_side_or_in_turn(run):
-    beside, in_turn = (_tuner(open_run(run)) for _ in range(2))
+    beside, in_turn = (open_run(run).training(0).tuner for _ in range(2))
     in_turn.cases.can_copy = lambda: False
     values = [{"gain": 0.05}, {"gain": 1.0}, {"gain": 0.05}]
     first, second = beside.returns(values, 3), in_turn.returns(values, 3)
     assert torch.equal(first[0], first[2])
     assert not torch.equal(first[0], first[1])
     assert torch.allclose(torch.stack(first), torch.stack(second))
-
-
-def _tuner(opened):
-    return opened.training(0).tuner
 
 
 def test_own_numbers_are_kept_unless_others_are_clearly_better():
