@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hydra import compose, initialize_config_module
+from programs import composed
 
 import coil_rl.config.schema  # noqa: F401 registers the configuration schema
 from coil_rl.comparison.arms import GUIDE
@@ -31,8 +31,7 @@ def car(**lags):
     for name, lag in lags.items():
         words += [f"disturb.{name}.min_lag={lag}", f"disturb.{name}.max_lag={lag}"]
     small = ["env.max_steps=30", "evaluation.cases=2", "run_dir=x"]
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return compose("train", ["env=pendulum", "method=coil", *small, *words])
+    return composed("env=pendulum", "method=coil", *small, *words)
 
 
 def rewards_of_the_guide(config):
@@ -56,22 +55,18 @@ def test_words_for_the_action_are_kept_with_what_was_measured(tmp_path):
     assert set(outcome.entries) == {"guide", "opposite", "zero", "random"}
 
 
+def box(low, high):
+    return spaces.Box(np.array(low), np.array(high), dtype=np.float32)
+
+
 @pytest.mark.parametrize(
     ("space", "action", "words"),
     [
-        (spaces.Box(-2.0, 2.0, (2,)), [0, 0], "zero actions"),
-        (
-            spaces.Box(np.array([-1, -9]), np.array([1, 9]), dtype=np.float32),
-            [0, 0],
-            "zero actions",
-        ),
-        (spaces.Box(-np.inf, np.inf, (1,)), [0], "zero actions"),
-        (spaces.Box(0.0, 20.0, (1,)), [10], "the middle of the action's range"),
-        (
-            spaces.Box(np.array([-1, 2]), np.array([1, 50]), dtype=np.float32),
-            [0, 26],
-            "the middle of the action's range",
-        ),
+        (box([-2, -2], [2, 2]), [0, 0], "zero actions"),
+        (box([-1, -9], [1, 9]), [0, 0], "zero actions"),
+        (box([-np.inf], [np.inf]), [0], "zero actions"),
+        (box([0], [20]), [10], "the middle of the action's range"),
+        (box([-1, 2], [1, 50]), [0, 26], "the middle of the action's range"),
         (spaces.Discrete(3, start=5), 0, "the first choice"),
         (spaces.MultiDiscrete([2, 4]), [0, 0], "the first choice"),
     ],
@@ -92,10 +87,8 @@ def test_neutral_action_is_called_what_it_is(space, action, words):
 def test_table_says_what_the_action_of_zero_is_and_old_files_have_zero_actions(tmp_path):
     rows = [{"baseline": name, "reward": 1.0, "steps": 3} for name in ("zero", "random")]
     for words, note in (("the first choice", "the first choice"), ("zero actions", ""), (None, "")):
-        if words is not None:
-            write_csv([rows[0] | {"baseline_action": words}, rows[1]], tmp_path / FILE)
-        else:
-            write_csv(rows, tmp_path / FILE)
+        said = {} if words is None else {"baseline_action": words}
+        write_csv([rows[0] | said, rows[1]], tmp_path / FILE)
         found = read_outcome(tmp_path, [], {})
         assert [row["note"] for row in found.rows] == [note, ""]
         assert found.entries["zero"].action == (words or "zero actions")
@@ -106,10 +99,3 @@ def test_damaged_file_is_one_sentence(text, tmp_path):
     (tmp_path / FILE).write_text(text)
     with pytest.raises(UserError, match=r"baselines.csv is damaged .*; remove it and compare"):
         read_baselines(tmp_path)
-
-
-def test_rows_of_what_acted_are_read(tmp_path):
-    write_csv([{"baseline": "zero", "reward": -1.0, "steps": 3}], tmp_path / FILE)
-    assert read_baselines(tmp_path).to_dict("records") == [
-        {"baseline": "zero", "reward": -1.0, "steps": 3}
-    ]

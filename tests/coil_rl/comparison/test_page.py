@@ -58,10 +58,8 @@ def test_picture_is_about_the_guide_and_what_is_better():
 
 @pytest.mark.parametrize(("tune", "written"), [("auto", "auto"), ({"kp": [1, 2]}, "{kp: [1, 2]}")])
 def test_command_of_a_tuning_has_its_bounds(tune, written):
-    given, best = (
-        Named(["env=pendulum", "guide=pid"], {"tune": tune}),
-        Verdict("tune", "tune", 1, 1, False),
-    )
+    given = Named(["env=pendulum", "guide=pid"], {"tune": tune})
+    best = Verdict("tune", "tune", 1, 1, False)
     assert shlex.split(command_of(given, best))[-2:] == [f"tune={written}", "method=tune"]
     of_object = Named(given.words, given.nodes | {"guide.controller.of": None})
     assert f"tune={tune!r}" in command_of(of_object, best)
