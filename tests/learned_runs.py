@@ -17,9 +17,20 @@ OPTIONS = dict.fromkeys(("cheq", "ibrl", "policy_decorator", "rlpd", "wsrl", "q_
 OPTIONS |= {"dagger": FOREST, "oil": FOREST, "coil_anchored": ["learner=ppo", *ON_POLICY[:2]]}
 
 
-def learned(folder, method, *overrides, guide="thermostat.control:PI", env="thermostat:Room-v0"):
-    """Return the folder of a run that has learned from one batch."""
-    words, frames = [*TINY, *OPTIONS.get(method, ON_POLICY)], 32
+def learned(
+    folder,
+    method,
+    *overrides,
+    guide="thermostat.control:PI",
+    env="thermostat:Room-v0",
+    options=None,
+):
+    """Return the folder of a run that has learned from one batch.
+
+    Args:
+        options: what makes its learner small; None: what does it for that of the method.
+    """
+    words, frames = [*TINY, *(options or OPTIONS.get(method, ON_POLICY))], 32
     if method == "guide":  # it learns nothing
         words, frames = SHORT, None
     elif method == "tune":  # it has no learner
