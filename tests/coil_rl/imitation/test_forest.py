@@ -4,7 +4,6 @@ from sklearn.ensemble import RandomForestRegressor
 
 from coil_rl.errors import UserError
 from coil_rl.imitation import ForestRegressor
-from coil_rl.run import checkpoint
 
 
 def data(outputs=1):
@@ -32,14 +31,10 @@ def test_prediction_equals_that_of_scikit_learn(outputs, rows):
     assert torch.equal(regressor(x[0]), y[0])
 
 
-def test_restored_regressor_and_equal_fit_predict_the_same(tmp_path):
-    first, second, x = fitted(), ForestRegressor().fresh(4, 1), data()[0]
-    assert (second(x) == 0).all()
-    checkpoint.save(first.state_dict(), tmp_path / "state.pt")
-    second.load_state_dict(checkpoint.load(tmp_path / "state.pt"))
-    assert torch.equal(first(x), second(x))
-    assert torch.equal(first(x), fitted()(x))
-    assert first(x).dtype == torch.float32
+def test_equal_fit_predicts_the_same():
+    x = data()[0]
+    assert (ForestRegressor().fresh(4, 1)(x) == 0).all()
+    assert torch.equal(fitted()(x), fitted()(x))
 
 
 def test_inputs_that_are_not_finite_are_refused():

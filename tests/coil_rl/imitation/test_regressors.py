@@ -13,13 +13,8 @@ def scaled_data():
 
 
 def fitted_network(**changes):
-    options = {
-        "hidden": (16,),
-        "epochs": 80,
-        "minibatch": 64,
-        "learning_rate": Linear(1e-2, 0),
-    } | changes
-    network = NetworkRegressor(**options).fresh(3, 2)
+    options = {"hidden": (16,), "epochs": 80, "minibatch": 64, "learning_rate": Linear(1e-2, 0)}
+    network = NetworkRegressor(**options | changes).fresh(3, 2)
     network.fit(*scaled_data())
     return network
 
@@ -42,8 +37,6 @@ def test_network_fit_follows_from_the_data_and_the_seed_and_leaves_the_global_ge
     assert not torch.equal(first(x), other(x))
     fresh = NetworkRegressor((16,)).fresh(3, 2)
     assert (fresh(x) == 0).all()
-    fresh.load_state_dict(first.state_dict())
-    assert torch.equal(first(x), fresh(x))
 
 
 def test_linear_regression_is_that_of_scikit_learn():
@@ -55,18 +48,10 @@ def test_linear_regression_is_that_of_scikit_learn():
         ours.weights, torch.from_numpy(theirs.coef_.T), rtol=1e-12, atol=1e-12
     )
     assert torch.equal(ours(x), torch.from_numpy(theirs.predict(x.numpy())).float())
-    other = LinearRegressor().fresh(3, 2)
-    other.load_state_dict(ours.state_dict())
-    assert torch.equal(ours(x), other(x))
 
 
 def test_values_out_of_range_are_refused_before_the_fit():
-    for name, value in (
-        ("hidden", (0,)),
-        ("epochs", 0),
-        ("minibatch", 0),
-        ("learning_rate", 0),
-        ("seed", -1),
-    ):
+    values = {"hidden": (0,), "epochs": 0, "minibatch": 0, "learning_rate": 0, "seed": -1}
+    for name, value in values.items():
         with pytest.raises(ValueError, match=f"{name}(\\[0\\])?=.* must be"):
             NetworkRegressor(**{name: value})

@@ -4,7 +4,7 @@ import torch
 from tabular_env import TabularEnv
 from tensordict.nn import TensorDictModule
 from torch.nn import functional as F
-from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_paper.tabular import garnet, toymaker, value_iteration
@@ -101,10 +101,3 @@ def test_dqn_finds_the_optimal_policy_of_a_table(mdp, key):
     assert states.unique().tolist() == list(range(len(mdp.P)))
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         assert torch.equal(dqn.policy(batch)["action"], optimal[states])
-
-
-def test_one_hot_actions():
-    env = GymEnv("CartPole-v1")
-    dqn, rollout = make(env, updates_per_step=0.25)
-    assert dqn.update(rollout.collect())["minibatches"] == 1
-    assert env.action_spec.is_in(dqn.policy(env.reset())["action"])

@@ -1,6 +1,5 @@
 """Properties of learners with a replay buffer."""
 
-import copy
 import math
 
 import pytest
@@ -90,14 +89,6 @@ def test_rewards_of_several_steps_are_summed_within_an_episode():
             live = 0.0 if last == 8 else gamma ** len(taken)
             entries = Entries(step.unsqueeze(0).items(True, True))
             assert float(discount(entries, torch.tensor(gamma))) == live
-
-
-def test_waiting_steps_are_part_of_the_state():
-    whole = steps(0, 6).unsqueeze(0)
-    first, second = NStep(3, 0.9), NStep(3, 0.9)
-    first.summed(whole[:, :4])
-    second.load_state_dict(copy.deepcopy(first.state_dict()))
-    assert (first.summed(whole[:, 4:]) == second.summed(whole[:, 4:])).all()
 
 
 def agent_acts(*flags):

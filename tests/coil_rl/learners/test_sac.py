@@ -14,21 +14,13 @@ from coil_rl.learners.policy import Entries
 from coil_rl.run.policy_batch import policy_batch
 from coil_rl.run.rollout import Rollout
 
+SMALL = {"hidden": [16], "starts": 0, "batch_size": 16, "updates_per_step": 0.0625}
+
 
 def make(kind=SAC, **options):
     torch.manual_seed(0)
-    env = options.pop("env", None) or worlds.pendulum()
-    sac = kind(
-        env,
-        **{
-            "in_keys": ["th", "thdot"],
-            "hidden": [16],
-            "starts": 0,
-            "batch_size": 16,
-            "updates_per_step": 0.0625,
-        }
-        | options,
-    )
+    env = worlds.pendulum()
+    sac = kind(env, ["th", "thdot"], **SMALL | options)
     return sac, Rollout(env, sac.policy, 32, sac.keys)
 
 
@@ -162,12 +154,9 @@ def test_target_networks_follow_by_tau():
     sac.of_target.vector.data.copy_(before)
     sac.after_update()
     torch.testing.assert_close(sac.of_target.vector, 0.75 * before + 0.25 * learned)
-    assert all(
-        torch.equal(view, parameter)
-        for view, parameter in zip(
-            sac.of_target._views(sac.of_target.vector), sac.target.parameters(), strict=True
-        )
-    )
+    views = sac.of_target._views(sac.of_target.vector)
+    pairs = zip(views, sac.target.parameters(), strict=True)
+    assert all(torch.equal(view, parameter) for view, parameter in pairs)
 
 
 def test_standard_deviation_is_initially_the_scale_in_every_state():
