@@ -41,9 +41,7 @@ def test_learners_learn_from_the_unclipped_sample(kind):
         rows["action"] *= 0
         rows["unclipped_action"] += offset
         other.update(rows)
-        weights.append(
-            torch.cat([parameter.detach().flatten() for parameter in other.policy.parameters()])
-        )
+        weights.append(nn.utils.parameters_to_vector(other.policy.parameters()))
     assert torch.equal(weights[0], weights[1])
     assert not torch.equal(weights[0], weights[2])
 
