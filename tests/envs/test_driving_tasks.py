@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from worlds import drive, same
 
 from coil_rl.cones.spline import SplineGuide
 from coil_rl.envs import ConeTrackEnv, DrivingTasksEnv, Track
@@ -20,19 +20,10 @@ TASKS = {
 EQUAL: dict[str, dict[str, float]] = {"a": {}, "b": {}, "c": {}}
 
 
-def drive(
-    env: ConeTrackEnv, steps: int, state: TensorDictBase | None = None, seed: int = 1
-) -> list[TensorDictBase]:
-    """Return the output of each step under smooth random steering, with resets."""
-    draw = torch.Generator().manual_seed(seed)
-    state = env.reset() if state is None else state
-    emitted = []
-    for _ in range(steps):
-        push = 0.1 * torch.randn(len(state), 1, generator=draw)
-        state["action"] = (0.95 * state["steering"] + push).to(env.dtype_).clamp(-1, 1)
-        step, state = env.step_and_maybe_reset(state)
-        emitted.append(step)
-    return emitted
+def rollout(env: DrivingTasksEnv, steps: int) -> TensorDictBase:
+    """Return steps under random steering, with resets, [B, T]."""
+    torch.manual_seed(1)
+    return env.rollout(steps, break_when_any_done=False)
 
 
 def one_step(ring: Track, position: float, action: float, **kwargs: Any) -> TensorDictBase:
@@ -116,15 +107,14 @@ def test_tasks_without_weights_equal_the_cone_world(rings: list[Track]) -> None:
 
 
 def test_observed_task_is_that_of_the_next_reward(rings: list[Track]) -> None:
-    changes = 0
-    for step in drive(DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5), 60):
-        rewarded = torch.cat(list(step["next", "info", "task"].values()), -1)
-        assert torch.equal(rewarded.float(), step["task"])
-        assert rewarded.sum(-1).eq(1).all()
-        nonzero = step["next", "info", "reward", "left"].ne(0) & ~step["next", "info", "crashed"]
-        assert torch.equal(nonzero, step["task"][:, 2:3].bool() & ~step["next", "info", "crashed"])
-        changes += int(step["next", "task"].ne(step["task"]).any(-1).sum())
-    assert changes > 16
+    steps = rollout(DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5), 60)
+    rewarded = torch.cat(list(steps["next", "info", "task"].values()), -1)
+    assert torch.equal(rewarded.float(), steps["task"])
+    assert rewarded.sum(-1).eq(1).all()
+    alive = ~steps["next", "info", "crashed"]
+    nonzero = steps["next", "info", "reward", "left"].ne(0) & alive
+    assert torch.equal(nonzero, steps["task"][..., 2:3].bool() & alive)
+    assert steps["next", "task"].ne(steps["task"]).any(-1).sum() > 16
 
 
 def test_task_durations_and_transitions_have_the_given_distribution(rings: list[Track]) -> None:
@@ -141,13 +131,10 @@ def test_task_durations_and_transitions_have_the_given_distribution(rings: list[
     assert (other / other.sum()).tolist() == pytest.approx([1 / 6] * 6, abs=0.015)
 
 
-def sequence(env: DrivingTasksEnv) -> Tensor:
-    return torch.stack([step["task"] for step in drive(env, 30)])
-
-
 def test_seed_determines_the_tasks(rings: list[Track]) -> None:
     first, again, other = (
-        sequence(DrivingTasksEnv(rings, 8, tasks=TASKS, duration=0.3, seed=k)) for k in (7, 7, 8)
+        rollout(DrivingTasksEnv(rings, 8, tasks=TASKS, duration=0.3, seed=seed), 30)["task"]
+        for seed in (7, 7, 8)
     )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
@@ -156,7 +143,7 @@ def test_seed_determines_the_tasks(rings: list[Track]) -> None:
 def test_single_task_uses_no_random_numbers(rings: list[Track]) -> None:
     env = DrivingTasksEnv(rings, 8, tasks=TASKS, only="corners", duration=0.1, assignment="cyclic")
     before = env.generator.get_state()
-    assert sequence(env)[..., 1].eq(1).all()
+    assert rollout(env, 30)["task"][..., 1].eq(1).all()
     env.assignment = "random"
     tracks = ConeTrackEnv(rings, 8).reset()["info", "track"]
     env.generator.set_state(before)
@@ -166,15 +153,13 @@ def test_single_task_uses_no_random_numbers(rings: list[Track]) -> None:
 @pytest.mark.slow
 def test_restored_env_continues_bit_for_bit(rings: list[Track]) -> None:
     env = DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5, seed=3)
-    state = drive(env, 20)[-1]["next"].exclude("reward")
-    state = env.maybe_reset(state)
+    _, carrier = drive(env, 20)
     saved = copy.deepcopy(env.state_dict())
-    trace = drive(env, 80, state.clone())
-    assert any(step["next", "done"].any() for step in trace)
+    expected, _ = drive(env, 80, carrier.clone())
+    assert any(step["done"].any() for step in expected)
     restored = DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5, seed=99)
     restored.load_state_dict(saved)
-    again = drive(restored, 80, state.clone())
-    assert all((ours == step).all() for ours, step in zip(again, trace, strict=True))
+    assert same(drive(restored, 80, carrier.clone())[0], expected)
 
 
 @pytest.mark.parametrize(
