@@ -43,8 +43,3 @@ def test_it_is_a_valid_transform_whose_second_one_has_the_last_word():
     check_transform(worlds.cones(), AdviceDropout(0.5).train())
     env = worlds.cones(AdviceDropout(0.0), AdviceDropout(in_evaluation=False)).eval()
     assert not env.reset()["advice_given"].any()
-
-
-def test_probability_out_of_range_is_refused():
-    with pytest.raises(ValueError, match=r"probability=1\.5 must be at most 1"):
-        AdviceDropout(1.5)

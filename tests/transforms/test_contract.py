@@ -12,6 +12,7 @@ from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import ConstantGuide, RandomGuide, SplineGuide, ZeroGuide
 from coil_rl.testing import check_env, check_transform
 from coil_rl.transforms import (
+    ActionDelay,
     AdaptiveMixedAction,
     AdviceDropout,
     BiasedAdvice,
@@ -21,6 +22,7 @@ from coil_rl.transforms import (
     GuideActions,
     JumpStart,
     NoisyAdvice,
+    ObservationDelay,
     PartialAdvice,
     RandomAdvice,
     RemovedAdvice,
@@ -38,6 +40,8 @@ TRANSFORMS = {
     "biased": BiasedAdvice,
     "dropout": AdviceDropout,
     "delayed": lambda: DelayedAdvice(2),
+    "delayed actions": lambda: ActionDelay(1, 2),
+    "delayed observations": lambda: ObservationDelay(1, 2),
     "jump start": lambda: JumpStart(4, random=True),
     "noisy": NoisyAdvice,
     "partial": lambda: PartialAdvice("left"),
@@ -141,6 +145,7 @@ def degraded(transform):
         (lambda: worlds.carts(DiscreteActions(5)).reset(), "the action of this env is choices"),
         (lambda: AdaptiveMixedAction(low=0.4), "low=0.4, .* must be in this order"),
         (lambda: AdaptiveMixedAction(certain=0.2), "certain=0.2 .* less than uncertain=0.15"),
+        (lambda: AdviceDropout(1.5), r"probability=1\.5 must be at most 1"),
         (lambda: DiscreteActions(1), "choices=1 must be at least 2"),
         (lambda: DiscreteActions([0.5, 0.5]), "must be at least two increasing numbers"),
         (lambda: DiscreteActions([0.0, math.inf]), "must be finite"),

@@ -158,13 +158,6 @@ def test_contract_holds_and_a_restored_env_goes_on_to_the_bit(make):
 
 
 @pytest.mark.parametrize("delay", [ObservationDelay, ActionDelay])
-def test_envs_without_batch_and_with_choices_are_delayed_too(delay):
-    check_env(worlds.pendulum(delay(1, 2)).train(), steps=4)
-    for categorical in (True, False):
-        check_env(worlds.carts(delay(1, 2), categorical=categorical).train(), steps=4)
-
-
-@pytest.mark.parametrize("delay", [ObservationDelay, ActionDelay])
 def test_no_lag_changes_nothing(delay):
     plain, delayed = driven(Counter()), driven(TransformedEnv(Counter(), delay(0, 0)))
     assert (plain == delayed).all()

@@ -27,7 +27,7 @@ INF = np.inf
 
 
 class Seen(gymnasium.Env):
-    """Writes nothing; keeps the actions that it gets, and pays for choices near to the last."""
+    """Shows random numbers, and keeps the actions that it gets."""
 
     observation_space = Box(-1, 1, (2,), np.float32)
 

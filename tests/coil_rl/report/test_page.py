@@ -5,7 +5,7 @@ import pytest
 from run_folders import driven, make_run, make_sweep
 
 from coil_rl.record import UNTESTED
-from coil_rl.report import page, write_csv
+from coil_rl.report import page
 from coil_rl.report.comparison import compare
 from coil_rl.report.runs import Run, read_runs
 
@@ -74,17 +74,19 @@ def test_parts_of_the_reward_have_their_own_table(prefix, guide, title, shown, t
     assert found == [f"{title} left right", *shown]
 
 
-def test_returns_of_trained_guides_are_shown_before_and_after(tmp_path):
-    for seed, label in enumerate(["dynamic", "dynamic", "coil"]):
-        rows = driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0})
-        run = make_run(tmp_path / str(seed), label, seed, rows)
-        if label == "dynamic":
-            returns = enumerate([10.0 + seed, math.nan, 20.0 + seed, 40.0 + seed])
-            lines = [{"frames": n, "guide/spline": x, "guide/calls": n} for n, x in returns]
-            write_csv(lines, run / "metrics.csv")
-    (table,) = page.guide_training(read_runs([tmp_path]))
-    assert cells(table)[1:] == [["dynamic", "2", "10.5 to 40.5"]]
-    assert page.guide_training(read_runs([tmp_path / "2"])) == []
+def test_returns_of_trained_guides_are_shown_before_and_after():
+    def run(label, seed, *returns):
+        curve = [{"frames": n, "guide/a": x, "guide/calls": n} for n, x in enumerate(returns)]
+        return Run(Path(), label, seed, True, curve=curve)
+
+    found = [run("both", seed, 10.0 + seed, math.nan, 20.0, 40.0 + seed) for seed in range(2)]
+    found += [run("one", 0, 1.0, 2.0), run("one", 1, math.nan, math.nan)]
+    without = Run(Path(), "one", 2, True, curve=[{"frames": 0.0}, {"frames": 9.0}])
+    (table,) = page.guide_training([*found, without])
+    both, one = cells(table)[1:]
+    assert both == ["both", "2", "10.5 to 40.5"]
+    assert one == ["one", "3", "1.00 to 2.00 (1 of 3 seeds)"]
+    assert page.guide_training([without]) == []
 
 
 def test_training_is_summarised_by_the_evaluation_curve(tmp_path):
@@ -199,18 +201,6 @@ def test_measure_of_some_episodes_counts_as_often_as_it_is_known(tmp_path):
     assert [by_case[case]["episodes"] for case in "ab"] == [10, 10]
     assert [by_case[case]["lap_time_episodes"] for case in "ab"] == [10, 6]
     assert by_case["b"]["lap_time"] == (80 + 5 * 50) / 6
-
-
-def test_guide_in_some_runs_of_a_label_only_is_said():
-    before, after = {"frames": 0.0}, {"frames": 9.0}
-    curves = [
-        [before | {"guide/x": 1.0}, after | {"guide/x": 2.0}],
-        [before, after],
-        [before | {"guide/x": math.nan}, after],
-    ]
-    runs = [Run(Path(), "a", seed, True, curve=curve) for seed, curve in enumerate(curves)]
-    (table,) = page.guide_training(runs)
-    assert cells(table)[1] == ["a", "3", "1.00 to 2.00 (1 of 3 seeds)"]
 
 
 def test_case_may_be_called_like_a_column(tmp_path):
