@@ -1,6 +1,5 @@
 """Runs from Python: the lines of the docs on a stranger's package, and what an object may be."""
 
-import csv
 import json
 import math
 from functools import partial
@@ -11,7 +10,7 @@ import pandas as pd
 import pytest
 import torch
 from outside_package.install import SOURCE
-from programs import called
+from programs import called, read_csv
 from torchrl.envs import PendulumEnv
 
 import coil_rl
@@ -34,11 +33,6 @@ def package(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
 
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.mark.slow
 def test_nine_lines_of_the_docs(tmp_path):
     from thermostat.control import PI
@@ -59,7 +53,7 @@ def test_nine_lines_of_the_docs(tmp_path):
     assert list(deterministic["case"]) == ["0", "1", "2", "mean"] * 2
     assert action.shape == (1,)
     assert 0 <= action[0] <= 1
-    metrics = rows(tmp_path / "outputs" / "room" / "metrics.csv")
+    metrics = read_csv(tmp_path / "outputs" / "room" / "metrics.csv")
     assert [int(float(row["frames/rollout"])) for row in metrics] == [0, 32, 64]
     parts = [float(metrics[-1][f"frames/{part}"]) for part in ("before", "rollout", "tests")]
     assert float(metrics[-1]["frames"]) == sum(parts), "the tests are frames too"
@@ -245,12 +239,12 @@ def test_mistake_is_one_sentence(arguments, message, tmp_path):
 def test_longer_run_goes_on_and_says_what_its_schedules_mean(tmp_path, capsys):
     folder = tmp_path / "run"
     run = coil_rl.train(ENV, frames=64, folder=folder, overrides=SHORT)
-    first = rows(folder / "metrics.csv")
+    first = read_csv(folder / "metrics.csv")
     with pytest.raises(UserError, match=r"has budget\.frames=64, more than 32"):
         run.train(frames=32)
     capsys.readouterr()
     called("train", f"resume={folder}", "budget.frames=128", "trust=[thermostat]")
-    longer = rows(folder / "metrics.csv")
+    longer = read_csv(folder / "metrics.csv")
     learned = [name for name in first[0] if name.startswith(("train/", "learner/"))]
     kept = [[row[name] for name in learned] for row in longer[: len(first)]]
     assert kept == [[row[name] for name in learned] for row in first]
@@ -302,7 +296,7 @@ def test_run_from_parts_is_trained_resumed_and_reported(tmp_path):
     run = Run(tmp_path / "runs" / "mine", **parts).train()
     assert math.isfinite(run.evaluate()["reward"].mean())
     again = Run(tmp_path / "runs" / "mine", **parts)
-    reward = float(rows(run.folder / "evaluation.csv")[-1]["reward"])
+    reward = float(read_csv(run.folder / "evaluation.csv")[-1]["reward"])
     assert again.finish_begun() == pytest.approx(reward)
     called("report", f"folder={tmp_path / 'runs'}")
     assert "mine" in (tmp_path / "runs" / "report.md").read_text()

@@ -3,14 +3,13 @@
 They do so with their guide and with each kind of learner.
 """
 
-import csv
 import shlex
 import signal
 import time
 
 import kill_and_resume
 import pytest
-from programs import called, composed, shipped
+from programs import called, composed, read_csv, shipped
 
 from coil_rl.config.parts import env_maker
 
@@ -95,8 +94,7 @@ def test_env_takes_steps_with_the_advice_of_its_guide(env):
 @pytest.mark.parametrize("env", [*TRACKED, *OTHERS])
 def test_env_trains_and_is_evaluated_in_its_own_cases(env, tmp_path):
     trained(env, "ppo", tmp_path / "run")
-    with (tmp_path / "run" / "evaluation.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_csv(tmp_path / "run" / "evaluation.csv")
     cases = {row["case"] for row in rows} - {"mean"}
     assert (cases == {"0", "1", "2"}) == (env in OTHERS)
     assert ("completed" in rows[0]) == (env in TRACKED)

@@ -1,12 +1,11 @@
 """A fault in an env or controller of somebody else ends every program with one sentence."""
 
-import csv
 import textwrap
 import warnings
 
 import numpy as np
 import pytest
-from programs import called
+from programs import called, read_csv
 
 import coil_rl
 
@@ -152,10 +151,7 @@ def test_flag_of_info_says_which_steps_count_and_a_run_is_measured_again(tmp_pat
     again = ["run=run", "trust=[odd_plants]", "hydra.run.dir=again", "env.info=[time]"]
     again.append("evaluation.measures.end={entry: [info, time], reduction: last}")
     called("evaluate", *again, cwd=tmp_path)
-    found = {}
-    for folder in ("run", "again"):
-        with (tmp_path / folder / "episodes.csv").open(newline="") as file:
-            found[folder] = list(csv.DictReader(file))
+    found = {name: read_csv(tmp_path / name / "episodes.csv") for name in ("run", "again")}
     assert {row["after"] for row in found["run"]} == {"7.0"}, "steps 6 to 12"
     assert {row["after"] for row in found["again"]} == {"7.0"}
     assert {row["end"] for row in found["again"]} == {"12.0"}

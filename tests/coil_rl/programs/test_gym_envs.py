@@ -1,9 +1,7 @@
 """The shipped envs of Gymnasium: each is evaluated with its public controller."""
 
-import csv
-
 import pytest
-from programs import TINY_ARM, called
+from programs import TINY_ARM, called, read_csv
 
 # Of each env: what it needs, and the least mean reward of its controller.
 ENVS = {
@@ -23,8 +21,8 @@ def test_controller_of_an_env_is_evaluated(env, tmp_path):
     package, least = ENVS[env]
     pytest.importorskip(package)
     called("evaluate", f"env={env}", "evaluation.cases=2", "hydra.run.dir=run", cwd=tmp_path)
-    with (tmp_path / "run" / "evaluation.csv").open(newline="") as file:
-        rewards = {row["case"]: float(row["reward"]) for row in csv.DictReader(file)}
+    rows = read_csv(tmp_path / "run" / "evaluation.csv")
+    rewards = {row["case"]: float(row["reward"]) for row in rows}
     assert rewards["mean"] >= least
 
 

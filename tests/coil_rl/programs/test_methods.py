@@ -1,12 +1,11 @@
 """Every method trains, evaluates and resumes with the same programs."""
 
-import csv
 import json
 import shutil
 
 import pytest
 import torch
-from programs import composed
+from programs import composed, read_csv
 from tiny_runs import METHODS, TRACKS, trained
 
 from coil_rl.config.python import open_run
@@ -50,8 +49,8 @@ def plain(tmp_path_factory):
 
 
 def rows(folder, **where):
-    with (folder / "evaluation.csv").open(newline="") as file:
-        return [row for row in csv.DictReader(file) if where.items() <= row.items()]
+    found = read_csv(folder / "evaluation.csv")
+    return [row for row in found if where.items() <= row.items()]
 
 
 def evaluated(run, folder, *words):
@@ -87,9 +86,7 @@ def test_trained_agent_is_evaluated_with_other_advice(residual, tmp_path):
 def test_rfc_logs_the_reward_of_the_task_alone(tmp_path, plain):
     # Before the first update its numbers are those of plain PPO.
     coupled = trained(tmp_path / "rfc", "rfc", "method.transforms.coupling.beta=1000")
-    (_, first, *_), (_, other, *_) = (
-        csv.DictReader((run / "metrics.csv").open(newline="")) for run in (coupled, plain)
-    )
+    first, other = (read_csv(run / "metrics.csv")[1] for run in (coupled, plain))
     same = [key for key in other if key.startswith("train/")]
     assert {key: first[key] for key in same} == {key: other[key] for key in same}
     assert float(first["train/guide_distance"]) > 0

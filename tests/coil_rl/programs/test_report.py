@@ -1,9 +1,8 @@
-import csv
 import shutil
 from pathlib import Path
 
 import pytest
-from programs import TINY, called
+from programs import TINY, called, read_csv
 from run_folders import driven, make_run, make_sweep
 
 KINDS = ("", "_cases", "_curves")
@@ -24,11 +23,6 @@ def report(*arguments):
 
 def all_files():
     return {str(path) for path in Path().rglob("*")}
-
-
-def read_csv(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.mark.slow
