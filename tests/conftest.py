@@ -146,10 +146,7 @@ def levels() -> list[Track]:
 @pytest.fixture(scope="session")
 def ring() -> Track:
     """Return a round track of 31 m, driven anticlockwise."""
-    inner, outer = (
-        np.linspace(0, 2 * np.pi, 16, endpoint=False),
-        np.linspace(0, 2 * np.pi, 26, endpoint=False),
-    )
+    inner, outer = (np.linspace(0, 2 * np.pi, count, endpoint=False) for count in (16, 26))
     left, right = (np.stack([np.cos(turn), np.sin(turn)], axis=1) for turn in (inner, outer))
     return Track("ring", left=3.7 * left, right=6.3 * right)
 

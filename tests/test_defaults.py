@@ -22,16 +22,9 @@ VARIATION_FOLDERS = ("experiment", "method", "preset", "paper/experiment", "stud
 VARIATIONS = {
     "env/cone_track.yaml": ["env.reward"],  # None in the constructor: the rewards of the paper
     "env/driving_tasks.yaml": ["env.reward"],
-    "robot/env/simulated_robot.yaml": [
-        "env.reward",
-        "env.lidar",
-        "env.car_length",
-    ],  # rounded length
-    "env/gym.yaml": [
-        "env.options",
-        "env.controllers",
-        "env.workers",
-    ],  # None in the constructor: no options, no controllers; from Python processes are asked for
+    "robot/env/simulated_robot.yaml": ["env.reward", "env.lidar", "env.car_length"],  # rounded
+    # None in the constructor: no options, no controllers; from Python processes are asked for.
+    "env/gym.yaml": ["env.options", "env.controllers", "env.workers"],
     # None in the constructor: nothing, and a reward for setpoints that a command line may change.
     "fmu/env/fmu.yaml": [
         *(f"env.{name}" for name in ("setpoints", "parameters", "start", "bounds", "controllers")),

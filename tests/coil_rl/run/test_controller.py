@@ -5,13 +5,14 @@ import copy
 import numpy as np
 import pytest
 import torch
+from any_env import AnyEnv
 from learned_runs import ON_POLICY, OPTIONS, STEPS, TINY, learned
 from outside_package.install import SOURCE
 from programs import shipped
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import Compose, EnvBase, ExplorationType, TransformedEnv, set_exploration_type
+from torchrl.data import Bounded, Unbounded
+from torchrl.envs import Compose, ExplorationType, TransformedEnv, set_exploration_type
 
 import coil_rl
 from coil_rl.run.controller import Controller
@@ -121,9 +122,8 @@ def test_cone_world_is_sent_its_steering(tmp_path):
     folder = tmp_path / "run"
     small = [word for word in TINY if not word.startswith(("env.", "evaluation.cases"))]
     small += [*ON_POLICY, "track=generated", "track.train.count=1", "track.test.count=1"]
-    run = coil_rl.prepare(
-        "cone_track", guide="spline", method="residual", frames=32, folder=folder, overrides=small
-    )
+    options = {"method": "residual", "frames": 32, "folder": folder, "overrides": small}
+    run = coil_rl.prepare("cone_track", guide="spline", **options)
     run.begin()
     run.learn()
     env = run.make_env(1, TEST)
@@ -141,31 +141,11 @@ def test_cone_world_is_sent_its_steering(tmp_path):
         controller.act(observation.clone().set("observation", observation["observation"] / 0))
 
 
-class Tank(EnvBase):
-    """An env with one observation, which is inside of another entry."""
-
-    def __init__(self):
-        super().__init__(batch_size=[1])
-        self.observation_spec = Composite(
-            tank=Composite(level=Unbounded((1, 1)), shape=[1]), shape=[1]
-        )
-        self.action_spec = Bounded(-10, 10, (1, 1))
-        self.reward_spec = Unbounded((1, 1))
-
-    def _set_seed(self, seed):
-        pass
-
-    def _reset(self, tensordict):
-        return self.observation_spec.zero()
-
-    def _step(self, tensordict):
-        raise NotImplementedError  # a controller never steps its env
-
-
 def doubling():
-    """Return a controller that acts twice the level."""
+    """Return a controller that acts twice the level, which is inside of another entry."""
     policy = TensorDictModule(lambda level: 2 * level, [("tank", "level")], ["action"])
-    return Controller(TransformedEnv(Tank(), Compose()), policy)
+    env = AnyEnv(1, Bounded(-10, 10, (1,)), {("tank", "level"): Unbounded((1,))})
+    return Controller(TransformedEnv(env, Compose()), policy)
 
 
 @pytest.mark.parametrize(
