@@ -84,12 +84,6 @@ def test_reward_that_is_nan_is_no_part_of_a_mean(tmp_path, monkeypatch, capsys):
     assert "the reward of ppo_alone is nan in 1 of 2 cases" in capsys.readouterr().err
 
 
-def changed(path, **settings):
-    """Change the configuration of a run."""
-    file = path / "config.yaml"
-    file.write_text(json.dumps(json.loads(file.read_text()) | settings))
-
-
 @pytest.mark.parametrize(
     ("cases", "settings", "seed", "message"),
     [
@@ -102,7 +96,7 @@ def changed(path, **settings):
 def test_runs_that_cannot_be_compared_are_refused(cases, settings, seed, message, tmp_path):
     small(tmp_path, {"ppo_alone": 10.0, "coil_intact": 5.0}, seeds=2)
     rows = [row for who in ("guide", "coil_intact") for row in driven(who, dict.fromkeys(cases, 9))]
-    changed(make_run(tmp_path / "further", "coil_intact", seed, rows), **settings)
+    make_run(tmp_path / "further", "coil_intact", seed, rows, settings=settings)
     with pytest.raises(UserError, match=message):
         rows_of(read_runs([tmp_path]))
 
