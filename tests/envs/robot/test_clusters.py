@@ -33,7 +33,9 @@ def expect_exact(ranges, angles, range_min=0.02, range_max=1.15, gap=GAP) -> int
         rows = np.flatnonzero(points.scan == scan)
         assert as_sets(label[rows], rows) == dense(points, scan, gap)
     assert len(label) == len(points.scan)
-    return len(np.unique(label))
+    numbers = np.unique(label)
+    assert numbers.tolist() == list(range(len(numbers)))
+    return len(numbers)
 
 
 def scans(seed: int, count: int, beams: int = 360):
