@@ -53,7 +53,7 @@ def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> 
     words = [f"+experiment={experiment}", *overrides]
     seeds, folders = list(seeds), []
     for choice in choices(experiment, words):
-        config = _composed([*words, *choice])
+        config = _composed(choice)
         for seed in seeds:
             config.seed = seed
             folders.append(Path(config.hydra.sweep.dir, config.hydra.sweep.subdir))
@@ -62,19 +62,20 @@ def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> 
 
 
 def choices(experiment: str, words: Sequence[str]) -> Iterator[Sequence[str]]:
-    """Yield the overrides of each run of a sweep, without its seed.
+    """Yield the words of each run of a sweep, without its seed.
+
+    A word of the command line takes the place of a parameter of the file, as Hydra has it.
 
     Args:
         experiment: name of the file, for the message.
         words: of the command line of `coil-train`, with this experiment.
     """
-    # Composed without any choice first, as Hydra does it too.
     params: dict[str, Any] = dict(_composed(words).hydra.sweeper.params or {})
     if not params:
         raise UserError(f"experiment={experiment} has no hydra.sweeper.params: it is no sweep")
     params.pop("seed", None)
     parsed = OverridesParser.create().parse_overrides(
-        [f"{key}={value}" for key, value in params.items()]
+        [*(f"{key}={value}" for key, value in params.items()), *words]
     )
     (batch,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
     yield from batch

@@ -32,18 +32,23 @@ def export(config: DictConfig) -> None:
     size = exported.contract["files"][exported.file.name]["bytes"] / 1000
     print(f"export: {exported.file} has {size:.0f} kB; guide {guide}; see {config.run_dir}")
     drive = f"on the machine: {config.run_dir}/drive.py, with numpy and onnxruntime alone"
-    print(f"Next: {next_step(str(config.run), str(config.run_dir), guide)} | {drive}")
+    print(f"Next: {next_step(config, guide)} | {drive}")
 
 
-def next_step(run: str, folder: str, guide: str) -> str:
-    """Return what to type after an export.
+def next_step(config: DictConfig, guide: str) -> str:
+    """Return the command that uses an export; for a guide outside, the expression of Python.
 
     Args:
+        config: of the program.
         guide: its place, "inside", "outside" or "absent".
     """
+    from coil_rl.run.stopping import command_of
+
+    folder = str(config.run_dir)
     if guide == "outside":
         return f"coil_rl.ExportedPolicy({folder!r}).act(observation, guide_action) in Python"
-    return f"coil-evaluate run={shlex.quote(run)} exported={shlex.quote(folder)}"
+    command = command_of("coil-evaluate", "run", config.run, config.trust)
+    return f"{command} {shlex.quote(f'exported={folder}')}"
 
 
 def check(config: DictConfig) -> None:

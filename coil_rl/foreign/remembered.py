@@ -3,7 +3,8 @@
 import copy
 import io
 import pickle
-from collections.abc import Callable, Iterator
+import weakref
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -36,26 +37,40 @@ def state_of(thing: Any, make: Callable[[], Any]) -> dict[str, Any] | None:
     """Return what `state_dict` of an object says; None if the object remembers more.
 
     A network whose class leaves `state_dict` to torch may remember something in plain attributes,
-    or in buffers that are not persistent: what is another than in a new object.
+    or in buffers that are not persistent: those that differ from a new object's.
     """
     if isinstance(thing, nn.Module) and type(thing).state_dict is nn.Module.state_dict:
         with torch.random.fork_rng():
-            new = dict(_plain(make()))
-        now = dict(_plain(thing))
-        if now.keys() != new.keys() or not all(_is_same(now[place], new[place]) for place in now):
+            new = make()
+        if _remembers_more(thing, new):
             return None
     state: dict[str, Any] = thing.state_dict()
     return state
 
 
-def _plain(network: nn.Module) -> Iterator[tuple[tuple[str, str], Any]]:
-    """Yield what torch does not save of a network: by part and name, the value."""
+def _remembers_more(network: nn.Module, new: nn.Module) -> bool:
+    """Return whether what torch does not save of a network differs from that of a new one."""
+    now, begun, saved, of_new = _plain(network), _plain(new), _saved(network), _saved(new)
+    return now.keys() != begun.keys() or not all(
+        value is begun[place] or pickled(value, saved) == pickled(begun[place], of_new) != b""
+        for place, value in now.items()
+    )
+
+
+def _plain(network: nn.Module) -> dict[tuple[str, str], Any]:
+    """Return what torch does not save of a network, by part and name."""
+    found = {}
     for part, module in network.named_modules():
-        for name, value in vars(module).items():
+        unsaved = {name: module._buffers[name] for name in module._non_persistent_buffers_set}
+        for name, value in (vars(module) | unsaved).items():
             if name not in OF_TORCH:
-                yield (part, name), value
-        for name in module._non_persistent_buffers_set:
-            yield (part, name), module._buffers[name]
+                found[part, name] = value
+    return found
+
+
+def _saved(network: nn.Module) -> dict[int, str]:
+    """Return the names of what torch saves of a network, by `id`."""
+    return {id(value): name for name, value in network.state_dict(keep_vars=True).items()}
 
 
 def copied(value: Any) -> Any:
@@ -75,16 +90,36 @@ def loaded(file: io.BytesIO, device: str | None = None) -> Any:
         return torch.load(file, map_location=device, weights_only=True)
 
 
-def _is_same(value: Any, other: Any) -> bool:
-    """Return whether two values are one, or have the same content."""
-    if isinstance(value, torch.Tensor):  # of which a pickle has the place in memory
-        return isinstance(other, torch.Tensor) and torch.equal(value, other)
-    return value is other or pickled(value) == pickled(other) != b""
+class _Pickler(pickle.Pickler):
+    """Writes numbers where torch and weak references write a place in memory.
+
+    Args:
+        saved: names that are written in place of tensors, by their `id`.
+    """
+
+    def __init__(self, file: io.BytesIO, saved: Mapping[int, str]) -> None:
+        super().__init__(file)
+        self.saved = saved
+
+    def reducer_override(self, value: Any) -> Any:
+        if id(value) in self.saved:
+            return str, (self.saved[id(value)],)
+        if isinstance(value, torch.Tensor):
+            return torch.from_numpy, (value.detach().cpu().numpy(),)
+        if isinstance(value, weakref.ref):
+            return weakref.ref, (value(),)
+        return NotImplemented
 
 
-def pickled(value: Any) -> bytes:
-    """Return the content of a value; empty for what cannot be pickled."""
+def pickled(value: Any, saved: Mapping[int, str] | None = None) -> bytes:
+    """Return the content of a value; empty for what cannot be pickled.
+
+    Args:
+        saved: names that are written in place of tensors, by their `id`.
+    """
+    file = io.BytesIO()
     try:
-        return pickle.dumps(value)
+        _Pickler(file, saved or {}).dump(value)
     except Exception:  # whatever the pickling of somebody else's object raises
         return b""
+    return file.getvalue()

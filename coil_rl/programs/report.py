@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from coil_rl.config.folder import PREFIX
 from coil_rl.errors import UserError, did_you_mean
@@ -109,6 +109,14 @@ class EnvPart:
         ]
 
 
+def _continuing(run: Run) -> str:
+    """Return the command that continues a run."""
+    from coil_rl.config.trust import to_trust
+    from coil_rl.run.stopping import resume_command
+
+    return resume_command(run.folder, to_trust(OmegaConf.create({**run.settings})))
+
+
 def report(config: DictConfig) -> None:
     """Compare the finished runs, and print the page.
 
@@ -121,7 +129,6 @@ def report(config: DictConfig) -> None:
     from coil_rl.report.html import Section, html_page
     from coil_rl.report.runs import failed_jobs, read_runs
     from coil_rl.report.sentences import REPORT
-    from coil_rl.run.stopping import resume_command
 
     folders = _folders(config)
     runs = read_runs(folders)
@@ -129,7 +136,7 @@ def report(config: DictConfig) -> None:
     if not finished:
         raise UserError(
             f"none of the runs in folder={config.folder} is finished; "
-            f"continue one with {resume_command(runs[0].folder)}, "
+            f"continue one with {_continuing(runs[0])}, "
             "or repeat the command that started them"
         )
     parts, envs = _parts(finished, ACTIONS[config.actions], config.against)

@@ -386,7 +386,7 @@ class Run:
             raise UserError(
                 f"{self.folder} was begun with another file of {names}, so one curve would be of "
                 "two tasks; put the file back, train another run, or go on with "
-                f"{resume_command(self.folder)} changed={ACCEPT}"
+                f"{resume_command(self.folder, self.trust)} changed={ACCEPT}"
             )
         if names:
             begun = code_of(self.folder)

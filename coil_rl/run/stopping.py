@@ -65,7 +65,7 @@ class Stop:
 STOP = Stop()
 
 
-def command_of(program: str, key: str, folder: Path, trust: Sequence[str] = ()) -> str:
+def command_of(program: str, key: str, folder: Path | str, trust: Sequence[str]) -> str:
     """Return the command that takes the folder of a run, as a shell reads it.
 
     Args:
@@ -76,6 +76,6 @@ def command_of(program: str, key: str, folder: Path, trust: Sequence[str] = ()) 
     return shlex.join([program, f"{key}={folder}", *words])
 
 
-def resume_command(folder: Path, trust: Sequence[str] = ()) -> str:
+def resume_command(folder: Path, trust: Sequence[str]) -> str:
     """Return the command that continues a run, as a shell reads it."""
     return command_of("coil-train", "resume", folder, trust)

@@ -47,6 +47,11 @@ def test_sweep_is_composed_beside_the_files_of_the_running_program(authors):
         assert compose("reproduce") == before
 
 
+def test_word_of_the_command_takes_the_place_of_a_parameter_of_the_file():
+    folders = planned("paper_authors", ["method=ppo", "budget.frames=64"], seeds=[0]).all_folders
+    assert [folder.name.rpartition("_")[0] for folder in folders] == ["ppo_seed0"]
+
+
 @pytest.mark.slow
 def test_lists_are_values_of_a_sweep():
     folders = planned("paper_placebo", seeds=[3]).all_folders

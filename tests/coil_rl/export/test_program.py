@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from omegaconf import OmegaConf
 from programs import called
 
 from coil_rl.export.contract import CONTRACT
@@ -30,10 +31,12 @@ def test_export_prints_what_it_does_and_what_comes_next(exported):
     assert all(line.startswith("export: ") for line in lines[:-1])  # no notes of libraries
 
 
-def test_next_step_of_a_guide_outside_is_python():
-    assert next_step("RUN", "folder", "absent") == "coil-evaluate run=RUN exported=folder"
+def test_next_step_trusts_what_the_export_trusts_and_is_python_for_a_guide_outside():
+    config = OmegaConf.create({"run": "RUN", "run_dir": "folder", "trust": ["mine"]})
+    evaluate = "coil-evaluate run=RUN 'trust=[mine]' exported=folder"
+    assert next_step(config, "absent") == evaluate
     text = "coil_rl.ExportedPolicy('folder').act(observation, guide_action) in Python"
-    assert next_step("RUN", "folder", "outside") == text
+    assert next_step(config, "outside") == text
 
 
 @pytest.mark.slow

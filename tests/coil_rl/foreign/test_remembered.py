@@ -1,5 +1,6 @@
 """Networks as guides: what acts is their `act`, if their class has one, else `forward`."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -131,3 +132,29 @@ def test_network_that_remembers_what_torch_does_not_save_begins_new_episodes(beg
     with pytest.warns(UserWarning, match="for all that it remembers, so new episodes begin"):
         guide.load_state_dict(guide.state_dict())
     assert not guide.guide.continues
+
+
+class Recurrent(nn.Module):
+    """Its memory is a buffer, and its layer holds its weights a second time, in plain lists."""
+
+    def __init__(self, kind):
+        super().__init__()
+        self.layer, self.constants = kind(1, 1), [torch.full((1,), torch.nan)]
+        self.register_buffer("memory", torch.zeros(1, 1))
+
+    def act(self, observation):
+        self.memory = self.layer(torch.as_tensor(observation)[None], self.memory)[1]
+        return self.memory[0]
+
+
+@pytest.mark.parametrize("kind", [nn.GRU, nn.RNN])
+@pytest.mark.parametrize("of_class", [False, True])
+def test_recurrent_network_goes_on_with_its_episodes(kind, of_class):
+    make = partial(Recurrent, kind)
+    guide = ControllerGuide(make if of_class else make())
+    asked(guide, [0.5, -1.0], first=True)
+    state = guide.state_dict()
+    expected = asked(guide, [0.1, 0.2], first=False)
+    guide.load_state_dict(state)
+    assert guide.guide.continues
+    assert torch.equal(asked(guide, [0.1, 0.2], first=False), expected)
