@@ -25,7 +25,7 @@ from torchrl.envs import EnvBase, ExplorationType, exploration_type, set_explora
 
 from coil_rl.learners.critics import Critics
 from coil_rl.learners.encoders import Mlp
-from coil_rl.learners.n_step import discount
+from coil_rl.learners.n_step import discounted
 from coil_rl.learners.policy import ByKey, Entries, Policy, next_of
 from coil_rl.learners.sac import SAC, SACSettings
 from coil_rl.learners.weights import Weights
@@ -123,7 +123,7 @@ class IBRL(SAC):
             shares = self.proposals.shares(values)
             value = (shares * values).sum(0)
             reward = minibatch["next", "reward"].squeeze(-1).to(value.dtype)
-            target = (reward + discount(minibatch, self.gamma) * value).unsqueeze(-1)
+            target = (reward + discounted(minibatch, self.gamma, value)).unsqueeze(-1)
         losses = self.distances(self.critics.outputs(minibatch, train=True), target)
         return losses | {"guide_share": shares[0].mean()}
 

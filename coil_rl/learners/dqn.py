@@ -21,7 +21,7 @@ from torchrl.modules import EGreedyModule, QValueModule
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import AnchoredInputs, AnchoredValues, hold_of
 from coil_rl.learners.encoders import Mlp, ObservationNetwork, without_memory
-from coil_rl.learners.n_step import discount
+from coil_rl.learners.n_step import discounted
 from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerStep
 from coil_rl.learners.policy import Entries, next_of, read_through
 from coil_rl.learners.weights import Weights
@@ -152,7 +152,7 @@ class DQN(OffPolicy):
         selecting = self.values(next_of(minibatch))["action_value"] if self.double else values
         best = values.gather(-1, selecting.argmax(-1, keepdim=True)).squeeze(-1)
         reward = minibatch["next", "reward"].squeeze(-1).to(best.dtype)
-        return reward + discount(minibatch, self.gamma) * best
+        return reward + discounted(minibatch, self.gamma, best)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Store the steps of a batch and learn; arguments as for `OffPolicy.update`.

@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import expand_as_right
 from torch import Tensor
 
 STEPS: NestedKey = ("next", "steps")  # entry [N, 1]: number of steps of a sum of rewards
@@ -80,9 +81,27 @@ class NStep:
         self.waiting, self.given = state.get("waiting"), state.get("given")
 
 
-def discount(minibatch: Any, gamma: Tensor) -> Tensor:
-    """Return the factor of the value after each step of a minibatch, [N]; 0 at a termination."""
-    going_on = (~minibatch[("next", "terminated")]).to(gamma.dtype).squeeze(-1)
+def discounted(minibatch: Any, gamma: Tensor, value: Tensor) -> Tensor:
+    """Return what the state after each step of a minibatch adds to its return, like `value`.
+
+    That is 0 after a termination. The state in which an episode was truncated is in no step that
+    is learned from: what a network makes of it is a guess, and where the time or a queue grows
+    during an episode, the guess and what is learned from it drift without end. So its value is
+    limited to one standard deviation from the mean of the others.
+
+    Args:
+        gamma: the discount.
+        value: of the state after each step, [N] or [N, n].
+    """
+    done, terminated = (
+        expand_as_right(minibatch["next", name].squeeze(-1), value)
+        for name in ("done", "terminated")
+    )
+    others = (~done).sum().clamp(min=1)
+    mean = torch.where(done, 0, value).sum() / others
+    deviation = (torch.where(done, 0, (value - mean).square()).sum() / others).sqrt()
+    limited = value.clamp(mean - deviation, mean + deviation)
+    value = torch.where(terminated, 0, torch.where(done, limited, value))
     if STEPS not in minibatch:
-        return going_on * gamma
-    return going_on * gamma ** minibatch[STEPS].squeeze(-1)
+        return gamma * value
+    return gamma ** expand_as_right(minibatch[STEPS].squeeze(-1), value) * value

@@ -227,7 +227,7 @@ class OffPolicy(Stateful, Learner):
         """Store the steps of a batch and learn from stored steps.
 
         Args:
-            batch: [*B, T] with `keys`. A truncated episode is bootstrapped.
+            batch: [*B, T] with `keys`. A truncated episode is bootstrapped, see `discounted`.
             progress: of the run, in [0, 1], for the schedules.
 
         Returns:

@@ -31,7 +31,7 @@ from coil_rl.learners.critics import Critics, Norm
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.kickstart import KickstartLoss
-from coil_rl.learners.n_step import discount
+from coil_rl.learners.n_step import discounted
 from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerStep
 from coil_rl.learners.policy import ByKey, Entries, Policy, next_of
 from coil_rl.learners.weights import Weights
@@ -265,7 +265,7 @@ class SAC(OffPolicy):
         """
         value = self.next_values(outputs) - (self.alpha * log_prob).unsqueeze(-1)
         reward = minibatch["next", "reward"].to(value.dtype)
-        return reward + discount(minibatch, self.gamma).unsqueeze(-1) * value
+        return reward + discounted(minibatch, self.gamma, value)
 
     def next_values(self, outputs: Tensor) -> Tensor:
         """Return the values of the next state, [N, n], from those of all critics."""

