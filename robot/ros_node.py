@@ -5,6 +5,7 @@ ROS 2 brings them (`source /opt/ros/DISTRO/setup.bash`); they are not on PyPI.
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable
 from typing import Any
@@ -15,9 +16,9 @@ from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -149,16 +150,19 @@ class DriveNode(Node):
 
 
 def run_node(driver: LiveDriver, **options: Any) -> None:
-    """Drive until the node is shut down; the last command stops the car.
+    """Drive until Ctrl-C or SIGTERM, then publish a stop.
+
+    The handlers of rclpy would invalidate the context first, after which nothing can be published.
 
     Args:
         options: those of `DriveNode`.
     """
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     node = DriveNode(driver, **options)
     try:
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         pass
     finally:
         node.publish(driver.stop("the node ends", node.now()))

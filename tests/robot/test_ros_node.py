@@ -1,6 +1,7 @@
 """The ROS 2 node, against a stub of the part of rclpy that it uses."""
 
 import importlib
+import signal
 import sys
 from types import ModuleType, SimpleNamespace
 from typing import ClassVar
@@ -78,19 +79,19 @@ def ros(monkeypatch):
         monkeypatch.setitem(sys.modules, package.__name__, package)
         monkeypatch.setitem(sys.modules, name, module)
     rclpy = ModuleType("rclpy")
-    rclpy.init = rclpy.try_shutdown = lambda: None
+    rclpy.try_shutdown = lambda: None
     parts = {
         "clock": {
             "Clock": SimpleNamespace,
             "ClockType": SimpleNamespace(STEADY_TIME="steady"),
         },
-        "executors": {"ExternalShutdownException": type("Shutdown", (Exception,), {})},
         "node": {"Node": Node},
         "qos": {
             "DurabilityPolicy": SimpleNamespace(TRANSIENT_LOCAL="latched"),
             "QoSProfile": SimpleNamespace,
             "ReliabilityPolicy": SimpleNamespace(BEST_EFFORT="best effort", RELIABLE="reliable"),
         },
+        "signals": {"SignalHandlerOptions": SimpleNamespace(NO="none")},
     }
     monkeypatch.setitem(sys.modules, "rclpy", rclpy)
     for name, values in parts.items():
@@ -213,15 +214,23 @@ def test_services_lift_and_stop_and_odometry_is_compared(ros):
     assert node.services["/coil/lift"](None, SimpleNamespace()).message == "waiting: no scan yet"
 
 
-def test_the_last_command_stops_the_car(ros):
-    driver, nodes = Driver(), []
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_last_command_stops_the_car(ros, monkeypatch, number):
+    driver, nodes, options = Driver(), [], []
 
     def spin(node):
         nodes.append(node)
         node.publish(driver.scan(None, 0.0))
-        raise KeyboardInterrupt
+        signal.raise_signal(number)
 
-    sys.modules["rclpy"].spin = spin
+    monkeypatch.setattr(sys.modules["rclpy"], "spin", spin, raising=False)
+    monkeypatch.setattr(
+        sys.modules["rclpy"], "init", lambda **given: options.append(given), raising=False
+    )
+    before = signal.getsignal(signal.SIGTERM)
     ros.run_node(driver)
+    signal.signal(signal.SIGTERM, before)
+    # The handlers of rclpy invalidate the context: nothing can be published after them.
+    assert options == [{"signal_handler_options": "none"}]
     assert commands(nodes[0])[-2:] == [(0.15, 0.2), (0.0, 0.0)]
     assert nodes[0].destroyed
