@@ -96,7 +96,7 @@ def target(arguments: Sequence[str]) -> Path:
     """Return the path of the picture.
 
     Raises:
-        UserError: for anything but nothing or one name that ends with .png.
+        UserError: for several arguments, or one that does not end with .png.
     """
     if not arguments:
         return Path(PICTURE)

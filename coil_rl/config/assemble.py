@@ -54,7 +54,7 @@ _DEPTH: ContextVar[int] = ContextVar("depth", default=0)
 
 
 def assemble(config: DictConfig, folder: Path | None = None) -> Run:
-    """Return the run that a configuration describes; nothing is built or written yet.
+    """Return the run that a configuration describes; its envs and learner are built when used.
 
     Args:
         config: of `coil-train`, composed or read from a folder.
@@ -238,7 +238,7 @@ class LearnedGuide(HostedGuide):
         self.by_row = any(isinstance(guide, HostedGuide) and guide.by_row for guide in inner)
         first = self.chain.first(TensorDict({}, [1], device=env.device))
         self.memory = {f"learned_{n}": at for n, at in enumerate(self.chain.remembered(first))}
-        self.start = {name: first[n][key][0] for name, (n, key) in self.memory.items()}
+        self.start = {name: first[link][key][0] for name, (link, key) in self.memory.items()}
         supplied = {key for each in guides for key in each.supplied}
         self.in_keys = [*self.chain.reads, *supplied.intersection(["row"]), *self.memory]
         self.out_keys: list[NestedKey] = ["action", *(("next", name) for name in self.memory)]

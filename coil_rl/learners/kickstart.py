@@ -15,9 +15,8 @@ from coil_rl.learners.extension import Extension
 from coil_rl.ranges import Positive, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 
-# Minimum distance of a guide's action from the bounds, as a fraction of half the range. A policy
-# that imitates a bound itself is so far in the flat part of the squashing that nothing is left to
-# explore with, and later gradients are almost zero.
+# Minimum distance of a guide's action from the bounds, as a fraction of half the range. To imitate
+# a bound saturates the squashing: noise then has no effect, and gradients are almost zero.
 EDGE = 0.2
 
 
@@ -129,12 +128,11 @@ class FilteredKickstartLoss(KickstartLoss):
         own = policy.get_dist(minibatch.select(*policy.in_keys)).mode
         advice = minibatch[self.advice_key][..., self.guide, :]
         of_guide, of_policy = self._values(minibatch, advice), self._values(minibatch, own)
-        values = torch.stack([of_guide, of_policy])
-        gain = values[0].mean(0) - values[1].mean(0)
-        spread = values.var(1).sum(0).sqrt().clamp_min(1e-8)
-        if self.soft:
-            return torch.special.ndtr(gain / spread)
-        return (gain > 0).to(gain.dtype)
+        gain = of_guide.mean(0) - of_policy.mean(0)
+        if not self.soft:
+            return (gain > 0).to(gain.dtype)
+        spread = (of_guide.var(0) + of_policy.var(0)).sqrt().clamp_min(1e-8)
+        return torch.special.ndtr(gain / spread)
 
     def _values(self, minibatch: TensorDictBase, action: Tensor) -> Tensor:
         return self.critics.values(minibatch.copy().set("action", action))  # type: ignore[union-attr]

@@ -10,8 +10,8 @@ policy maximises min Q(s, a) - alpha log pi(a | s), and alpha is adjusted to kee
 policy near a target.
 
 With many critics, y has the minimum over a random few of them, and the policy maximises their mean
-(REDQ, Chen et al. 2021). With dropout in two critics it is DroQ (Hiraoka et al. 2022). RLPD is this
-with a share of prior steps in each minibatch (Ball et al. 2023).
+(REDQ, Chen et al. 2021). DroQ has dropout and normalised layers in two critics (Hiraoka et al.
+2022). RLPD is this with a share of prior steps in each minibatch (Ball et al. 2023).
 """
 
 import copy

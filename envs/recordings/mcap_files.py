@@ -122,7 +122,7 @@ def read_messages(
     """Read a recording from start to end, with its checksums verified.
 
     One that ends early is read as far as it goes, and damaged chunks are skipped. Another kind of
-    file, or damage outside of the chunks, is a `RecordingError`.
+    file, or damage after which no record can be found, is a `RecordingError`.
 
     Args:
         path: an MCAP file, or the folder of a rosbag2 recording in MCAP files.
