@@ -90,7 +90,7 @@ def test_numbers_of_the_table_are_those_of_the_benchmark():
             assert sac_alone == " - "
         for arm, pair in zip(("intact", "reversed", "random"), pairs, strict=True):
             row = measured[task, arm]
-            guide, end = pair.split(",")
+            guide, end = pair.split("→")
             check_number(guide, row["guide"])
             check_number(end.strip("* "), row["end"])
             mark = {"gain": "**", "loss": "*", "even": ""}[row["verdict"]]
