@@ -8,7 +8,7 @@ import pytest
 from programs import TINY_ARM, called, composed, shipped
 from run_folders import driven, make_run
 
-from benchmarks import promise
+from benchmarks import prediction, promise
 from coil_rl.config.check import check
 from coil_rl.errors import UserError
 from coil_rl.report.runs import read_runs
@@ -221,3 +221,18 @@ def test_seeds_that_confirm_have_a_column_of_their_own(folder):
     promise.add_parts(rows, promise.arms_of(runs), 2)
     assert rows[0]["others"] == ""
     assert f"{rows[0]['difference']:+.1f}" in rows[0]["claimed"]
+
+
+@pytest.mark.slow
+def test_what_could_predict_a_gain_stands_beside_it(folder, capsys):
+    prediction.main([str(folder), "--method", "coil_anchored", "--learner", "ppo"])
+    assert "residual: rank correlation" in capsys.readouterr().out
+    runs = read_runs([folder / "pendulum"])
+    arms = promise.arms_of(runs)
+    rows = prediction.rows_of_task("pendulum", runs, "coil_anchored", "ppo")
+    for row in rows:
+        arm, alone = arms["coil_anchored", row["guide"]], arms["ppo", "alone"]
+        gain = sum(arm.reward(seed) - alone.reward(seed) for seed in (0, 1)) / 2
+        assert row["gain"] == pytest.approx(100 * gain / promise.scale_of(arms, alone))
+        assert row["residual"] <= 1
+    assert rows[0]["ahead"] > rows[1]["ahead"]  # the intact guide, the random one
