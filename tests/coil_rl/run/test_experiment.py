@@ -47,7 +47,7 @@ def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=(), anchor=N
         curve=curve,
         callbacks=learner.callbacks(tests := TrainingCases(of_tests, frames, seed)),
         cases=tests,
-        resume_command=resume_command(folder),
+        resume_command=resume_command(folder, []),
     )
 
 
