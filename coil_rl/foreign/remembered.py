@@ -49,16 +49,16 @@ def state_of(thing: Any, make: Callable[[], Any]) -> dict[str, Any] | None:
 
 
 def _remembers_more(network: nn.Module, new: nn.Module) -> bool:
-    """Return whether what torch does not save of a network differs from that of a new one."""
-    now, begun, saved, of_new = _plain(network), _plain(new), _saved(network), _saved(new)
+    """Return whether attributes and buffers that torch does not save differ from a new one's."""
+    now, begun, names, of_new = _plain(network), _plain(new), _names(network), _names(new)
     return now.keys() != begun.keys() or not all(
-        value is begun[place] or pickled(value, saved) == pickled(begun[place], of_new) != b""
+        value is begun[place] or pickled(value, names) == pickled(begun[place], of_new) != b""
         for place, value in now.items()
     )
 
 
 def _plain(network: nn.Module) -> dict[tuple[str, str], Any]:
-    """Return what torch does not save of a network, by part and name."""
+    """Return the attributes and buffers that torch does not save, by part and name."""
     found = {}
     for part, module in network.named_modules():
         unsaved = {name: module._buffers[name] for name in module._non_persistent_buffers_set}
@@ -68,9 +68,9 @@ def _plain(network: nn.Module) -> dict[tuple[str, str], Any]:
     return found
 
 
-def _saved(network: nn.Module) -> dict[int, str]:
-    """Return the names of what torch saves of a network, by `id`."""
-    return {id(value): name for name, value in network.state_dict(keep_vars=True).items()}
+def _names(network: nn.Module) -> dict[int, str]:
+    """Return the names of the parameters by `id`: torch saves them, wherever else they are held."""
+    return {id(value): name for name, value in network.named_parameters()}
 
 
 def copied(value: Any) -> Any:
@@ -94,16 +94,16 @@ class _Pickler(pickle.Pickler):
     """Writes numbers where torch and weak references write a place in memory.
 
     Args:
-        saved: names that are written in place of tensors, by their `id`.
+        names: names that are written in place of parameters, by the `id` of each.
     """
 
-    def __init__(self, file: io.BytesIO, saved: Mapping[int, str]) -> None:
+    def __init__(self, file: io.BytesIO, names: Mapping[int, str]) -> None:
         super().__init__(file)
-        self.saved = saved
+        self.names = names
 
     def reducer_override(self, value: Any) -> Any:
-        if id(value) in self.saved:
-            return str, (self.saved[id(value)],)
+        if id(value) in self.names:
+            return str, (self.names[id(value)],)
         if isinstance(value, torch.Tensor):
             return torch.from_numpy, (value.detach().cpu().numpy(),)
         if isinstance(value, weakref.ref):
@@ -111,15 +111,15 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def pickled(value: Any, saved: Mapping[int, str] | None = None) -> bytes:
-    """Return the content of a value; empty for what cannot be pickled.
+def pickled(value: Any, names: Mapping[int, str] | None = None) -> bytes:
+    """Return the content of a value as bytes; empty if it cannot be pickled.
 
     Args:
-        saved: names that are written in place of tensors, by their `id`.
+        names: names that are written in place of parameters, by the `id` of each.
     """
     file = io.BytesIO()
     try:
-        _Pickler(file, saved or {}).dump(value)
+        _Pickler(file, names or {}).dump(value)
     except Exception:  # whatever the pickling of somebody else's object raises
         return b""
     return file.getvalue()
