@@ -76,9 +76,11 @@ def test_rewards_of_several_steps_are_summed_within_an_episode():
         parts = [sums.summed(part.unsqueeze(0)) for part in whole.split(size)]
         found = torch.cat(parts)
         places = found["action"].flatten().int().tolist()
+        entries = Entries(found.items(True, True))
+        added = discounted(entries, torch.tensor(gamma), torch.ones(len(found)))
         # The last two steps wait for the next batch.
         assert sorted(places) == list(range(10))
-        for place, step in zip(places, found, strict=True):
+        for place, step, value in zip(places, found, added, strict=True):
             last = min(place + 2, *(end for end in ends if end >= place))
             taken = range(place, last + 1)
             expected = sum(gamma ** (each - place) * each**2 for each in taken)
@@ -86,10 +88,7 @@ def test_rewards_of_several_steps_are_summed_within_an_episode():
             assert int(step["next", "steps"]) == len(taken)
             assert float(step["next", "th"]) == last
             assert bool(step["next", "terminated"]) == (last == 8)
-            live = 0.0 if last == 8 else gamma ** len(taken)
-            entries = Entries(step.unsqueeze(0).items(True, True))
-            if last != 4:
-                assert float(discounted(entries, torch.tensor(gamma), torch.ones(1))) == live
+            assert float(value) == (0.0 if last == 8 else gamma ** len(taken))
 
 
 def test_value_of_the_state_in_which_an_episode_was_truncated_is_limited():
