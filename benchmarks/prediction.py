@@ -2,14 +2,14 @@
 
     python -m benchmarks.prediction outputs/experiments/promise
 
-The folder is that of `benchmarks.promise`. Its table has a row for each task and guide, means over
-the seeds in percent of the scale of the promise:
+The folder is that of `benchmarks.promise`. The table has a row for each task and guide. The first
+two numbers are means over the seeds, in percent of the scale of the promise:
 
 - `gain`: return with the guide minus that of the learner alone, which is to be predicted;
 - `ahead`: return of the guide minus that of the learner alone after a tenth of the frames;
 - `residual`: R^2 with which a network predicts the learner's action minus the guide's from the
-  observation, along episodes of the learner alone, in episodes that it has not seen. A residual
-  that cannot be learned is said to be a reason to keep the guide.
+  observation, along episodes of the learner alone that it has not seen; of the first seed. A
+  residual that cannot be learned is said to be a reason to keep the guide.
 
 Below it are the rank correlations of both with the gain. The third number that is proposed, how
 much better a guide is that knows more than the policy, is 0 where guides see what policies see.
@@ -25,7 +25,7 @@ from scipy.stats import spearmanr
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
-from benchmarks.promise import ALONE, arms_of, runs_of, scale_of
+from benchmarks.promise import ALONE, arms_of, paired, runs_of, scale_of
 from coil_rl.imitation import NetworkRegressor
 from coil_rl.imitation.validation import cross_validate
 from coil_rl.report import markdown_table
@@ -44,13 +44,13 @@ COLUMNS = {
 
 
 def after_a_tenth(run: Run) -> float:
-    """Return the return of a run on its curve after a tenth of its frames."""
+    """Return the evaluation curve of a run after a tenth of its frames."""
     curve = points(run.curve, RETURN)
     return float(np.interp(0.1 * curve[-1, 0], curve[:, 0], curve[:, 1]))
 
 
 def learnability(alone: Run, advised: Run) -> float:
-    """Return R^2 of the difference of the actions of a policy and a guide.
+    """Return R^2 with which a network predicts a policy's action minus a guide's.
 
     Args:
         alone: of the policy.
@@ -75,13 +75,13 @@ def rows_of_task(
 ) -> list[dict[str, object]]:
     """Return a row for each guide of a task."""
     arms = arms_of(runs)
-    alone = arms[learner, ALONE]
-    scale = scale_of(arms, alone) / 100
+    scale = scale_of(arms, arms[learner, ALONE]) / 100
     rows: list[dict[str, object]] = []
-    for (label, kind), arm in arms.items():
+    for (label, kind), every in arms.items():
         if label != method:
             continue
-        seeds = sorted(set(arm.runs) & set(alone.runs))
+        arm, alone = paired(every, arms[learner, ALONE])
+        seeds = list(arm.runs)
         early = np.mean([after_a_tenth(alone.runs[seed]) for seed in seeds])
         gain = np.mean([arm.reward(seed) - alone.reward(seed) for seed in seeds])
         residual = learnability(alone.runs[seeds[0]], arm.runs[seeds[0]])

@@ -36,7 +36,7 @@ def export(config: DictConfig) -> None:
 
 
 def next_step(config: DictConfig, guide: str) -> str:
-    """Return the command that uses an export; for a guide outside, the expression of Python.
+    """Return the command that evaluates an export; for a guide outside, a Python expression.
 
     Args:
         config: of the program.

@@ -102,7 +102,8 @@ class Normal(Density):
 
     def divergence(self, other: Density) -> Tensor:
         """Return KL(self || other); squashing both does not change it."""
-        ratio, distance = self.scale / other.scale, (self.loc - other.loc) / other.scale  # type: ignore[attr-defined]
+        loc, scale = other.loc, other.scale  # type: ignore[attr-defined]
+        ratio, distance = self.scale / scale, (self.loc - loc) / scale
         return self.summed(0.5 * (ratio.square() + distance.square() - 1) - ratio.log())
 
 

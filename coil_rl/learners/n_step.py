@@ -82,9 +82,9 @@ class NStep:
 
 
 def discounted(minibatch: Any, gamma: Tensor, value: Tensor) -> Tensor:
-    """Return what the state after each step of a minibatch adds to its return, like `value`.
+    """Return the discounted value of the state after each step of a minibatch, shaped as `value`.
 
-    That is 0 after a termination. The state in which an episode was truncated is in no step that
+    It is 0 after a termination. The state in which an episode was truncated is in no step that
     is learned from: what a network makes of it is a guess, and where the time or a queue grows
     during an episode, the guess and what is learned from it drift without end. So its value is
     limited to one standard deviation from the mean of the others.
