@@ -31,6 +31,8 @@ CHUNK = 128 * 1024  # bytes
 # A file unpacks to at most this many bytes, and this many for each of its own.
 UNPACKED, UNPACKED_SHARE = 20_000_000, 50
 
+COMPRESSIONS = ("zstd", "lz4", "")  # of chunks
+
 # First bytes of other files with the name of a recording, what they are, and the remedy.
 _OTHER_FORMATS = {
     b"version https://git-lfs": (
@@ -363,6 +365,7 @@ def _records(
                 contents.cut_off = True
                 return
             summary = _summary(stream)
+            _check_compression(file, start, record, summary)
             places = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
             places += [each.offset for each in summary.metadata_indexes]
             places += [each.offset for each in summary.attachment_indexes]
@@ -387,6 +390,24 @@ def _records(
             # The damage may hide the channels of the messages that follow.
             parts = [*summary.schemas.values(), *summary.channels.values()]
         yield from parts
+
+
+def _check_compression(file: Path, start: int, record: Any, summary: Summary) -> None:
+    """Raise a `RecordingError` if a chunk cannot be unpacked because nobody here knows how.
+
+    Args:
+        start: place of the chunk in the file.
+        record: the chunk, or another record, or None if that is damaged itself.
+        summary: of the file; what it says of the chunk goes before what the chunk itself says,
+            which may be damaged.
+    """
+    named = {each.chunk_start_offset: each.compression for each in summary.chunk_indexes}
+    compression = named.get(start, getattr(record, "compression", ""))
+    if compression not in COMPRESSIONS:
+        raise RecordingError(
+            f"{file} has chunks in the compression {compression[:40]!r}, but zstd and lz4 are read; "
+            "record it, or write it again, in one of these."
+        )
 
 
 def _unpacked(file: Path, chunk: records.Chunk, left: int) -> records.Chunk:

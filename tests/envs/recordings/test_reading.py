@@ -297,6 +297,18 @@ def test_damage_that_no_chunk_explains_is_refused(tmp_path, whole):
     assert "is damaged before byte 17 (" in refusal(path)
 
 
+@pytest.mark.parametrize("index", [True, False])
+def test_chunks_of_an_unknown_compression_are_no_damage(tmp_path, index):
+    path = drive(tmp_path / "a.mcap", scans=2)
+    data = path.read_bytes()
+    assert data.count(b"zstd") == 2  # of the chunk, and of its entry in the index
+    path.write_bytes(data.replace(b"zstd", b"blsc", 2 if index else 1))
+    if index:
+        assert "has chunks in the compression 'blsc', but zstd and lz4 are read" in refusal(path)
+    else:
+        assert "is damaged before its first scan" in refusal(path)
+
+
 def test_recording_whose_only_chunk_is_damaged_is_refused(tmp_path):
     path = drive(tmp_path / "a.mcap", scans=2)
     data = bytearray(path.read_bytes())
