@@ -405,8 +405,8 @@ def _check_compression(file: Path, start: int, record: Any, summary: Summary) ->
     compression = named.get(start, getattr(record, "compression", ""))
     if compression not in COMPRESSIONS:
         raise RecordingError(
-            f"{file} has chunks in the compression {compression[:40]!r}, but zstd and lz4 are read; "
-            "record it, or write it again, in one of these."
+            f"{file} has chunks in the compression {compression[:40]!r}, but zstd and lz4 are "
+            "read; record it, or write it again, in one of these."
         )
 
 

@@ -21,7 +21,8 @@ from matplotlib.patches import Patch
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from coil_paper.figures.ego_view import Array, marker
+from coil_paper.figures.world import marker
+from coil_paper.reproduce.figures import Array
 from coil_rl import EvaluationResult, Track, UserError, open_run
 from coil_rl.envs import SIDES
 from coil_rl.report import DrivenLines, markdown_table, style

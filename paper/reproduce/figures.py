@@ -159,41 +159,37 @@ class OnTheWay(Drawing):
         self, track: str = "train_1", seconds: Annotated[float, Interval(ge=0, le=60)] = 10.0
     ) -> None:
         self.track, self.seconds = shipped_track(track), seconds
+        self.about: dict[str, Any] = {"track": track, "seconds": seconds}
 
     @torch.no_grad()
-    def _drive(self) -> tuple[ConeTrackEnv, Tensor, Tensor, dict[str, Any]]:
-        """Return the moment.
-
-        Returns:
-            The env, its visible cones [1, 2, K, 2], their number [1, 2], and numbers for the notes.
-        """
+    def drive(self) -> tuple[ConeTrackEnv, TensorDictBase]:
+        """Return the env at the moment, and its state with the advice of the guide, [1]."""
         env, guide = ConeTrackEnv([self.track], num_envs=1), SplineGuide()
         state = env.reset()
         for _ in range(round(self.seconds * env.rate)):
             state = step_mdp(env.step(guide(state)))
-        numbers = {"track": self.track.name, "seconds": self.seconds}
-        return env, state["cones"], state["cone_count"], numbers
+        return env, guide(state)
 
 
 class Figure19(OnTheWay):
     """The simulator: a car on a track, its detected cones, and its estimates of both boundaries."""
 
     def _panels(self) -> Panels:
-        env, cones, count, numbers = self._drive()
-        frame = Frame(env.pose.double())
+        env, state = self.drive()
+        frame, count = Frame(env.pose.double()), state["cone_count"]
         around = {"left cones": self.track.left, "right cones": self.track.right}
         around["middle"] = resample(self.track.middle(), 1.0)
         series = {}
         for name, points in around.items():
-            series[name] = _facing_up(frame.to_car(torch.tensor(points.T)))
-        seen = np.concatenate(list(_visible(cones[0], count[0]).values()))
+            series[name] = facing_up(frame.to_car(torch.tensor(points.T)))
+        seen = np.concatenate(list(visible(state["cones"][0], count[0]).values()))
         # A line from the car to each detected cone; NaN ends a line.
         series["detected"] = np.stack([0 * seen, seen, seen + np.nan], 1).reshape(-1, 2)
         boundaries = frame.to_car(env.samples.double())[..., 0].unbind(2)
         for side, samples in zip(SIDES, boundaries, strict=True):
-            series[f"estimate of the {side} boundary"] = _facing_up(samples)
-        numbers |= {"left": int(count[0, 0]), "right": int(count[0, 1])}
-        return {"": {**series, "car": np.zeros((1, 2))}}, numbers
+            series[f"estimate of the {side} boundary"] = facing_up(samples)
+        numbers = {"left": int(count[0, 0]), "right": int(count[0, 1])}
+        return {"": {**series, "car": np.zeros((1, 2))}}, self.about | numbers
 
 
 class Figure21(Drawing):
@@ -219,8 +215,8 @@ class Figure26(Drawing):
         ranges, angles = drive.ranges[[SCAN]].numpy(), drive.angles.numpy()
         points = points_of(ranges, angles, perception.range_min, RANGE_MAX)
         cones, count = map(torch.from_numpy, perception(ranges, angles))
-        series = {**_visible(cones[0] / perception.scale, count[0]), "robot": np.zeros((1, 2))}
-        series["LiDAR points"] = _facing_up(torch.from_numpy(np.stack([points.x, points.y])))
+        series = {**visible(cones[0] / perception.scale, count[0]), "robot": np.zeros((1, 2))}
+        series["LiDAR points"] = facing_up(torch.from_numpy(np.stack([points.x, points.y])))
         numbers: dict[str, Any] = {
             "scan": SCAN,
             "sight": perception.range_max,
@@ -255,20 +251,21 @@ class Figure31(OnTheWay):
     """
 
     def _panels(self) -> Panels:
-        _, cones, count, numbers = self._drive()
+        _, state = self.drive()
+        cones, count = state["cones"], state["cone_count"]
         plan = SplineGuide().plan(cones, count)
         pairs = int(plan.midpoint_count)
-        seen = {**_visible(cones[0], count[0]), "car": np.zeros((1, 2))}
-        midpoints = {"midpoints of pairs": _facing_up(plan.midpoints[:, :pairs, 0])}
-        spline = {"smoothing spline": _facing_up(plan.path.equidistant(SPLINE_POINTS)[..., 0])}
+        seen = {**visible(cones[0], count[0]), "car": np.zeros((1, 2))}
+        midpoints = {"midpoints of pairs": facing_up(plan.midpoints[:, :pairs, 0])}
+        spline = {"smoothing spline": facing_up(plan.path.equidistant(SPLINE_POINTS)[..., 0])}
         # A shorter path repeats its last target.
-        targets = {"targets": np.unique(_facing_up(plan.targets[..., 0]), axis=0)}
+        targets = {"targets": np.unique(facing_up(plan.targets[..., 0]), axis=0)}
         panels = {"midpoints": seen | midpoints, "spline": seen | midpoints | spline}
-        numbers |= {"pairs": pairs, "targets": len(targets["targets"])}
-        return panels | {"targets": seen | spline | targets}, numbers
+        numbers = {"pairs": pairs, "targets": len(targets["targets"])}
+        return panels | {"targets": seen | spline | targets}, self.about | numbers
 
 
-def _facing_up(points: Tensor) -> Array:
+def facing_up(points: Tensor) -> Array:
     """Rotate points from the car's frame (x ahead, y left) to that of the picture (y ahead).
 
     Args:
@@ -280,7 +277,7 @@ def _facing_up(points: Tensor) -> Array:
     return torch.stack([-points[1], points[0]], 1).double().numpy()
 
 
-def _visible(cones: Tensor, count: Tensor) -> dict[str, Array]:
+def visible(cones: Tensor, count: Tensor) -> dict[str, Array]:
     """Return the visible cones of either side in the frame of the picture.
 
     Args:
@@ -292,5 +289,5 @@ def _visible(cones: Tensor, count: Tensor) -> dict[str, Array]:
     """
     visible = {}
     for side, of_side, number in zip(SIDES, cones, count.tolist(), strict=True):
-        visible[f"{side} cones"] = _facing_up(of_side[:number].t())
+        visible[f"{side} cones"] = facing_up(of_side[:number].t())
     return visible
