@@ -22,6 +22,7 @@ from coil_rl.record import json_file
 
 FORMAT, VERSION = "coil-rl policy", 1
 CONTRACT, ONNX, TORCH, DRIVER = "contract.json", "policy.onnx", "policy.pt2", "drive.py"
+ADVICE = "guide_action"  # input for the actions of guides that are outside
 LARGEST_CONTRACT, LARGEST_POLICY = 10_000_000, 500_000_000  # bytes
 LARGEST_ENTRY = 100_000_000  # numbers of an input or output
 REMEDY = "export the policy again: coil-export run=RUN"

@@ -14,10 +14,10 @@ from torchrl.data import Bounded
 
 from coil_rl import record
 from coil_rl.envs.meanings import meaning, meanings_of
-from coil_rl.export.contract import FORMAT, VERSION
+from coil_rl.export.contract import ADVICE, FORMAT, VERSION
 from coil_rl.export.files import OPSET
 from coil_rl.export.parity import Parity
-from coil_rl.export.step import ADVICE, Entry, PolicyStep
+from coil_rl.export.step import Entry, PolicyStep
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.normaliser import Normaliser

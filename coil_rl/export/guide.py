@@ -14,7 +14,8 @@ from torch import Tensor
 from torchrl.envs import TensorDictPrimer
 
 from coil_rl.errors import UserError
-from coil_rl.export.policy import ADVICE, ExportedPolicy
+from coil_rl.export.contract import ADVICE
+from coil_rl.export.policy import ExportedPolicy
 from coil_rl.transforms.action_space import ActionRange, ActionSpace, OwnChoices
 from coil_rl.transforms.guide_memory import primer_of
 from coil_rl.transforms.hosted import ToldGuide

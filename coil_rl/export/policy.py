@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coil_rl.export.contract import place_of, read_contract
+from coil_rl.export.contract import ADVICE, place_of, read_contract
 from coil_rl.export.session import Session
-
-ADVICE = "guide_action"
 
 
 class ExportedPolicy:

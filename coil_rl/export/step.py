@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import GRUModule
 
-from coil_rl.export.gru import WrittenGru
+from coil_rl.export.contract import ADVICE
 from coil_rl.run.controller import Controller
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import space_of
@@ -25,8 +25,6 @@ from coil_rl.transforms.degraded_advice import DegradedAdvice
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.last_action import LastAction
 from coil_rl.transforms.link import Link, State
-
-ADVICE = "guide_action"  # input for the actions of guides that are outside
 
 
 class NotExportableError(Exception):
@@ -87,6 +85,31 @@ class GivenAdvice(Link):
         rows = [self.guides.observed(space.advice(each, data.batch_size)) for each in actions]
         data.set(self.guides.out_keys[0], torch.stack(rows, -2))
         return state
+
+
+class WrittenGru(TensorDictModuleBase):
+    """One step of a `GRUModule` of one layer, with the same weights: that one cannot be exported.
+
+    The state that it reads is that of the step before; whoever begins an episode sets it to 0.
+
+    Args:
+        module: the module.
+    """
+
+    def __init__(self, module: GRUModule) -> None:
+        super().__init__()
+        observed, state, _ = module.in_keys
+        self.in_keys, self.out_keys = [observed, state], list(module.out_keys)
+        self.gru = module.gru
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write what is remembered, and the next state."""
+        observed, state = (tensordict[key] for key in self.in_keys)
+        gru = self.gru
+        weights = gru.weight_ih_l0, gru.weight_hh_l0, gru.bias_ih_l0, gru.bias_hh_l0
+        remembered = torch.gru_cell(observed, state.squeeze(-2), *weights)
+        written, after = self.out_keys
+        return tensordict.set(written, remembered).set(after, remembered.unsqueeze(-2))
 
 
 class WrittenPolicy(nn.Sequential):

@@ -13,9 +13,8 @@ from coil_rl.errors import UserError
 from coil_rl.export.contract import CONTRACT, DRIVER, ONNX, TORCH, checksum
 from coil_rl.export.describe import LEARNED, describe
 from coil_rl.export.files import as_onnx, as_torch, explained, traced
-from coil_rl.export.parity import LIMIT, WITH_GUIDE, Parity, compare
+from coil_rl.export.parity import LIMIT, WITH_GUIDE, Parity, Step, compare, record
 from coil_rl.export.policy import ExportedPolicy
-from coil_rl.export.recording import Recording, record
 from coil_rl.export.step import NotExportableError, PolicyStep, exportable
 from coil_rl.extras import require
 from coil_rl.files import temporary
@@ -67,8 +66,8 @@ def export_policy(
         with progress(
             total=observations, unit="step", desc="export", leave=False, mininterval=0.5
         ) as bar:
-            recording = record(run, controller, observations, seed, bar.update)
-        step, contents, parity, outside = _possible(run, controller, recording)
+            recorded = record(run, controller, observations, seed, bar.update)
+        step, contents, parity, outside = _possible(run, controller, recorded)
     except NotExportableError as error:
         raise UserError(
             f"run {run.folder}: its policy cannot be exported: {error}; use run.controller()"
@@ -102,7 +101,7 @@ def export_policy(
 
 
 def _possible(
-    run: Run, controller: Controller, recording: Recording
+    run: Run, controller: Controller, recorded: list[Step]
 ) -> tuple[PolicyStep, dict[str, bytes], Parity, str | None]:
     """Export a policy with its guides in the file if that is possible, and else without them.
 
@@ -115,19 +114,19 @@ def _possible(
     outside = _cause(controller)
     if outside is None:
         try:
-            return *_written(controller, recording, inside=True), None
+            return *_written(controller, recorded, inside=True), None
         except NotExportableError as error:
             outside = str(error)
     if controller.guides is None or run.make_learner is None:  # nothing is left without the guide
         raise NotExportableError(outside)
-    step, contents, parity = _written(controller, recording, inside=False)
+    step, contents, parity = _written(controller, recorded, inside=False)
     if step.guides:
         say(f"export: the guide stays outside, its action is an input: {outside}")
     return step, contents, parity, outside
 
 
 def _written(
-    controller: Controller, recording: Recording, *, inside: bool
+    controller: Controller, recorded: list[Step], *, inside: bool
 ) -> tuple[PolicyStep, dict[str, bytes], Parity]:
     """Return what is exported, the contents of the files, and how much they differ.
 
@@ -140,7 +139,7 @@ def _written(
     program = traced(step)
     contents = {TORCH: as_torch(program), ONNX: as_onnx(program, step)}
     say("export: comparing it with torch ...")
-    parity = compare(step, contents[ONNX], recording, limit)
+    parity = compare(step, contents[ONNX], recorded, limit)
     return step, contents, parity
 
 
