@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 
 from coil_rl import Measure
 from coil_rl.report import Comparison, Group
@@ -65,31 +64,15 @@ def _reference(guide: Group) -> np.ndarray | None:
 
     In a case where it crashes, or earns nothing or next to nothing, its mean over the other cases
     is taken: the ratio to so small a reward would dominate the mean of all ratios. A guide has none
-    if it earns nothing in every case, or if it loses too much in one of them.
+    if it earns nothing in every case.
     """
     rewards = guide.by_seed("reward").mean()
-    crashes = pd.Series(False, rewards.index)
+    earned = rewards[rewards > 0]
     if guide.has("crashed"):
-        crashes = (guide.by_seed("crashed") > 0).any()
-    earned = rewards[(rewards > 0) & ~crashes]
+        earned = earned[(guide.by_seed("crashed")[earned.index] == 0).all()]
     if len(earned) > 1:
         others = (earned.sum() - earned) / (len(earned) - 1)
         earned = earned[earned >= NEXT_TO_NOTHING * others]
-    if not len(earned) or _loses(rewards, crashes, earned.mean()):
+    if not len(earned):
         return None
     return np.asarray(rewards.where(rewards.index.isin(earned.index), earned.mean()))
-
-
-def _loses(rewards: pd.Series, crashes: pd.Series, earned: float) -> bool:
-    """Return whether a guide loses too much in a case for its rewards to be divided by.
-
-    The limit is `NEXT_TO_NOTHING` of `earned`. It is all of `earned` where the guide crashes, as a
-    crash may be punished.
-
-    Args:
-        rewards: of each case.
-        crashes: whether the guide crashes in each case.
-        earned: its mean reward over the cases in which it earns something.
-    """
-    limits = np.where(crashes, 1.0, NEXT_TO_NOTHING) * earned
-    return bool((rewards < -limits).any())

@@ -23,6 +23,7 @@ from coil_paper import tabular
 from coil_paper.reproduce import pages
 from coil_paper.reproduce.result import NO_RUNS, PAGES, Result, Runs
 from coil_paper.tabular.coil import noisy_guide, optimal_guide, random_guide, worst_guide
+from coil_paper.tabular.learning import Epsilon, Power
 from coil_paper.tabular.mdp import Array, Integers
 from coil_rl.ranges import Count, Share, checked
 from coil_rl.report import markdown_table, style, write_csv
@@ -57,9 +58,9 @@ class TabularCoil(Result):
     actions: Count = 3
     classes: Count = 4
     noise: Share = 0.2
-    epsilon: float = 0.2
-    power: float = 0.6
-    episode_steps: int = 50
+    epsilon: Epsilon = 0.2
+    power: Power = 0.6
+    episode_steps: Count = 50
     steps: Sequence[int] = (100, 300, 1_000, 3_000, 10_000, 30_000)
 
     def __post_init__(self) -> None:
@@ -76,7 +77,6 @@ class TabularCoil(Result):
             power=self.power,
             episode_steps=self.episode_steps,
         )
-        self.learn(tabular.toymaker(), 0, np.random.default_rng(0))  # checks its options
         self.guides: Mapping[str, Callable[[tabular.MDP], Array]] = {
             "optimal": optimal_guide,
             f"noisy ({self.noise:.0%})": partial(noisy_guide, noise=self.noise),

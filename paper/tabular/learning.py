@@ -10,14 +10,20 @@ sizes alpha of each pair have an infinite sum and their squares a finite one (th
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from coil_paper.tabular.mdp import MDP, Array, Integers
+from coil_rl.ranges import Count, Interval, checked
+
+Epsilon = Annotated[float, Interval(gt=0, le=1)]
+Power = Annotated[float, Interval(gt=0.5, le=1)]
 
 
+@checked
 class Simulator:
     """Step-by-step simulation of a Markov decision process.
 
@@ -32,9 +38,7 @@ class Simulator:
         steps: number of steps in the present episode.
     """
 
-    def __init__(self, mdp: MDP, rng: Generator, episode_steps: int | None = None) -> None:
-        if episode_steps is not None and episode_steps < 1:
-            raise ValueError(f"episode_steps={episode_steps} must be at least 1, or None")
+    def __init__(self, mdp: MDP, rng: Generator, episode_steps: Count | None = None) -> None:
         self.rng, self.episode_steps = rng, episode_steps
         # Plain lists: element by element they are several times faster than arrays.
         self._next, self._rewards = _cumulative(mdp.P).tolist(), mdp.R.tolist()
@@ -170,14 +174,15 @@ class QLearningResult:
         return self.Q.argmax(axis=1)
 
 
+@checked
 def q_learning(
     mdp: MDP,
     steps: int,
     rng: Generator,
     *,
-    epsilon: float = 0.1,
-    power: float = 0.6,
-    episode_steps: int | None = None,
+    epsilon: Epsilon = 0.1,
+    power: Power = 0.6,
+    episode_steps: Count | None = None,
     observations: ArrayLike | None = None,
     snapshots: Sequence[int] = (),
 ) -> QLearningResult:
@@ -186,9 +191,9 @@ def q_learning(
     Args:
         mdp: the world; the learner uses its `Simulator` only.
         rng: of the world and of the actions.
-        epsilon: probability of a random action, more than 0 and at most 1.
-        power: alpha = n ** -power at the n-th visit of (s, a), more than 1/2 and at most 1 (theorem
-            2.3).
+        epsilon: probability of a random action; above 0, so that every action is tried.
+        power: alpha = n ** -power at the n-th visit of (s, a); above 1/2 and at most 1, or Q need
+            not converge (theorem 2.3).
         episode_steps: steps after which an episode is truncated, None for no limit; the last
             state's value is still bootstrapped.
         observations: [S] integers from 0, the observation of each state. States with the same
@@ -201,14 +206,6 @@ def q_learning(
         >>> q_learning(toymaker(), 20_000, np.random.default_rng(0)).policy.tolist()
         [1, 1]
     """
-    if not 0 < epsilon <= 1:
-        raise ValueError(
-            f"epsilon={epsilon} must be more than 0, so that every action is tried, and at most 1"
-        )
-    if not 0.5 < power <= 1:
-        raise ValueError(
-            f"power={power} must be more than 1/2 and at most 1, or Q-learning need not converge"
-        )
     for snapshot in snapshots:
         if not 0 <= snapshot <= steps:
             raise ValueError(f"snapshots: {snapshot} must be between 0 and steps={steps}")

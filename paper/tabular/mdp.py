@@ -4,15 +4,19 @@ In all shapes S is the number of states and A the number of actions.
 """
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 
+from coil_rl.ranges import Interval, checked
+
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
+@checked
 class MDP:
     """A finite Markov decision process: transition probabilities, rewards and a discount factor.
 
@@ -42,7 +46,7 @@ class MDP:
         self,
         P: ArrayLike,
         R: ArrayLike,
-        gamma: float,
+        gamma: Annotated[float, Interval(ge=0, lt=1)],
         *,
         start: ArrayLike | None = None,
         states: Sequence[str] | None = None,
@@ -57,8 +61,6 @@ class MDP:
             )
         if self.R.shape != self.P.shape:
             raise ValueError(f"R must have the shape of P, {self.P.shape}; it has {self.R.shape}")
-        if not 0 <= gamma < 1:
-            raise ValueError(f"gamma={gamma} must be at least 0 and less than 1")
         self.gamma = gamma
         count, choices = self.P.shape[:2]
         self.states = _names("states", states, count)

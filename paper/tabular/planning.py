@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coil_paper.tabular.mdp import MDP, Array, Integers
+from coil_rl.ranges import Positive, checked
 
 TIE = 1e-9  # smaller differences of Q are rounding
 
@@ -31,12 +32,13 @@ class PlanningResult:
     history: Array
 
 
-def policy_evaluation(mdp: MDP, policy: ArrayLike, tolerance: float = 1e-9) -> Array:
+@checked
+def policy_evaluation(mdp: MDP, policy: ArrayLike, tolerance: Positive = 1e-9) -> Array:
     """Return the value of each state under a policy, by iteration from 0 (algorithm 1).
 
     Args:
         policy: actions [S], or their probabilities [S, A].
-        tolerance: the largest error of V, more than 0.
+        tolerance: the largest error of V.
 
     Returns:
         V, [S].
@@ -65,14 +67,15 @@ def solve(mdp: MDP, policy: ArrayLike) -> Array:
     return np.linalg.solve(np.eye(len(r)) - mdp.gamma * P, r)
 
 
+@checked
 def policy_iteration(
-    mdp: MDP, policy: ArrayLike | None = None, tolerance: float = 1e-12
+    mdp: MDP, policy: ArrayLike | None = None, tolerance: Positive = 1e-12
 ) -> PlanningResult:
     """Alternate policy evaluation and greedy improvement until the policy is stable (algorithm 2).
 
     Args:
         policy: actions [S] to begin with; by default the first action everywhere.
-        tolerance: the largest error of V in each policy evaluation, more than 0.
+        tolerance: the largest error of V in each policy evaluation.
 
     Returns:
         The optimal policy; its `history` has V of each intermediate policy.
@@ -94,11 +97,12 @@ def policy_iteration(
         policy = np.where(improves, Q.argmax(axis=1), policy)
 
 
-def value_iteration(mdp: MDP, tolerance: float = 1e-9) -> PlanningResult:
+@checked
+def value_iteration(mdp: MDP, tolerance: Positive = 1e-9) -> PlanningResult:
     """Iterate V <- max over actions of r + gamma P V from 0 until convergence (algorithm 3).
 
     Args:
-        tolerance: the largest error of V, more than 0.
+        tolerance: the largest error of V.
 
     Returns:
         The optimal policy; its `history` has V after each iteration.
@@ -117,10 +121,6 @@ def _converged(mdp: MDP, V: Array, previous: Array, tolerance: float) -> bool:
 
     The change of an iteration bounds the sum of all later changes, which is a geometric series.
     """
-    if not tolerance > 0:
-        raise ValueError(
-            f"tolerance={tolerance} must be more than 0, or the iteration would not end"
-        )
     # Rounding limits what can be reached.
     rounding = 4 * np.finfo(np.float64).eps * max(1.0, float(np.abs(V).max()))
     remaining = mdp.gamma / (1 - mdp.gamma) * float(np.abs(V - previous).max())

@@ -74,7 +74,7 @@ def test_worlds_do_not_depend_on_their_number(made, tmp_path):
         ({"states": 5, "classes": 6}, "at least classes=6"),
         ({"noise": 1.5}, "noise=1.5 must be at most 1"),
         ({"epsilon": 0}, "epsilon=0 must be more than 0"),
-        ({"power": 0.5}, "power=0.5 must be more than 1/2"),
+        ({"power": 0.5}, "power=0.5 must be more than 0.5"),
         ({"steps": [3, 2]}, "must be increasing integers from 1"),
         ({"steps": [0, 2]}, "must be increasing integers from 1"),
     ],

@@ -141,7 +141,7 @@ def test_q_of_a_corridor_follows_equation_52():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"power": 0.5}, "power=0.5 must be more than 1/2 and at most 1"),
+        ({"power": 0.5}, "power=0.5 must be more than 0.5"),
         ({"epsilon": 0}, "epsilon=0 must be more than 0"),
         ({"snapshots": (1, 600)}, "snapshots: 600 must be between 0 and steps=500"),
         ({"observations": [0]}, "observations must be 2 integers"),

@@ -36,7 +36,7 @@ def test_a_state_without_exit_and_reward_is_terminal():
         ({"P": P[0]}, r"P must have the shape \[S, A, S\]"),
         ({"R": R[0]}, r"R must have the shape of P, \(2, 2, 2\); it has \(2, 2\)"),
         ({"R": changed(R, (1, 1, 0), np.inf)}, r"finite \(state low, action stay\)"),
-        ({"gamma": 1.0}, "gamma=1.0 must be at least 0 and less than 1"),
+        ({"gamma": 1.0}, "gamma=1.0 must be less than 1"),
         ({"gamma": np.nan}, "gamma=nan"),
         ({"start": [0.5, 0.6]}, "start must be 2 probabilities"),
         ({"states": ("high",)}, "states has 1 names, but P has 2 states"),
