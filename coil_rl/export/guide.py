@@ -82,10 +82,9 @@ class ExportedGuide(ToldGuide):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare what is remembered."""
-        start = {}
-        for name, entry in self.memory.items():
-            start[name] = torch.from_numpy(np.full(entry["shape"], entry["first"], entry["dtype"]))
-        return primer_of(start)
+        first = self.exported.first_state()
+        entries = self.memory.items()
+        return primer_of({n: torch.from_numpy(first[each["input"]][0]) for n, each in entries})
 
     def _unfit(self, problem: str) -> UserError:
         title = self.exported.contract["env"]["title"]

@@ -46,19 +46,14 @@ class ExportedPolicy:
 
     def reset(self) -> None:
         """Begin an episode: forget everything."""
-        self.state = self.first_state(1)
+        self.state = self.first_state()
 
-    def first_state(self, rows: int) -> dict[str, NDArray[Any]]:
-        """Return what the policy remembers at the start of an episode, by input.
-
-        Args:
-            rows: number of rows, B.
-        """
-        state = {}
-        for entry in self.contract["state"]:
-            shape = (rows, *entry["shape"])
-            state[entry["input"]] = np.full(shape, entry["first"], entry["dtype"])
-        return state
+    def first_state(self) -> dict[str, NDArray[Any]]:
+        """Return what the policy remembers at the start of an episode, by input, [1, ...] each."""
+        return {
+            entry["input"]: np.full((1, *entry["shape"]), entry["first"], entry["dtype"])
+            for entry in self.contract["state"]
+        }
 
     def act(self, observation: Any, guide_action: Any = None) -> Any:
         """Return the action for an observation.
@@ -79,22 +74,23 @@ class ExportedPolicy:
             ValueError: for an observation that does not fit the contract, and for a `guide_action`
                 where no guide is outside.
         """
-        inputs = {}
-        entries = [entry for entry in self.contract["inputs"] if entry["name"] != ADVICE]
         place = self.contract["guide"]["place"]
         if guide_action is not None and place != "outside":
             raise ValueError(
                 f"this policy takes no guide_action: its guide is {place}; leave guide_action out"
             )
+        names = {entry["name"] for entry in self.contract["inputs"]}
+        feeds, only = dict(self.state), len(names - {ADVICE}) == 1
         for entry in self.contract["inputs"]:
             if entry["name"] == ADVICE:
                 value = self._in_rows(_advice(observation, guide_action), entry["shape"])
             else:
-                value = _found(observation, entry, only=len(entries) == 1)
-            inputs[entry["name"]] = _row(value, entry)
-        action = self.act_on(inputs)[0]
+                value = _found(observation, entry, only=only)
+            feeds[entry["name"]] = _row(value, entry)
+        action, *state = self.session(feeds)
+        self.state = dict(zip(self.state, state, strict=True))
         space = self.contract["outputs"][0]["space"]
-        return action.reshape(space["shape"]).astype(space["dtype"])[()]
+        return action[0].reshape(space["shape"]).astype(space["dtype"])[()]
 
     def _in_rows(self, advice: Any, rows: Sequence[int]) -> Any:
         """Return actions in the shape that the env takes as rows of the contract, others as given.
@@ -112,23 +108,6 @@ class ExportedPolicy:
             return given.reshape(rows)
         return advice
 
-    def act_on(self, inputs: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        """Return the action for the inputs of the contract.
-
-        Args:
-            inputs: by name, [1, ...] each.
-
-        Raises:
-            ValueError: for an input that is missing.
-        """
-        for entry in self.contract["inputs"]:
-            if entry["name"] not in inputs:
-                names = ", ".join(each["name"] for each in self.contract["inputs"])
-                raise ValueError(f"the input {entry['name']} is missing; give {names}")
-        action, *state = self.session({**inputs, **self.state})
-        self.state = dict(zip(self.state, state, strict=True))
-        return action
-
     def state_dict(self) -> dict[str, Any]:
         """Return what the next actions of the episode depend on, besides their observations."""
         return {name: value.tolist() for name, value in self.state.items()}
@@ -139,7 +118,7 @@ class ExportedPolicy:
         Raises:
             ValueError: for the state of another policy.
         """
-        first = self.first_state(1)
+        first = self.first_state()
         given = {name: np.shape(value) for name, value in state.items()}
         if given != {name: value.shape for name, value in first.items()}:
             names = ", ".join(first) or "nothing"

@@ -52,13 +52,10 @@ def test_observation_that_does_not_fit_is_refused(observation, advice, message, 
         policy.act(observation, advice)
 
 
-def test_inputs_that_do_not_fit_the_contract_are_named(tmp_path):
+def test_advice_for_a_guide_inside_is_refused(tmp_path):
     def inside(contract):
         contract["guide"] = {"place": "inside", "names": ["sum"]}
 
-    policy = ExportedPolicy(write(tmp_path))
-    with pytest.raises(ValueError, match="guide_action is missing; give observation, guide_action"):
-        policy.act_on({"observation": np.zeros((1, 2), np.float32)})
     policy = ExportedPolicy(write(tmp_path, inside))
     with pytest.raises(ValueError, match="takes no guide_action: its guide is inside; leave"):
         policy.act([1.0, 2.0], [1.0])
@@ -83,7 +80,7 @@ def test_advice_may_have_the_shape_of_the_contract_or_of_the_env(guides, shape, 
     policy = ExportedPolicy(write(tmp_path))
     matrix(guides)(policy.contract)
     numbers, given = np.arange(4.0 * guides), []
-    policy.act_on = lambda inputs: given.append(inputs["guide_action"]) or np.zeros((1, 4))
+    policy.session = lambda feeds: given.append(feeds["guide_action"]) or [np.zeros((1, 4)), None]
     assert policy.act([1.0, 2.0], numbers.reshape(shape)).shape == (2, 2)
     np.testing.assert_array_equal(given[0], numbers.reshape(1, guides, 4))
 
