@@ -112,9 +112,7 @@ def share_of(correct: int, total: int) -> Share:
     return Share(correct / total, float(low), float(high), total - correct, total)
 
 
-def train_classifier(
-    features: Array, thick: Flags, drives: Integers, folds: int = FOLDS
-) -> Training:
+def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int) -> Training:
     """Train a classifier, with cross-validation over drives, as clusters of one drive are alike.
 
     Outliers next to a cone make unusual clusters, so a one-class machine (Schoelkopf et al. 2001)
@@ -125,16 +123,11 @@ def train_classifier(
         thick: [N], whether the cone is thick.
         drives: [N], group of each cluster; a group is held out as a whole and should have both
             kinds of cone.
+        folds: at most the number of groups.
 
     Raises:
-        UserError: if there are fewer groups than folds, or only one kind of cone.
+        UserError: if there is only one kind of cone, or without one fold.
     """
-    groups = len(np.unique(drives))
-    if groups < max(2, folds):
-        raise UserError(
-            f"{groups} drives are too few for {folds} folds; "
-            f"record more, or set folds to at most {groups}"
-        )
     if thick.all() or not thick.any():
         kind = "thick" if thick.all() else "thin"
         raise UserError(f"all clusters are of {kind} cones; the other drive is missing")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from sklearn.decomposition import PCA
 from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
@@ -21,6 +21,7 @@ from coil_rl.envs.robot import FEATURES, labelled_drive, record_labelling_drives
 from coil_rl.report import markdown_table, style, write_csv
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 PAGE = PAGES["figure_25"]
 PAPER_ACCURACY = cones.share_of(*PAGE["paper"])
@@ -102,9 +103,9 @@ class Figure25(Result):
         draw_cone_features(
             features,
             is_thick,
+            training.classifier.classify(features) != is_thick,
             stem.with_suffix(".png"),
-            wrong=training.classifier.classify(features) != is_thick,
-            title=f"Figure 25: clusters of the classifier's {kind} drives{suffix}",
+            f"Figure 25: clusters of the classifier's {kind} drives{suffix}",
         )
         rows = self._shares(training, labelled)
         write_csv(rows, stem.with_suffix(".csv"))
@@ -149,7 +150,7 @@ class Figure25(Result):
         return rows
 
 
-def principal_components(features: ArrayLike) -> tuple[Array, Array, Array]:
+def principal_components(features: Array) -> tuple[Array, Array, Array]:
     """Return the first two principal components of standardised features.
 
     Args:
@@ -160,21 +161,12 @@ def principal_components(features: ArrayLike) -> tuple[Array, Array, Array]:
         largest component above 0; and the shares of the variance, [2].
     """
     pca = PCA(2, svd_solver="full")
-    coordinates = pca.fit_transform(
-        StandardScaler().fit_transform(np.asarray(features, dtype=np.float64))
-    )
+    coordinates = pca.fit_transform(StandardScaler().fit_transform(features))
     signs = np.sign(pca.components_[[0, 1], np.abs(pca.components_).argmax(axis=1)])
     return coordinates * signs, pca.components_.T * signs, pca.explained_variance_ratio_
 
 
-def draw_cone_features(
-    features: ArrayLike,
-    thick: ArrayLike,
-    path: Path,
-    *,
-    wrong: ArrayLike | None = None,
-    title: str | None = None,
-) -> None:
+def draw_cone_features(features: Array, thick: Flags, wrong: Flags, path: Path, title: str) -> None:
     """Draw clusters of thin and thick cones by the principal components of their features.
 
     Arrows show the direction in which each feature grows.
@@ -182,22 +174,20 @@ def draw_cone_features(
     Args:
         features: [N, 3], see `coil_rl.envs.robot.FEATURES`.
         thick: [N], whether each cluster is a thick cone.
-        wrong: [N], whether each cluster is classified wrongly and gets a ring; by default none.
+        wrong: [N], whether each cluster is classified wrongly and gets a ring.
         title: above the picture.
     """
     xy, directions, share = principal_components(features)
-    is_thick = np.asarray(thick, dtype=bool)
-    is_wrong = np.zeros(len(xy), dtype=bool) if wrong is None else np.asarray(wrong, dtype=bool)
     kinds = (
-        ("thin (left)", ~is_thick, style.LEFT_CONE, "o"),
-        ("thick (right)", is_thick, style.RIGHT_CONE, "s"),
+        ("thin (left)", ~thick, style.LEFT_CONE, "o"),
+        ("thick (right)", thick, style.RIGHT_CONE, "s"),
     )
     handles = []
     for name, rows, colour, marker in kinds:
         label = f"{name}, {int(rows.sum())} clusters"
         handles.append(Line2D([], [], ls="", marker=marker, color=colour, ms=5, label=label))
-    if is_wrong.any():
-        label = f"misclassified, {int(is_wrong.sum())}"
+    if wrong.any():
+        label = f"misclassified, {int(wrong.sum())}"
         ring: Any = {"ls": "", "marker": "o", "mfc": "none", "mec": style.INK, "ms": 6.5}
         handles.append(Line2D([], [], label=label, **ring))
     with style.picture(path, title, handles, 4.4) as figure:
@@ -209,7 +199,7 @@ def draw_cone_features(
         dots: Any = {"ms": 3.6, "mec": style.BACKGROUND, "mew": 0.3, "alpha": 0.75}
         for _, rows, colour, marker in kinds:
             axes.plot(*xy[rows].T, marker, color=colour, **dots)
-        axes.plot(*xy[is_wrong].T, "o", ms=7.0, mfc="none", mec=style.INK, mew=0.9)
+        axes.plot(*xy[wrong].T, "o", ms=7.0, mfc="none", mec=style.INK, mew=0.9)
         _draw_directions(axes, directions, xy.max(axis=0))
         axes.set_xlim(xy[:, 0].min() - 0.2, xy[:, 0].max() + 0.4)
 

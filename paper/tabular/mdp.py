@@ -15,6 +15,8 @@ from coil_rl.ranges import Interval, checked
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
+BRANCHES = 3  # states to which an action of `garnet` can lead
+
 
 @checked
 class MDP:
@@ -173,22 +175,18 @@ def toymaker(gamma: float = 0.95) -> MDP:
     )
 
 
-def garnet(
-    states: int, actions: int, rng: Generator, *, branches: int = 3, gamma: float = 0.9
-) -> MDP:
+def garnet(states: int, actions: int, rng: Generator, *, gamma: float = 0.9) -> MDP:
     """Return a random world (a Garnet, Archibald et al. 1995).
 
-    Each action leads to some randomly drawn states, with probabilities from a flat Dirichlet
+    Each action leads to three randomly drawn states, with probabilities from a flat Dirichlet
     distribution and a normally distributed reward that does not depend on the next state.
 
     Args:
-        branches: number of states to which an action can lead, from 1 to `states`.
+        states: S, at least 3.
         gamma: the discount factor, from 0 to less than 1.
     """
-    if not 1 <= branches <= states:
-        raise ValueError(f"branches={branches} must be between 1 and states={states}")
     P = np.zeros((states, actions, states))
     for s, a in np.ndindex(states, actions):
-        P[s, a, rng.choice(states, branches, replace=False)] = rng.dirichlet(np.ones(branches))
+        P[s, a, rng.choice(states, BRANCHES, replace=False)] = rng.dirichlet(np.ones(BRANCHES))
     R = np.broadcast_to(rng.normal(size=(states, actions, 1)), P.shape)
     return MDP(P, R, gamma)

@@ -46,14 +46,7 @@ def replay(config: DictConfig) -> None:
         env = build(config.env, "env", McapReplayEnv)
     _check_unique("recording", [recording.path for recording in env.recordings])
     runs, policies = _load_policies(config, env)
-    scans = int(env.length.max()) * len(policies)
-    with progress(total=scans, unit="scan", desc="replay", leave=False) as bar:
-
-        def tick(name: str) -> None:
-            bar.set_postfix_str(name, refresh=False)
-            bar.update()
-
-        results = open_loop(env, policies, seed=config.seed, tick=tick)
+    results = open_loop(env, policies, seed=config.seed)
     folder = Path(config.run_dir)
     names = _numbered([result.recording.path.name.removesuffix(".mcap") for result in results])
     folders = [folder / name for name in names] if len(names) > 1 else [folder]
@@ -129,9 +122,6 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
         result,
         folder / "annotated.mcap",
         topics=dict.fromkeys(topic for topic in topics if topic),
-        speed=robot.speed,
-        scale=OmegaConf.select(robot, "perception.scale", default=7.0),
-        laser_yaw=math.radians(OmegaConf.select(robot, "perception.laser_yaw", default=0.0)),
         about=about,
         attachments=attachments,
     )

@@ -28,6 +28,7 @@ DELETE_ALL = 3  # action of a marker
 COLOURS = {"left": {"r": 1.0, "g": 0.85}, "right": {"g": 0.3, "b": 1.0}}
 DIAMETERS = {"left": 2 * THIN, "right": 2 * THICK}  # m, of a cone
 CONE_HEIGHT, LINE_WIDTH = 0.1, 0.01  # m
+SCALE = 7.0  # of the cone world, to the metres of the paper's robot
 FADED = 0.3  # opacity of a boundary from the memory
 
 # Metadata record with the numbers of messages in the original, which the copy does not have
@@ -41,9 +42,6 @@ def annotate(
     path: Path,
     *,
     topics: Collection[str],
-    speed: float,
-    scale: float,
-    laser_yaw: float = 0.0,
     about: Mapping[str, str],
     attachments: Mapping[str, bytes],
 ) -> None:
@@ -56,9 +54,6 @@ def annotate(
 
     Args:
         topics: of the recording, copied besides its transforms.
-        speed: m/s of the robot, for the commands.
-        scale: factor from the robot's metres to those of the cone world.
-        laser_yaw: radians, bearing of the LiDAR's 0 in the car's frame, anticlockwise.
         about: entries of the metadata record `coil`, to which the SHA-256 of the recording is
             added.
         attachments: YAML files by name.
@@ -66,7 +61,7 @@ def annotate(
     Raises:
         RecordingError: if the recording can no longer be read.
     """
-    recording = result.recording
+    recording, env = result.recording, result.env
     contents = read_messages(recording.path, [*topics, *TRANSFORMS])
     times = recording.log_time.tolist()
     with RecordingWriter(path) as writer:
@@ -80,22 +75,27 @@ def annotate(
             writer.attach(name, attachment.media_type, attachment.data, created_and_logged)
         for policy in result.policies:
             steering = result.steering[policy]
-            angles = steering.action * result.max_steering
+            angles = steering.action * env.max_steering
             for time, angle, turn_rate in zip(
                 times, angles.tolist(), steering.omega.tolist(), strict=True
             ):
                 writer.add(f"/coil/{policy}/steering", FLOAT, time, {"data": angle})
-                writer.add(f"/coil/{policy}/cmd_vel", TWIST, time, twist(speed, turn_rate))
-        _add_view(writer, result, laser_yaw, scale)
+                writer.add(f"/coil/{policy}/cmd_vel", TWIST, time, twist(env.speed, turn_rate))
+        _add_view(writer, result)
         for name, content in attachments.items():
             writer.attach(name, "application/yaml", content)
         writer.describe("coil", {**about, "input_sha256": digest(recording.path)})
 
 
-def _add_view(writer: RecordingWriter, result: OpenLoop, laser_yaw: float, scale: float) -> None:
-    """Write what the car perceives at each scan: the cones and the boundaries as markers."""
-    cos, sin = math.cos(laser_yaw), math.sin(laser_yaw)
-    to_laser = np.array([[cos, -sin], [sin, cos]]) / scale
+def _add_view(writer: RecordingWriter, result: OpenLoop) -> None:
+    """Write what the car perceives at each scan: the cones and the boundaries as markers.
+
+    A perception that does not say its `scale` and `laser_yaw` has those of the paper's robot.
+    """
+    perception = result.env.perception
+    yaw = math.radians(getattr(perception, "laser_yaw", 0.0))
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    to_laser = np.array([[cos, -sin], [sin, cos]]) / getattr(perception, "scale", SCALE)
     lines = _boundaries(result) @ to_laser
     cones = result.cones @ to_laser
     ever_valid = np.logical_or.accumulate(result.valid, axis=0)
@@ -122,7 +122,7 @@ def _boundaries(result: OpenLoop) -> Floats:
     This is the inverse of `sight.encode_samples`. The scale is that of the cone world.
     """
     distance, angle = np.moveaxis(result.observation.reshape(-1, 2, SAMPLES, 2), -1, 0)
-    distance, angle = (distance + 1) * (result.sight / 2), angle * WIDEST_ANGLE
+    distance, angle = (distance + 1) * (result.env.memory.sight / 2), angle * WIDEST_ANGLE
     return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1)
 
 

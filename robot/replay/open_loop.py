@@ -3,9 +3,8 @@
 The policies act at every scan of a drive that they did not control.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,8 +13,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from coil_rl import UserError
 from coil_rl.envs import HISTORY, McapReplayEnv, Recording, recent_mean
+from coil_rl.for_guests import progress
 
 RECORDED = "recorded"  # name of the recorded commands among the policies
 STEERING_KEYS = (("next", "steering"), ("next", "omega"), ("next", "info", "smoothness"))
@@ -54,8 +53,7 @@ class OpenLoop:
         observation: [N, 20], see `coil_rl.envs.sight`.
         valid: [N, 2], whether each side is valid in the scan.
         steering: by policy; `recorded_steering` is last, as `RECORDED`, if there are commands.
-        max_steering: radians of an action of 1.
-        sight: m, range of view in the scale of the cone world.
+        env: of the replay, without transforms.
     """
 
     recording: Recording
@@ -64,8 +62,7 @@ class OpenLoop:
     observation: NDArray[np.float32]
     valid: NDArray[np.bool_]
     steering: dict[str, Steering]
-    max_steering: float
-    sight: float
+    env: McapReplayEnv
 
     @property
     def both_valid(self) -> NDArray[np.bool_]:
@@ -79,14 +76,8 @@ class OpenLoop:
 
 
 @torch.no_grad()
-def open_loop(
-    env: McapReplayEnv,
-    policies: Policies,
-    *,
-    seed: int = 0,
-    tick: Callable[[str], Any] | None = None,
-) -> list[OpenLoop]:
-    """Return the result of each recording of an env.
+def open_loop(env: McapReplayEnv, policies: Policies, *, seed: int = 0) -> list[OpenLoop]:
+    """Return the result of each recording of an env, in which each recording has a row.
 
     Each policy observes its own last action.
 
@@ -94,31 +85,25 @@ def open_loop(
         env: the env of the recordings, without transforms.
         policies: the policies by name, each with an env that has the transforms it needs.
         seed: of PyTorch's generator, set again for each policy.
-        tick: called with the name of the policy after every scan.
-
-    Raises:
-        UserError: for an env with fewer rows than recordings.
     """
-    if env.batch_size[0] < len(env.recordings):
-        raise UserError(
-            f"env.num_envs={env.batch_size[0]} leaves out recordings, of which there are "
-            f"{len(env.recordings)}; leave it out for a row of each"
-        )
     scans = int(env.length.max())
     rollouts: dict[str, TensorDictBase] = {}
-    for name, (policy_env, policy) in policies.items():
-        torch.manual_seed(seed)
-
-        def after_scan(*_: Any, name: str = name) -> None:
-            if tick is not None:
-                tick(name)
-
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            policy_env, policy = policy_env.eval(), policy.eval()
-            rollouts[name] = policy_env.rollout(
-                scans, policy, callback=after_scan, break_when_any_done=False
-            ).cpu()
-        after_scan()
+    with progress(total=scans * len(policies), unit="scan", desc="replay", leave=False) as bar:
+        for name, (policy_env, policy) in policies.items():
+            torch.manual_seed(seed)
+            bar.set_postfix_str(name, refresh=False)
+            with set_exploration_type(ExplorationType.DETERMINISTIC):
+                rollouts[name] = (
+                    policy_env.eval()
+                    .rollout(
+                        scans,
+                        policy.eval(),
+                        callback=lambda *_: bar.update(),
+                        break_when_any_done=False,
+                    )
+                    .cpu()
+                )
+            bar.update()
     return [_result(env, row, rollouts) for row in range(len(env.recordings))]
 
 
@@ -135,8 +120,7 @@ def _result(env: McapReplayEnv, row: int, rollouts: Mapping[str, TensorDictBase]
         steering[RECORDED] = recorded_steering(recording, *car)
     view = next(iter(steps.values()))  # equal for all policies
     cones, count, observation, valid = (view[key].numpy() for key in VIEW_KEYS)
-    robot = env.max_steering, env.memory.sight
-    return OpenLoop(recording, cones, count, observation, valid, steering, *robot)
+    return OpenLoop(recording, cones, count, observation, valid, steering, env)
 
 
 def recorded_steering(

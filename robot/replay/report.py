@@ -135,7 +135,7 @@ def draw_steering(
             axes.set_axisbelow(True)
         for name, stroke in strokes.items():
             line: dict[str, Any] = {"color": stroke.colour, "ls": stroke.linestyle, "lw": 1.1}
-            degrees = np.degrees(result.steering[name].action * result.max_steering)
+            degrees = np.degrees(result.steering[name].action * result.env.max_steering)
             steering_axes.plot(seconds, degrees, **line)
             omega_axes.plot(seconds, result.steering[name].omega, **line)
         omega_axes.set_xlabel("time (s)")

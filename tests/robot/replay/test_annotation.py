@@ -1,7 +1,7 @@
 """Annotated recordings, read by another library."""
 
 import itertools
-import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -29,11 +29,11 @@ def perception(ranges, angles):
     return cones, count
 
 
-def annotate_replay(source, path, *, sight=None, **options):
+def annotate_replay(source, path, *, sight=None, perceive=perception, **options):
     """Write a recording with the replay of a guide."""
-    env = McapReplayEnv(source, perception, sight=sight)
+    env = McapReplayEnv(source, perceive, sight=sight)
     [result] = open_loop(env, {"spline": (env, SplineGuide())})
-    usual = {"topics": ["/scan"], "speed": 0.15, "scale": 7.0, "about": {}, "attachments": {}}
+    usual = {"topics": ["/scan"], "about": {}, "attachments": {}}
     annotate(result, path, **usual | options)
 
 
@@ -161,7 +161,9 @@ def test_boundary_is_at_its_place_with_any_range_of_view(source, read, tmp_path)
 
 @pytest.mark.parametrize("topic", ["/coil/cones", "/coil/boundary"])
 def test_markers_are_in_the_frame_of_a_lidar_that_points_to_the_left(source, read, topic, tmp_path):
-    annotate_replay(source, tmp_path / "turned.mcap", laser_yaw=math.radians(90))
+    to_the_left = partial(perception)
+    to_the_left.laser_yaw = 90.0
+    annotate_replay(source, tmp_path / "turned.mcap", perceive=to_the_left)
     turned, _ = by_another_library(tmp_path / "turned.mcap")
     for a, b in zip(points_of(read[0][topic]), points_of(turned[topic]), strict=True):
         assert (b.x, b.y) == pytest.approx((a.y, -a.x), abs=1e-6)
