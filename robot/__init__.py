@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from coil_rl.for_guests import lazy_names
 
 if TYPE_CHECKING:
-    from coil_robot.classifier import LabelledClusters as LabelledClusters
     from coil_robot.classifier import Scans as Scans
     from coil_robot.classifier import Share as Share
     from coil_robot.classifier import Training as Training

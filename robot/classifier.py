@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.stats import binomtest
@@ -61,29 +62,6 @@ class Training:
     accuracy: Array
     correct: int
     total: int
-
-
-@dataclass(frozen=True, eq=False)
-class LabelledClusters:
-    """N clusters with their true cones.
-
-    Attributes:
-        features: [N, 3] m, width, depth and girth.
-        thick: [N], whether the cone is thick.
-        drive: [N], index of the drive.
-        scan: [N], index of the scan in the drive.
-        cone: [N], index of the cone on its track.
-        distance: [N] m, of the centroid.
-        visibility: [N], share of the cone's beams that no nearer cone blocks.
-    """
-
-    features: Array
-    thick: Flags
-    drive: Integers
-    scan: Integers
-    cone: Integers
-    distance: Array
-    visibility: Array
 
 
 class Share(NamedTuple):
@@ -243,9 +221,7 @@ def clusters_in_range(drives: Sequence[Scans], every: int = 1) -> tuple[Array, I
     return np.concatenate(features), np.repeat(np.arange(len(features)), counts)
 
 
-def label_clusters(
-    drives: Sequence[SimulatedDrive], max_distance: float = RANGE
-) -> LabelledClusters:
+def label_clusters(drives: Sequence[SimulatedDrive], max_distance: float = RANGE) -> pd.DataFrame:
     """Return the clusters of drives, labelled with the cone of most of their points.
 
     Clusters of outliers alone are left out.
@@ -253,16 +229,19 @@ def label_clusters(
     Args:
         drives: with the true cone of each range.
         max_distance: largest distance of a cluster, m.
+
+    Returns:
+        A row for each cluster, with its features in m, whether the cone is `thick`, the index of
+        the `drive`, of the `scan` in it, and of the `cone` on its track, the `distance` of the
+        centroid in m, and the `visibility`: the share of the cone's beams that no nearer cone
+        blocks.
     """
-    columns: dict[str, list[Any]] = {each.name: [] for each in fields(LabelledClusters)}
-    for number, drive in enumerate(drives):
-        for name, values in _label_drive(drive, number, max_distance).items():
-            columns[name].append(values)
-    return LabelledClusters(**{name: np.concatenate(parts) for name, parts in columns.items()})
+    tables = [_label_drive(drive, max_distance).assign(drive=n) for n, drive in enumerate(drives)]
+    return pd.concat(tables, ignore_index=True)
 
 
-def _label_drive(drive: SimulatedDrive, number: int, max_distance: float) -> dict[str, Any]:
-    """Return the columns of `LabelledClusters` of the drive with a number."""
+def _label_drive(drive: SimulatedDrive, max_distance: float) -> pd.DataFrame:
+    """Return the rows of `label_clusters` of a drive."""
     points = points_of(drive.ranges.numpy(), drive.angles.numpy(), RANGE_MIN, max_distance + MARGIN)
     label = single_linkage(points)
     clusters = measure(points, label)
@@ -270,31 +249,24 @@ def _label_drive(drive: SimulatedDrive, number: int, max_distance: float) -> dic
     votes = np.zeros((int(label.max(initial=-1)) + 1, drive.cones.shape[1] + 1), dtype=np.int64)
     np.add.at(votes, (label, drive.hit.numpy()[points.scan, points.beam]), 1)
     cone = np.where(votes[:, :-1].any(1), votes[:, :-1].argmax(1), -1)[clusters.label]
-    distance = np.hypot(*clusters.centroid.T)
-    rows = (distance <= max_distance) & (cone >= 0)
-    cone, scan = cone[rows], clusters.scan[rows]
-    return {
-        "features": clusters.features[rows],
-        "thick": drive.thick.numpy()[cone],
-        "drive": np.full(len(cone), number),
-        "scan": scan,
-        "cone": cone,
-        "distance": distance[rows],
-        "visibility": drive.visibility.numpy()[scan, cone],
-    }
+    table = pd.DataFrame(clusters.features, columns=list(FEATURES))
+    table["thick"] = drive.thick.numpy()[cone]
+    table["scan"], table["cone"] = clusters.scan, cone
+    table["distance"] = np.hypot(*clusters.centroid.T)
+    table["visibility"] = drive.visibility.numpy()[clusters.scan, cone]
+    return table[(table["distance"] <= max_distance) & (cone >= 0)]
 
 
-def accuracy(classifier: ConeClassifier, labelled: LabelledClusters) -> dict[str, Share]:
+def accuracy(classifier: ConeClassifier, labelled: pd.DataFrame) -> dict[str, Share]:
     """Return the share of correctly classified clusters.
+
+    Args:
+        labelled: clusters, see `label_clusters`.
 
     Returns:
         The share of `all` clusters, and the shares by range and by visibility of the cone.
     """
-    return _shares(
-        classifier.classify(labelled.features) == labelled.thick,
-        labelled.distance,
-        labelled.visibility,
-    )
+    return _shares(labelled.assign(correct=_correct(classifier, labelled)))
 
 
 def recall(
@@ -311,30 +283,36 @@ def recall(
         For either kind, the share of `all` cones, and the shares by range and by visibility.
     """
     labelled = label_clusters(drives, RANGE + MARGIN)
-    correct = classifier.classify(labelled.features) == labelled.thick
-    # Of each cone in each scan: whether it is recognised and thick, its distance and visibility.
-    parts = []
+    known = labelled[_correct(classifier, labelled)]
+    tables = []
     for number, drive in enumerate(drives):
         offset = drive.cones[:, None] - drive.poses[:2, :, 0, None]
         distance = (offset.norm(dim=0) - drive.radius).numpy()
         visibility = drive.visibility.numpy()
         recognised = np.zeros(distance.shape, dtype=bool)
-        rows = (labelled.drive == number) & correct
-        recognised[labelled.scan[rows], labelled.cone[rows]] = True
-        counted = (distance > RANGE_MIN) & (distance <= RANGE) & (visibility > 0)
-        thick = np.broadcast_to(drive.thick.numpy(), distance.shape)
-        parts.append([each[counted] for each in (recognised, distance, visibility, thick)])
-    *values, thick = map(np.concatenate, zip(*parts, strict=True))
-    kinds = {"thin": ~thick, "thick": thick}
-    return {name: _shares(*(each[rows] for each in values)) for name, rows in kinds.items()}
+        of_drive = known[known["drive"] == number]
+        recognised[of_drive["scan"], of_drive["cone"]] = True
+        scan, cone = np.nonzero((distance > RANGE_MIN) & (distance <= RANGE) & (visibility > 0))
+        columns = {"correct": recognised, "distance": distance, "visibility": visibility}
+        table = pd.DataFrame({name: values[scan, cone] for name, values in columns.items()})
+        tables.append(table.assign(thick=drive.thick.numpy()[cone]))
+    cones = pd.concat(tables)
+    return {"thin": _shares(cones[~cones["thick"]]), "thick": _shares(cones[cones["thick"]])}
 
 
-def _shares(correct: NDArray[np.generic], distance: Array, visibility: Array) -> dict[str, Share]:
-    """Return the share of correct ones: of all, by range in m, and by visibility; all are [N]."""
-    shares = {"all": share_of(int(correct.sum()), len(correct))}
-    properties = (("m", distance, RANGE_BINS), ("visible", visibility, VISIBILITY_BINS))
-    for name, value, bins in properties:
+def _correct(classifier: ConeClassifier, labelled: pd.DataFrame) -> NDArray[np.bool_]:
+    """Return whether each cluster is classified correctly, [N]."""
+    features = labelled[list(FEATURES)].to_numpy()
+    return np.asarray(classifier.classify(features) == labelled["thick"])
+
+
+def _shares(rows: pd.DataFrame) -> dict[str, Share]:
+    """Return the share of `correct` rows: of all, by `distance` in m, and by `visibility`."""
+    groups = {"all": rows["correct"]}
+    for name, column, bins in (
+        ("m", rows["distance"], RANGE_BINS),
+        ("visible", rows["visibility"], VISIBILITY_BINS),
+    ):
         for low, high in pairwise(bins):
-            rows = (value > low) & (value <= high)
-            shares[f"{low:g}-{high:g} {name}"] = share_of(int(correct[rows].sum()), int(rows.sum()))
-    return shares
+            groups[f"{low:g}-{high:g} {name}"] = rows["correct"][(column > low) & (column <= high)]
+    return {name: share_of(int(group.sum()), len(group)) for name, group in groups.items()}

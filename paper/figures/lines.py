@@ -31,6 +31,7 @@ from coil_studies.listening import LEFT, RIGHT, classify, smooth_line
 INSIDE_COLOUR = "#eceff2"
 HALF_WIDTH = 1.5  # m, of the straightened track
 SPACING = 0.05  # m, of the middle line
+RECORD = {"pose": ("info", "pose"), "smoothness": ("info", "smoothness")}
 CONE: Any = {"ms": 3, "mec": style.INK, "mew": 0.3}
 
 
@@ -84,35 +85,26 @@ def drive(
     Args:
         folders: of finished runs; tracks and guide are those of the first one.
         policy: of each run, "last" or "handed_over".
+
+    Raises:
+        UserError: for a folder without a run, and for one in another world than that of the cones.
     """
     runs = [open_run(folder) for folder in folders]
     trial = runs[0].trial
-    tracks = test_tracks(trial.pictures, folders[0])[:count]
-    record = {"pose": ("info", "pose"), "smoothness": ("info", "smoothness")}
-    evaluation = replace(trial.evaluation, cases=[track.name for track in tracks], record=record)
+    pictures = [each for each in trial.pictures if isinstance(each, DrivenLines)]
+    if not pictures:
+        raise UserError(
+            f"{folders[0]} is no run in the cone world, so that it has no lines to draw"
+        )
+    tracks = pictures[0].tracks[:count]
+    cases = [track.name for track in tracks]
+    evaluation = replace(trial.evaluation, cases=cases, record=RECORD)
     drives = dict(trial.guide_results(evaluation, []))
     for run in runs:
         env = run.make_env(len(tracks), "test")
         name = run.label if run.label not in drives else f"{run.label}, seed {run.seed}"
         drives[name] = evaluation.run(env, run.policy(env, policy))
     return tracks, drives
-
-
-def test_tracks(pictures: Sequence[object], folder: Path) -> Sequence[Track]:
-    """Return the tracks of the picture of driven lines that the evaluation of a run draws.
-
-    Raises:
-        UserError: for a run in another world than that of the cones.
-    """
-    for picture in pictures:
-        if isinstance(picture, DrivenLines):
-            return picture.tracks
-    raise UserError(f"{folder} is no run in the cone world, so that it has no lines to draw")
-
-
-def line_of(result: EvaluationResult, index: int) -> Array:
-    """Return the driven line of an episode, [steps, 2] m."""
-    return result.histories["pose"][index][:, :2]
 
 
 def draw_map(axes: Axes, straight: StraightTrack) -> None:
@@ -179,8 +171,8 @@ def draw(
             draw_straight(above, straight)
             for name, result in drives.items():
                 stroke = {"color": strokes[name].colour, "ls": strokes[name].linestyle}
-                line, rough = line_of(result, index), result.histories["smoothness"][index]
-                along, left, rough = straight.last_lap(line, rough)
+                pose, rough = (result.histories[key][index] for key in RECORD)
+                along, left, rough = straight.last_lap(pose[:, :2], rough)
                 above.plot(along, left, lw=1.2, zorder=4, **stroke)
                 below.plot(along, rough, lw=1.0, **stroke)
                 if result.episodes[index]["crashed"]:
@@ -213,14 +205,17 @@ def main() -> None:
     parser.add_argument("--tracks", type=int, default=3, help="number of test tracks")
     parser.add_argument("--policy", choices=("last", "handed_over"), default="last")
     options = parser.parse_args()
-    options.output.mkdir(parents=True, exist_ok=True)
-    tracks, drives = drive(options.runs, options.tracks, options.policy)
+    try:
+        tracks, drives = drive(options.runs, options.tracks, options.policy)
+    except UserError as error:
+        parser.error(str(error))
     straight = [StraightTrack(track) for track in tracks]
     draw(options.output / "lines.png", straight, drives)
     rows = []
     for name, result in drives.items():
         for index, (episode, of_track) in enumerate(zip(result.episodes, straight, strict=True)):
-            ratio = of_track.path_ratio(line_of(result, index)) if episode["laps"] else None
+            line = result.histories["pose"][index][:, :2]
+            ratio = of_track.path_ratio(line) if episode["laps"] else None
             rows.append({"driver": name, **episode, "path": ratio})
     columns = {
         "driver": ("driver", ""),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
@@ -91,8 +92,8 @@ class Figure25(Result):
         cones.save_classifier(training.classifier, stem.with_name("cones.json"))
         labelled = cones.label_clusters(self.test_drives) if self.test_drives else None
         if labelled is not None:
-            kind, drawn = "test", labelled.scan % DRAW_EVERY == 0
-            features, is_thick = labelled.features[drawn], labelled.thick[drawn]
+            kind, drawn = "test", labelled[labelled["scan"] % DRAW_EVERY == 0]
+            features, is_thick = drawn[list(FEATURES)].to_numpy(), drawn["thick"].to_numpy()
         else:
             kind = "training"
             sides = [cones.clusters_in_range(side, DRAW_EVERY)[0] for side in (thin, thick)]
@@ -127,7 +128,7 @@ class Figure25(Result):
         return [(each.ranges, each.angles(slice(None))) for each in self.recordings[side]]
 
     def _shares(
-        self, training: cones.Training, labelled: cones.LabelledClusters | None
+        self, training: cones.Training, labelled: pd.DataFrame | None
     ) -> list[dict[str, Any]]:
         """Return how many clusters and cones are classified correctly, as rows of the table.
 

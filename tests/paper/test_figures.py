@@ -7,13 +7,13 @@ from programs import LAP, ROOT, environment
 from run_folders import make_untrained_run
 
 
-def run(script, *arguments):
+def run(script, *arguments, code=0):
     command = [sys.executable, "-m", f"coil_paper.figures.{script}", *map(str, arguments)]
     done = subprocess.run(
         command, env=environment(ROOT), cwd=ROOT, capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert done.returncode == code, done.stderr
+    return done.stderr if code else done.stdout
 
 
 @pytest.mark.slow
@@ -33,3 +33,9 @@ def test_lines_draws_the_agents_of_runs_and_the_guide(tmp_path):
     ]
     assert rows == ["guide", "ppo", "coil"]
     assert (tmp_path / "lines.png").exists()
+
+
+@pytest.mark.slow
+def test_lines_of_what_is_no_run_is_one_sentence(tmp_path):
+    last = run("lines", tmp_path, code=2).splitlines()[-1]
+    assert f"folder={tmp_path} is not the folder of a run" in last
