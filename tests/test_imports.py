@@ -59,7 +59,9 @@ ALLOWED = {
     "conf": set(),
 }
 # What everything may import.
-BELOW = ("coil_rl.errors", "coil_rl.extras", "coil_rl.files", "coil_rl.lazy", "coil_rl.ranges")
+BELOW = tuple(
+    f"coil_rl.{name}" for name in ("errors", "extras", "files", "lazy", "plain_yaml", "ranges")
+)
 
 
 def source_files(*folders: str) -> list[Path]:

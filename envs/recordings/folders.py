@@ -4,25 +4,15 @@ The metadata are written by another program than the files, and after them: they
 name no storage (as after a reindexing), or count messages of a longer recording. The files decide.
 """
 
-import re
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from coil_rl.files import open_regular, read_file
+from coil_rl.files import open_regular
+from coil_rl.plain_yaml import read_yaml
 
 MAGIC = b"\x89MCAP0\r\n"
-LARGEST_METADATA = 1_000_000  # bytes of the metadata.yaml of a folder
 CONVERT = "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap"
-
-# The metadata are written by a program, so a few of their lines are found without a YAML parser.
-STORAGE = re.compile(r"^\s*storage_identifier:[ \t]*[\"']?(\w*)", re.MULTILINE)
-LISTED = re.compile(r"^\s*relative_file_paths:\s*\n((?:\s*-[ \t]+.*\n?)+)", re.MULTILINE)
-LISTED_IN_A_LINE = re.compile(r"^\s*relative_file_paths:[ \t]*\[([^\]\n]*)\]", re.MULTILINE)
-COUNTED = re.compile(r"^\s*topics_with_message_count:\s*\n", re.MULTILINE)
-OF_A_TOPIC = re.compile(r"^\s*-[ \t]+(?=topic_metadata:|message_count:)", re.MULTILINE)
-NAME = re.compile(r"^\s*name:[ \t]*[\"']?([^\s\"']+)", re.MULTILINE)
-NUMBER = re.compile(r"^\s*message_count:[ \t]*(\d{1,18})\s*$", re.MULTILINE)
 
 
 class RecordingError(ValueError):
@@ -57,53 +47,32 @@ def files_of(path: Path) -> Folder:
         return Folder([path])
     metadata = path / "metadata.yaml"
     try:
-        text = read_file(metadata, LARGEST_METADATA).decode()
-    except (OSError, UnicodeDecodeError):
+        said = read_yaml(metadata)["rosbag2_bagfile_information"]
+        # Older versions of ROS put the folder's own name before the file's.
+        names = [Path(name).name for name in said["relative_file_paths"] or ()]
+        topics = said.get("topics_with_message_count") or ()
+        named = [each for each in topics if "topic_metadata" in each]  # not in the oldest ones
+        counts = {each["topic_metadata"]["name"]: each["message_count"] for each in named}
+    except Exception:  # it may hold anything
         raise RecordingError(
             f"{path} is a folder without a readable metadata.yaml; let ROS write it: ros2 bag "
             "reindex FOLDER."
         ) from None
-    names = _listed(text)
     if not names:
         raise RecordingError(
             f"{metadata} lists no files; let ROS write it: ros2 bag reindex FOLDER."
         )
-    files = [path / name for name in dict.fromkeys(names)]
-    storage = STORAGE.search(text)
-    if storage and storage[1] not in ("", "mcap") and not any(map(_is_mcap, files)):
+    files, storage = [path / name for name in dict.fromkeys(names)], said.get("storage_identifier")
+    if storage not in (None, "", "mcap") and not any(map(_is_mcap, files)):
         raise RecordingError(
-            f"{path} is a recording in {storage[1]}, not in MCAP; convert it: {CONVERT}."
+            f"{path} is a recording in {storage}, not in MCAP; convert it: {CONVERT}."
         )
     for file in files:
         if not file.is_file():
             raise RecordingError(
                 f"{metadata} lists {file.name}, which is missing; copy all its files."
             )
-    return Folder(files, _counts(text), _remarks(path, names))
-
-
-def _listed(text: str) -> list[str]:
-    """Return the names of the files that the metadata list."""
-    block, line = LISTED.search(text), LISTED_IN_A_LINE.search(text)
-    entries: list[str] = []
-    if block:
-        entries = [entry.strip().removeprefix("-") for entry in block[1].splitlines()]
-    elif line:
-        entries = line[1].split(",")
-    # Older versions of ROS put the folder's own name before the file's.
-    names = [Path(entry.strip(" \"'")).name for entry in entries]
-    return [name for name in names if name]
-
-
-def _counts(text: str) -> dict[str, int]:
-    """Return the number of messages of each topic that the metadata claim."""
-    counts: dict[str, int] = {}
-    section = COUNTED.split(text, maxsplit=1)[1:]
-    for part in OF_A_TOPIC.split(section[0])[1:] if section else ():
-        name, number = NAME.search(part), NUMBER.search(part)
-        if name and number:
-            counts[name[1]] = int(number[1])
-    return counts
+    return Folder(files, counts, _remarks(path, names))
 
 
 def _remarks(path: Path, names: list[str]) -> list[str]:

@@ -208,6 +208,12 @@ def test_missing_files_and_incomplete_folders_are_refused(tmp_path):
     assert "folder without a readable metadata.yaml" in refusal(tmp_path)
     assert "rosbags-convert" in refusal(rosbag(tmp_path, "drive_0.db3", storage="sqlite3"))
     assert "lists no files" in refusal(rosbag(tmp_path))
+    (tmp_path / "metadata.yaml").write_text("- [no: metadata")
+    assert "folder without a readable metadata.yaml" in refusal(tmp_path)
+    topic = "topic_and_type: {name: /scan}"  # as the first versions of ROS 2 wrote it
+    text = f"relative_file_paths: [drive_0.mcap], topics_with_message_count: [{{{topic}}}]"
+    (tmp_path / "metadata.yaml").write_text(f"rosbag2_bagfile_information: {{{text}}}")
+    assert len(read_recording(tmp_path).ranges) == 1
 
 
 def test_recording_that_is_cut_off_is_read_as_far_as_it_goes(tmp_path, whole):
