@@ -51,7 +51,7 @@ def identity_of(given: Named, config: DictConfig, minutes: float, seed: int) -> 
         minutes: that it may take.
         seed: of the first trainings.
     """
-    code = nodes.code_of_user(config, ("env", "guide"))
+    code = nodes.code_of_run(config).values()
     arguments = {
         "words": list(given.words),
         "objects": sorted(given.nodes),

@@ -63,7 +63,7 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
         expected: type of the result.
         arguments: added by the program.
     """
-    node = _converted(check_node(node, name, arguments))
+    node = check_node(node, name, arguments)
     try:
         # In the node, because Hydra merges it with keyword arguments, which takes a while.
         built = hydra.utils.instantiate({**node, "_convert_": "all"}, **arguments)
@@ -89,7 +89,7 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
 
 
 def check_node(node: Any, name: str, program: Iterable[str] = ()) -> dict[str, Any]:
-    """Return a node with its references resolved, after the checks of `build`.
+    """Return a node with its references resolved, as it is built, after the checks of `build`.
 
     Nothing is built.
 
@@ -102,32 +102,21 @@ def check_node(node: Any, name: str, program: Iterable[str] = ()) -> dict[str, A
             f"{name}={yaml_text(node)} has no _target_; give single settings, {name}.KEY=VALUE, or "
             "a _target_, the full name of a class or function"
         )
-    _check(node, name, program)
-    return dict(node)
+    return dict(_checked(node, name, program))
 
 
-def _check(node: Any, name: str, program: Iterable[str] = ()) -> None:
-    if isinstance(node, Mapping):
-        for key, value in node.items():
-            _check(value, f"{name}.{key}")
-        if "_target_" in node:
-            target = find_target(node["_target_"], name)
-            check_arguments(target, node, name, program)
-    elif isinstance(node, list):
-        for index, value in enumerate(node):
-            _check(value, f"{name}[{index}]")
-
-
-def _converted(node: Any) -> Any:
-    """Return a checked node with nodes for the tuples and arrays that callables of others want."""
+def _checked(node: Any, name: str, program: Iterable[str] = ()) -> Any:
+    """Return a checked value with nodes for the tuples and arrays that callables of others want."""
     if isinstance(node, list):
-        return [_converted(value) for value in node]
+        return [_checked(value, f"{name}[{index}]") for index, value in enumerate(node)]
     if not isinstance(node, Mapping):
         return node
-    node = {key: _converted(value) for key, value in node.items()}
+    node = {key: _checked(value, f"{name}.{key}") for key, value in node.items()}
     if "_target_" not in node:
         return node
-    return converted(hydra.utils.get_object(node["_target_"]), node)
+    target = find_target(node["_target_"], name)
+    check_arguments(target, node, name, program)
+    return converted(target, node)
 
 
 def find_target(path: Any, name: str) -> Callable[..., Any]:
@@ -459,18 +448,6 @@ class _State(pickle.Pickler):
         return NotImplemented
 
 
-def code_of_user(config: DictConfig, keys: Iterable[str]) -> list[str]:
-    """Return the identity of each class and function of the user that a configuration names.
-
-    Args:
-        keys: parts of it to look at, among them `env`, whose id may be registered with Gymnasium.
-    """
-    parts = OmegaConf.masked_copy(config, list(keys))
-    named = [*map(_named, sorted(import_paths(parts))), _registered(config.env.get("id"))]
-    found = [identity_of(each) for each in named if each is not None and is_of_user(each)]
-    return [*found, *_files_of(parts).values()]
-
-
 def code_of_run(config: DictConfig) -> dict[str, str]:
     """Return the SHA-256 of each file of the user that a run depends on, by its module.
 
@@ -499,18 +476,11 @@ def code_of_run(config: DictConfig) -> dict[str, str]:
         with suppress(OSError):  # it is gone
             found[name] = hashlib.sha256(Path(file).read_bytes()).hexdigest()
             waiting += [each for value in vars(module).values() for each in _modules_of(value)]
-    return dict(sorted((found | _files_of(parts)).items()))
-
-
-def _files_of(parts: DictConfig) -> dict[str, str]:
-    """Return the SHA-256 of each `file` that a configuration names, by its name."""
-    named = entries(OmegaConf.to_container(parts), lists=True)
-    paths = {Path(value) for _, key, value in named if key == "file" and isinstance(value, str)}
-    found = {}
-    for path in paths:
-        with suppress(OSError):  # what is missing is said where it is read
-            found[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
-    return found
+    for _, key, value in entries(OmegaConf.to_container(parts), lists=True):
+        if key == "file" and isinstance(value, str):
+            with suppress(OSError):  # what is missing is said where it is read
+                found[Path(value).name] = hashlib.sha256(Path(value).read_bytes()).hexdigest()
+    return dict(sorted(found.items()))
 
 
 def _modules_of(thing: Any) -> list[str]:

@@ -27,7 +27,7 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from coil_rl.config.nodes import (
     build,
     build_all,
-    code_of_user,
+    code_of_run,
     find_target,
     identity_of,
     kept_objects,
@@ -458,7 +458,7 @@ def _hash_of_user(config: DictConfig, name: str) -> list[str]:
     things = kept_objects(config, "env")
     if find_target(guide.get("_target_"), f"guide.{name}") is ControllerGuide:
         things += kept_objects(config, "guide")
-    found = [*map(identity_of, things), *code_of_user(config, ("guide", "env"))]
+    found = [*map(identity_of, things), *code_of_run(config).values()]
     if not found:
         return []
     return [hashlib.sha256(" ".join(found).encode()).hexdigest()[:10]]

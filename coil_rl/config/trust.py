@@ -23,7 +23,7 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import hydra.utils
 import yaml
@@ -71,16 +71,13 @@ CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.-]*")  # MODULE:NAME, wherever it i
 PLAIN = r"[\w-]+"  # a name that is no path, no address and no reference
 
 
-def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -> None:
+def trust_packages(packages: Iterable[str]) -> None:
     """Let the run folders that this process reads from here on use parts of packages.
 
-    They may use parts of no others.
-
-    A folder may call everything that is defined in these packages.
+    They may use parts of no others. A folder may call everything that is defined in these packages.
 
     Args:
         packages: their top-level names.
-        command: the configuration that the user composed; what it names is trusted too.
 
     Raises:
         UserError: for a package that is never trusted.
@@ -98,12 +95,11 @@ def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -
                 f"trust=[{name}] cannot be: functions of {name} run any code; name the package of "
                 "the part"
             )
-    _packages = frozenset(names)
-    _own = frozenset() if command is None else import_paths(command)
+    _packages, _own = frozenset(names), frozenset()
 
 
 def trust_own(config: DictConfig) -> None:
-    """Let this process read folders that name what a configuration of the user names."""
+    """Let the folders that this process reads name what a configuration of the user names."""
     global _own
     _own |= import_paths(config)
 
@@ -178,20 +174,9 @@ def _import_path(name: str, key: Any, value: Any) -> Any:
     return value.replace(":", ".", 1) if names_code else None
 
 
-class _Entry(NamedTuple):
-    """An entry of a configuration that names something to be called."""
-
-    path: Path  # of the file
-    name: str  # full key
-    target: Any  # what it names
-
-    def __str__(self) -> str:
-        return f"{self.path}: {self.name:.100} names {self.target!r:.100}"
-
-
 def _check_target(target: Any, name: str, path: Path) -> None:
     """Raise a `UserError` if an entry names something that a folder may not call."""
-    entry = _Entry(path, name, target)
+    entry = f"{path}: {name:.100} names {target!r:.100}"
     package = target.partition(".")[0] if isinstance(target, str) else ""
     if not package.isidentifier():
         raise UserError(f"{entry}, which is not the full name of a class; give one")
@@ -202,7 +187,7 @@ def _check_target(target: Any, name: str, path: Path) -> None:
     if package not in NEVER_TRUSTED and package in _packages | entry_points:
         # A Gymnasium env is registered by its module, and has no name of its own there.
         if not name.endswith(".id"):
-            _check_origin(entry, package)
+            _check_origin(target, package, entry)
     elif package in NEVER_TRUSTED:
         similar = did_you_mean(target, allowed) if package == "coil_rl" else ""
         raise UserError(
@@ -215,10 +200,14 @@ def _check_target(target: Any, name: str, path: Path) -> None:
         )
 
 
-def _check_origin(entry: _Entry, package: str) -> None:
-    """Raise a `UserError` if a part is not defined in the trusted package that names it."""
+def _check_origin(target: str, package: str, entry: str) -> None:
+    """Raise a `UserError` if a part is not defined in the trusted package that names it.
+
+    Args:
+        entry: that names it, the beginning of the sentence.
+    """
     try:
-        origin = str(getattr(hydra.utils.get_object(entry.target), "__module__", None))
+        origin = str(getattr(hydra.utils.get_object(target), "__module__", None))
     except Exception as error:
         raise UserError(
             f"{entry}, which {package} does not have; check that the package is installed"

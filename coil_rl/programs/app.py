@@ -39,7 +39,7 @@ from coil_rl import programs
 from coil_rl.config.compose import keep_written, key_of
 from coil_rl.config.folder import make_folder
 from coil_rl.config.messages import is_no_bug, naming_files, refuse
-from coil_rl.config.trust import trust_packages
+from coil_rl.config.trust import trust_own, trust_packages
 from coil_rl.errors import NO_SPACE, UserError
 from coil_rl.output import SafeStream
 from coil_rl.plain_yaml import is_part
@@ -269,7 +269,8 @@ def _do(
     if is_sweep() and "existing" in config:
         config.existing = "resume"  # so that a sweep goes on by the same command
     files = keep_written(config, HydraConfig.get(), *typed())
-    trust_packages(config.get("trust", []), config)
+    trust_packages(config.get("trust", []))
+    trust_own(config)
     has_folder = bool(config.get("run_dir"))
     made = _missing(Path(config.run_dir).absolute()) if has_folder else []
     try:

@@ -293,7 +293,7 @@ def test_trusted_package_may_be_used_and_nothing_that_it_imports(
 @pytest.mark.parametrize(("naming", "sep"), [(with_target, "."), (with_controller, ":")])
 def test_what_the_command_itself_names_is_trusted_in_folders(naming, sep, package, saved, tmp_path):
     theirs = naming(saved, f"their_package{sep}TheirGuide")
-    trust.trust_packages([], OmegaConf.create({"guide": theirs["guide"]}))
+    trust.trust_own(OmegaConf.create({"guide": theirs["guide"]}))
     assert read(tmp_path, theirs).guide.theirs
     with pytest.raises(UserError, match=r"trust=\[their_package\]"):
         read(tmp_path, naming(saved, f"their_package{sep}Other"))

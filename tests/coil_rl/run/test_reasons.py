@@ -103,7 +103,7 @@ def test_next_command_trusts_what_the_command_of_the_run_named():
         }
     )
     try:
-        trust_packages(["other"], command)
+        trust_packages(["other"])
         line = next_step(Path("runs/one"), 1000, trust=to_trust(command))
     finally:
         trust_packages([])
