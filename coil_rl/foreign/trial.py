@@ -293,7 +293,8 @@ class Trial:
             (
                 "past",
                 equal(interrupted[0, middle:], fresh[0]),
-                "the guide's action after the reset of a row depends on what was before it",
+                "the guide's action after the reset of a row depends on what was before it, or on "
+                "the other rows",
             ),
             (
                 "clock",

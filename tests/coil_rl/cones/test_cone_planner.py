@@ -49,4 +49,4 @@ def test_steering_stays_where_there_is_no_cone():
 
 @needs_planner
 def test_guide_acts_like_any_other():
-    check_guide(ConePlannerGuide(), SimulatedRobotEnv(num_envs=2).reset())
+    check_guide(ConePlannerGuide(), SimulatedRobotEnv(num_envs=2))

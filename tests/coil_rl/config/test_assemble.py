@@ -55,7 +55,7 @@ def test_guide_drives_as_the_policy_in_its_own_env(run):
 def test_guide_is_deterministic_and_advises_another_agent(run):
     env = env_maker(composed(*ONE_SECOND, "method=ppo", "run_dir=unused"))()
     data, guide = env.rollout(5, break_when_any_done=False)[:, -1], LearnedGuide(str(run))
-    check_guide(guide, data, tolerance=1e-6)
+    check_guide(guide, env.base_env, tolerance=1e-6)
     assert not any(p.requires_grad for p in guide.parameters())
     assert set(guide(data.select(*guide.in_keys)).keys()) == {*guide.in_keys, "action"}
     learned = ["method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"]
