@@ -19,7 +19,7 @@ SWEEP = "multirun.yaml"  # Hydra's file in the folder of a sweep
 FAILED_JOBS = "failed_jobs.txt"  # in the folder of a sweep, a line for each
 LARGEST_NUMBERS = 1_000_000  # bytes of a small file, such as guide_return.json
 LARGEST_TABLE = 200_000_000  # bytes of a table, such as metrics.csv
-BLOCK = 65_536  # bytes
+BLOCK = 65_536  # bytes that are read of a file without a size
 _OPTIONS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
@@ -59,14 +59,10 @@ def read_file(path: str | os.PathLike[str], largest: int) -> bytes:
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         # Some files of the system have no size before they are read.
-        blocks: list[bytes] = []
-        read = 0
-        while size <= largest and read <= largest and (block := file.read(max(size, BLOCK))):
-            blocks.append(block)
-            read += len(block)
-    if max(size, read) > largest:
+        content = b"" if size > largest else file.read(max(size, BLOCK))
+    if max(size, len(content)) > largest:
         raise OSError(errno.EINVAL, f"it has more than {largest:,} bytes", os.fspath(path))
-    return b"".join(blocks)
+    return content
 
 
 def read_text(path: str | os.PathLike[str], largest: int) -> str:

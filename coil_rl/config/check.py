@@ -177,7 +177,6 @@ def _check_env(
             f"env: {config.env.get('_target_', 'it')} has no key num_envs, so no policy can act in "
             "it; choose another env"
         )
-    check_node(config.env, "env")
     env = make_env.bare(SOME_ROWS, TEST, None)
     check_measures(config.evaluation.measures, env)
     for key in recorded:
@@ -416,9 +415,9 @@ def check_measures(measures: Any, env: EnvBase) -> None:
 
 def check_number(env: EnvBase, key: NestedKey, name: str) -> None:
     """Raise a `UserError` if an entry does not have exactly one number per row, or per agent."""
-    check_entry(env, key, name)
+    groups = check_entry(env, key, name)
     rewards = [env.full_reward_spec[each].shape for each in env.reward_keys]
-    for group in _groups(env, key):
+    for group in groups:
         spec = group[key]
         parent = group[key[:-1]] if isinstance(key, tuple) and len(key) > 1 else group
         shape = spec.shape[len(parent.shape) :]
@@ -436,8 +435,7 @@ def _check_flag(env: EnvBase, key: NestedKey, name: str) -> None:
 
     It is a boolean, or a number of Gymnasium's info, where flags are numbers too.
     """
-    check_entry(env, key, name)
-    found = [group[key] for group in _groups(env, key)]
+    found = [group[key] for group in check_entry(env, key, name)]
     rows = env.batch_size.numel()
     of_info = key in optional_entries(env)
     if not any(
@@ -449,27 +447,26 @@ def _check_flag(env: EnvBase, key: NestedKey, name: str) -> None:
         )
 
 
-def _specs(env: EnvBase) -> list[Composite]:
-    """Return the specs of what an env writes after a step."""
-    return [env.observation_spec, env.full_reward_spec, env.full_done_spec]
+def check_entry(env: EnvBase, key: NestedKey, name: str) -> list[Composite]:
+    """Return the specs of what an env writes in a step that have an entry.
 
+    There is none for the sum of rewards.
 
-def _groups(env: EnvBase, key: NestedKey) -> list[Composite]:
-    """Return the specs of an env that have an entry; none for the sum of rewards."""
-    return [group for group in _specs(env) if key in group.keys(True)]
+    Args:
+        name: the key that names the entry, for the message.
 
-
-def check_entry(env: EnvBase, key: NestedKey, name: str) -> None:
-    """Raise a `UserError` if an env does not write an entry; `name` is the key that names it."""
-    known = {EPISODE_REWARD}
-    for spec in _specs(env):
-        known |= {dotted(each) for each in spec.keys(True)}
+    Raises:
+        UserError: if the env does not write it.
+    """
+    groups = [env.observation_spec, env.full_reward_spec, env.full_done_spec]
+    known = {EPISODE_REWARD, *(dotted(each) for group in groups for each in group.keys(True))}
     given = dotted(key)
     if given not in known:
         raise UserError(
             f"{name}={given} is no entry of the env; it has {', '.join(sorted(known))}"
             f"{did_you_mean(given, known)}"
         )
+    return [group for group in groups if key in group.keys(True)]
 
 
 def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:

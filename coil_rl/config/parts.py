@@ -145,7 +145,7 @@ def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
         return build_transforms(found, advice)
 
     def of_agent(rows: int | None, cases: str, count: int | None) -> EnvBase:
-        return made(rows, cases, count, unread_controllers(config, _all_transforms(config)))
+        return made(rows, cases, count, unread_controllers(config))
 
     def alone(rows: int | None, cases: str, count: int | None) -> EnvBase:
         return made(rows, cases, count, OmegaConf.select(config, "env.controllers") or ())
@@ -199,14 +199,6 @@ def build_bare_env(
         node["controllers"] = {name: thing for name, thing in beside if name not in without}
     env: EnvBase = build(node, "env", EnvBase)
     return env
-
-
-def _all_transforms(config: DictConfig) -> list[Transform]:
-    """Return the transforms of all envs of an agent, if there are controllers beside the env."""
-    if not OmegaConf.select(config, "env.controllers"):
-        return []
-    kinds = ("", *config.evaluation.advice)
-    return [part for advice in kinds for part in build_transforms(config, advice)]
 
 
 def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -363,13 +355,17 @@ def driving_guides(config: DictConfig) -> dict[str, Any]:
     return {name: node for name, node in nodes.items() if name not in left_out}
 
 
-def unread_controllers(config: DictConfig, transforms: Iterable[Transform]) -> set[str]:
+def unread_controllers(config: DictConfig) -> set[str]:
     """Return the names of the controllers beside an env that its agent does without.
 
     They are those that neither a transform reads nor any part of the configuration names: the
     observation, the method, what is logged, measures and pictures.
     """
     names = set(OmegaConf.select(config, "env.controllers") or ())
+    if not names:
+        return names
+    kinds = ("", *config.evaluation.advice)
+    transforms = [part for advice in kinds for part in build_transforms(config, advice)]
     keys = [key for part in transforms for key in (part.in_keys or ())]
     named = {part for key in keys for part in ((key,) if isinstance(key, str) else key)}
     read = OmegaConf.to_container(OmegaConf.masked_copy(config, READERS))

@@ -132,7 +132,7 @@ class Trial:
         It is the zero of the scale of returns: a reward of 0 means nothing by itself.
         """
         rows = len(self.evaluation.cases)
-        env = self.make_env.plain(rows, TEST, count=self.count, controllers=False)
+        env = self.make_env.plain(rows, TEST, count=self.count)
         with torch.random.fork_rng():
             torch.manual_seed(0)
             return evaluate_policy(env, partial(random_action, env)).mean_reward

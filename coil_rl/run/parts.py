@@ -102,21 +102,18 @@ class EnvMaker:
         Raises:
             UserError: if the transforms do not fit the env, or each other.
         """
-        bare = self.bare if self.of_agent is None else self.of_agent
+        bare = self.of_agent or self.bare
         return self.around(bare(rows, cases, count), advice, self.disturb(cases))
 
-    def plain(
-        self, rows: int, cases: str, *, count: int | None = None, controllers: bool = True
-    ) -> EnvBase:
-        """Return an env without guides, disturbed as the run says.
+    def plain(self, rows: int, cases: str, *, count: int | None = None) -> EnvBase:
+        """Return an env without guides and controllers, disturbed as the run says.
 
         Args:
             rows: number of rows.
             cases: as above.
             count: as above.
-            controllers: whether it has the controllers beside it, which act in every step.
         """
-        make = self.bare if controllers or self.alone is None else self.alone
+        make = self.alone or self.bare
         return transformed(make(rows, cases, count), self.disturb(cases), "disturb")
 
     def around(self, env: EnvBase, advice: str = "", disturb: Sequence[Transform] = ()) -> EnvBase:

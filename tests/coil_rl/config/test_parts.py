@@ -10,8 +10,9 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from programs import ONE_SECOND, composed, shipped
-from torchrl.envs import RenameTransform
+from torchrl.envs import RenameTransform, TransformedEnv
 
+from coil_rl.config import parts
 from coil_rl.config.assemble import load_guides
 from coil_rl.config.check import check
 from coil_rl.config.nodes import build
@@ -66,7 +67,6 @@ def test_env_of_every_method_passes_check_env(method, preset):
 # They need a package, a class, an entry, a run, an entry to control, a file or recordings.
 NOT_ALONE = {"cone_planner", "controller", "entry", "exported", "learned", "pid", "recorded"}
 NOT_ALONE |= {"recording", "none"}
-WITH_MEMORY = {"authors", "spline_memory"}
 OF_OTHER_ENVS = {"bot", "energy_pump", "lander", "linear_feedback", "oscillator", "swing_tip"}
 OF_OTHER_ENVS |= {"swing_up", "walker"}
 
@@ -76,13 +76,10 @@ OF_OTHER_ENVS |= {"swing_up", "walker"}
 def test_every_guide_acts_on_the_observations_of_the_env(guide):
     config = small(f"guide={guide}")
     (guide_module,), env = build_guides(config).values(), build_bare_env(config)
-    if guide in WITH_MEMORY:
-        check_guide(guide_module, env)
-        return
-    data = env.reset()
-    assert guide_module(data.copy())["action"].shape == (4, 1)
+    advised = TransformedEnv(env, GuideActions({guide: guide_module}))
+    assert advised.reset()["guide_action"].shape == (4, 1, 1)
     if guide != "random":
-        check_guide(guide_module, data)
+        check_guide(guide_module, env)
 
 
 def test_override_with_another_target_replaces_all_arguments():
@@ -251,14 +248,15 @@ def test_controller_that_is_observed_logged_or_measured_stays(reader):
     assert beside(env_maker(composed_beside("method=ppo", reader))(2)) == ["other"]
 
 
-def test_controller_that_a_transform_reads_stays():
+def test_controller_that_a_transform_reads_stays(monkeypatch):
     transform = RenameTransform([("controller", "leaning")], ["leaning"])
-    assert unread_controllers(composed_beside("method=ppo"), [transform]) == {"other"}
+    monkeypatch.setattr(parts, "build_transforms", lambda *_: [transform])
+    assert unread_controllers(composed_beside("method=ppo")) == {"other"}
 
 
 def test_name_inside_of_another_word_is_no_reader():
     config = composed_beside("method=ppo", "label=others", "observes=[observation,leaning_more]")
-    assert unread_controllers(config, []) == {"leaning", "other"}
+    assert unread_controllers(config) == {"leaning", "other"}
 
 
 TINY = [
