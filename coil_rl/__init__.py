@@ -59,7 +59,6 @@ if TYPE_CHECKING:
     from coil_rl.learners import Reinforce as Reinforce
     from coil_rl.learners.stepper import LearnerStepper as LearnerStepper
     from coil_rl.measures import Measure as Measure
-    from coil_rl.programs.app import NoSweepError as NoSweepError
     from coil_rl.programs.app import run_program as run_program
     from coil_rl.run.controller import Controller as Controller
     from coil_rl.run.evaluation import EvaluationResult as EvaluationResult

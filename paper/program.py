@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
 
 import coil_paper.schema  # noqa: F401  registers the root configuration with Hydra
-from coil_rl import NoSweepError, UserError, did_you_mean, run_program
+from coil_rl import UserError, did_you_mean, run_program
 
 if TYPE_CHECKING:
     from coil_paper.reproduce.result import Result, Runs
@@ -148,11 +147,6 @@ def check(config: DictConfig) -> None:
     from coil_rl import check_values
 
     check_values(config)
-    if HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise NoSweepError(
-            "results are made one after the other; "
-            "leave out -m, and request several as in table=[1,4]"
-        )
     if config.budget not in config.budgets:
         names = list(config.budgets)
         raise UserError(
@@ -171,7 +165,12 @@ def _key(name: str) -> str:
     return f"{kind}={rest}" if kind in KINDS and rest else f"claim={name}"
 
 
-main = partial(run_program, reproduce, "reproduce", check, "pkg://coil_paper.conf")
+NO_SWEEP = (
+    "results are made one after the other; leave out -m, and request several as in table=[1,4]"
+)
+main = partial(
+    run_program, reproduce, "reproduce", check, "pkg://coil_paper.conf", no_sweep=NO_SWEEP
+)
 
 if __name__ == "__main__":
     main()

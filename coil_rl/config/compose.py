@@ -40,9 +40,7 @@ ANY_ENV = ("fmu", "gym", "torchrl")  # files of conf/env that stand for any env
 FRAMES = 100_000  # 3.5 minutes of the processor with SAC, where the steps of an env are fast
 
 
-def keep_written(
-    config: DictConfig, hydra: Any, task: Sequence[str], others: Sequence[str] = ()
-) -> dict[str, str]:
+def keep_written(config: DictConfig, hydra: Any) -> dict[str, str]:
     """Put the values of users' files into their places, after Hydra has composed all files.
 
     The order of Hydra's defaults list cannot say it: a method is meant to replace what a shipped
@@ -50,8 +48,7 @@ def keep_written(
 
     Args:
         config: composed by a Hydra that is initialised; it is changed in place.
-        task: overrides of the command line for the program.
-        others: overrides of the command line for Hydra.
+        hydra: Hydra's part of it.
 
     Returns:
         The file of a user by each key that it gives.
@@ -60,6 +57,7 @@ def keep_written(
         UserError: for a word that chooses several files of a group that takes one.
     """
     loader = GlobalHydra.instance().config_loader()
+    task, others = typed(hydra)
     groups = {str(group).replace("/", ".") for group in hydra.runtime.choices}
     groups |= set(loader.list_groups(""))  # a choice of several files is not among the first
     for text in task:
@@ -73,17 +71,29 @@ def keep_written(
     # To look for files of users takes as long as to compose all files.
     if all(place.startswith(shipped_places()) for place in places):
         return {}
-    name, words = hydra.job.config_name, [*task, *others]
-    defaults = loader.compute_defaults_list(name, words, RunMode.RUN).defaults
+    name = hydra.job.config_name
+    defaults = loader.compute_defaults_list(name, [*task, *others], RunMode.RUN).defaults
     # A choice of a file, such as method=coil, gives no value.
-    typed = [key for key in map(key_of, task) if key not in groups]
+    given = [key for key in map(key_of, task) if key not in groups]
     files = {}
     with open_dict(config):
         for key, value, file in _written(defaults, places):
             files[key] = file
-            if not any(covers(each, key) for each in typed):
+            if not any(covers(each, key) for each in given):
                 OmegaConf.update(config, key, value, merge=False, force_add=True)
     return files
+
+
+def typed(hydra: Any) -> tuple[list[str], list[str]]:
+    """Return the words of a command line for the program, and those for Hydra, as typed.
+
+    References in them stay.
+
+    Args:
+        hydra: Hydra's part of the configuration.
+    """
+    given: Any = OmegaConf.to_container(hydra.overrides, resolve=False)
+    return given["task"], given["hydra"]
 
 
 def key_of(text: str) -> str:
@@ -168,9 +178,7 @@ def compose_with_files(words: Sequence[str], *, with_hydra: bool = False) -> Com
     try:
         with _own_hydra():
             config = compose("train", list(words), return_hydra_config=True)
-            task = [word for word in words if not word.startswith("hydra.")]
-            others = [word for word in words if word not in task]
-            files = keep_written(config, config.hydra, task, others)
+            files = keep_written(config, config.hydra)
             if not with_hydra:
                 with open_dict(config):
                     del config["hydra"]

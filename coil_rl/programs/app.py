@@ -22,8 +22,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import Any, NamedTuple
+from typing import Any
 
 import hydra
 import yaml
@@ -36,7 +35,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import coil_rl.config  # noqa: F401  registers the root configurations
 from coil_rl import programs
-from coil_rl.config.compose import keep_written, key_of
+from coil_rl.config.compose import keep_written, key_of, typed
 from coil_rl.config.folder import make_folder
 from coil_rl.config.messages import is_no_bug, naming_files, refuse
 from coil_rl.config.trust import trust_own, trust_packages
@@ -50,37 +49,17 @@ from coil_rl.run.stopping import STOP
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
 
 
-class NoSweepError(UserError):
-    """A program without sweeps was started with several values of a key; none of them is run."""
-
-
-class Signals:
-    """The signals that a program gets.
-
-    Attributes:
-        received: their numbers. They are remembered, because a module that is being imported may
-            swallow a `KeyboardInterrupt`.
-    """
-
-    def __init__(self) -> None:
-        self.received: list[int] = []
-
-    def listen(self) -> None:
-        """Handle signals, in this process or in that of a job of a sweep."""
-        if threading.current_thread() is not threading.main_thread():
-            return  # other threads cannot
-        if signal.getsignal(signal.SIGINT) is programs.interrupted:
-            signal.signal(signal.SIGINT, self._interrupt)
-        for name in ("SIGTERM", "SIGHUP", "SIGUSR1"):  # the last two are missing on Windows
-            number = getattr(signal, name, None)
-            # A program under nohup ignores SIGHUP.
-            if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
-                signal.signal(number, self._interrupt)
-
-    def _interrupt(self, signum: int, frame: FrameType | None) -> None:
-        """Raise a `KeyboardInterrupt`, unless a training ends its update first."""
-        self.received.append(signum)
-        STOP.interrupt(signum, frame)
+def listen() -> None:
+    """Hand signals to `STOP`, in this process or in that of a job of a sweep."""
+    if threading.current_thread() is not threading.main_thread():
+        return  # other threads cannot
+    if signal.getsignal(signal.SIGINT) is programs.interrupted:
+        signal.signal(signal.SIGINT, STOP.interrupt)
+    for name in ("SIGTERM", "SIGHUP", "SIGUSR1"):  # the last two are missing on Windows
+        number = getattr(signal, name, None)
+        # A program under nohup ignores SIGHUP.
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, STOP.interrupt)
 
 
 class OwnFolder(Callback):
@@ -113,37 +92,26 @@ class OwnFolder(Callback):
 
 def overrides() -> list[tuple[str, str]]:
     """Return the full key and the text of each override on the command line."""
-    return [(key_of(text), text) for text in typed().task]
-
-
-class Typed(NamedTuple):
-    """The arguments of the command line, as typed: references in them stay."""
-
-    task: list[str]  # for the program
-    hydra: list[str]  # for Hydra
-
-
-def typed() -> Typed:
-    """Return the arguments of the command line."""
-    given: Any = OmegaConf.to_container(HydraConfig.get().overrides, resolve=False)
-    return Typed(given["task"], given["hydra"])
+    return [(key_of(text), text) for text in typed(HydraConfig.get())[0]]
 
 
 def command_line() -> list[str]:
     """Return the command that makes this run alone, also where it is a job of a sweep."""
     if not HydraConfig.initialized():
         return []
-    given = typed()
+    task, of_hydra = typed(HydraConfig.get())
     # Files of another package, such as an experiment, are found only with this one.
-    places = [word for word in given.hydra if word.startswith("hydra.searchpath=")]
-    return ["coil-train", *places, *given.task]
+    places = [word for word in of_hydra if word.startswith("hydra.searchpath=")]
+    return ["coil-train", *places, *task]
 
 
 def check_used(used: Iterable[str], reason: str) -> None:
     """Raise a `UserError` for an override that has no effect.
 
-    `used` are the keys that have one with all that is in them, besides those of every program that
-    drives; `reason` is why others do not.
+    Args:
+        used: full keys that have one with all that is in them, besides those of every program that
+            drives.
+        reason: why others have none.
     """
     known = (*used, *COMMON_KEYS)
     for key, text in overrides():
@@ -153,17 +121,15 @@ def check_used(used: Iterable[str], reason: str) -> None:
             )
 
 
-def check_unused(node: str, unused: Iterable[str], reason: str) -> None:
-    """Raise a `UserError` for an override in a node that has no effect.
+def check_unused(unused: Iterable[str], reason: str) -> None:
+    """Raise a `UserError` for an override that has no effect.
 
     Args:
-        node: top-level key, such as "evaluation".
-        unused: keys in it that have none.
+        unused: full keys that have none with all that is in them.
         reason: why they have none.
     """
     for key, text in overrides():
-        first, *rest = key.split(".")
-        if first == node and rest and rest[0] in unused:
+        if is_part(key, unused):
             raise UserError(f"{text} has no effect: {reason}; leave it out")
 
 
@@ -173,7 +139,7 @@ def check_folder(key: str) -> None:
     Args:
         key: names the folder of the files.
     """
-    for text in typed().hydra:
+    for text in typed(HydraConfig.get())[1]:
         if text.lstrip("+").startswith("hydra.run.dir="):
             raise UserError(f"{text} has no effect: the files are written to {key}=FOLDER")
 
@@ -200,6 +166,7 @@ def run_program(
     check: Callable[[DictConfig], None] = check_run,
     config_path: str = "pkg://coil_rl.conf",
     further: Callable[[list[str]], list[str]] | None = None,
+    no_sweep: str = "",
 ) -> None:
     """Run a task as a console program: Hydra composes its configuration, which is checked first.
 
@@ -213,28 +180,29 @@ def run_program(
             finds the files of coil-rl by an entry point, see `coil_rl.config.schema`, and
             gets the help and the clean-up of these programs by the schema `ProgramConfig`.
         further: returns the words that a command line leaves open.
+        no_sweep: the sentence that refuses a sweep, of a program that has none.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
     bugs: list[Exception] = []
-    signals = Signals()
 
     @functools.wraps(task)
     def checked(config: DictConfig) -> Any:
+        if no_sweep and is_sweep():
+            remove_unused(Path(HydraConfig.get().sweep.dir))
+            refuse(config_name, UserError(no_sweep))
         try:
-            return _do(task, check, config, signals)
+            return _do(task, check, config)
         except Exception as error:
-            if is_sweep() and not isinstance(error, NoSweepError):
-                return failed(config_name, error)
             if is_sweep():
-                remove_unused(Path(HydraConfig.get().sweep.dir))
+                return failed(config_name, error)
             if is_no_bug(error):
                 # Here, because Hydra prints a line of its own for an error of the task.
                 refuse(config_name, error)
             bugs.append(error)
             raise
 
-    with program(config_name, signals):
+    with program(config_name):
         sys.argv[1:] = map(spelled, sys.argv[1:])
         sys.argv += further(sys.argv[1:]) if further else []
         _check_options(config_name)
@@ -261,14 +229,13 @@ def _do(
     task: Callable[[DictConfig], Any],
     check: Callable[[DictConfig], None],
     config: DictConfig,
-    signals: Signals,
 ) -> Any:
     """Do a task after a check of its configuration, and return its result."""
-    signals.listen()
+    listen()
     _draw_into_files()
     if is_sweep() and "existing" in config:
         config.existing = "resume"  # so that a sweep goes on by the same command
-    files = keep_written(config, HydraConfig.get(), *typed())
+    files = keep_written(config, HydraConfig.get())
     trust_packages(config.get("trust", []))
     trust_own(config)
     has_folder = bool(config.get("run_dir"))
@@ -278,7 +245,7 @@ def _do(
             check(config)
             if has_folder:
                 make_folder(Path(config.run_dir))
-            if signals.received:
+            if STOP.received:
                 raise KeyboardInterrupt
             return task(config)
     except Exception:
@@ -294,7 +261,7 @@ def _missing(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def program(name: str, signals: Signals | None = None) -> Iterator[None]:
+def program(name: str) -> Iterator[None]:
     """End the process with one sentence on standard error instead of a traceback.
 
     The exit code is 2 for a mistake of the user, and 130 for Ctrl-C, SIGTERM, SIGHUP and SIGUSR1.
@@ -302,10 +269,9 @@ def program(name: str, signals: Signals | None = None) -> Iterator[None]:
 
     Args:
         name: of the program.
-        signals: those that it gets.
     """
-    signals = Signals() if signals is None else signals
-    signals.listen()
+    STOP.received = False
+    listen()
     _draw_into_files()
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.formatwarning = lambda message, *_, **__: f"{name}: {message}\n"
@@ -321,7 +287,7 @@ def program(name: str, signals: Signals | None = None) -> Iterator[None]:
         raise
     except (Exception, KeyboardInterrupt) as error:
         # A library may raise an error of its own on the way out of an interrupt.
-        if signals.received or isinstance(error, KeyboardInterrupt):
+        if STOP.received or isinstance(error, KeyboardInterrupt):
             args = error.args if isinstance(error, KeyboardInterrupt) else ()
             reasons = [str(each) for each in args]
             if is_sweep():

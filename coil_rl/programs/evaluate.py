@@ -23,8 +23,8 @@ OWN = ("repeats", "policy", "advice", "beside")
 OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
 # Keys of `evaluation` that only a training reads, and those that only a policy with actions to
 # sample or advice to listen to has.
-OF_TRAINING = ("curve", "guides")
-OF_AN_AGENT = ("repeats", "policy", "advice", "beside")
+OF_TRAINING = ("evaluation.curve", "evaluation.guides")
+OF_AN_AGENT = tuple(f"evaluation.{key}" for key in OWN)
 
 
 def evaluate(config: DictConfig) -> float:
@@ -185,14 +185,12 @@ def check(config: DictConfig) -> None:
         else "a guide is evaluated without an agent"
     )
     app.check_used(OF_A_RUN if given else OF_GUIDES, reason)
-    app.check_unused("evaluation", OF_TRAINING, "only a training reads it")
-    app.check_unused("evaluation", ("sections",), "only coil-listen reads it")
+    app.check_unused(OF_TRAINING, "only a training reads it")
+    app.check_unused(("evaluation.sections",), "only coil-listen reads it")
     if config.exported is not None:
-        app.check_unused(
-            "evaluation", OF_AN_AGENT, "the exported policy acts alone, as it is in its file"
-        )
+        app.check_unused(OF_AN_AGENT, "the exported policy acts alone, as it is in its file")
     elif not given:
-        app.check_unused("evaluation", OF_AN_AGENT, reason)
+        app.check_unused(OF_AN_AGENT, reason)
     app.check_run(config)
 
 

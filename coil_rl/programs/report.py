@@ -16,7 +16,6 @@ from coil_rl.config.folder import PREFIX
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.output import printable
 from coil_rl.programs import app
-from coil_rl.programs.sweeps import is_sweep
 
 if TYPE_CHECKING:
     from coil_rl.report.comparison import Comparison
@@ -270,10 +269,6 @@ def check(config: DictConfig) -> None:
 
     check_values(config)
     app.check_folder("folder")
-    if is_sweep():
-        raise app.NoSweepError(
-            "a report covers several folders at once; leave out -m and write folder=[ONE,OTHER]"
-        )
     first = _folders(config)[0]
     if first.is_dir() and not os.access(first, os.W_OK):
         raise UserError(
@@ -281,7 +276,8 @@ def check(config: DictConfig) -> None:
         )
 
 
-main = partial(app.run_program, report, "report", check)
+NO_SWEEP = "a report covers several folders at once; leave out -m and write folder=[ONE,OTHER]"
+main = partial(app.run_program, report, "report", check, no_sweep=NO_SWEEP)
 
 if __name__ == "__main__":
     main()

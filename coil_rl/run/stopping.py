@@ -17,10 +17,12 @@ class Stop:
 
     Attributes:
         requested: whether it is asked.
+        received: whether a signal came since a program began. It is remembered, because a module
+            that is being imported may swallow a `KeyboardInterrupt`.
     """
 
     def __init__(self) -> None:
-        self.requested, self._patient = False, False
+        self.requested, self.received, self._patient = False, False, False
 
     def ask(self) -> bool:
         """Ask to stop; return whether something runs that will stop by itself."""
@@ -48,6 +50,7 @@ class Stop:
 
     def interrupt(self, signum: int, frame: FrameType | None) -> None:
         """Raise a `KeyboardInterrupt` at a signal, unless something runs that stops by itself."""
+        self.received = True
         if not self.ask():
             raise KeyboardInterrupt
 

@@ -186,8 +186,8 @@ def check(config: DictConfig) -> None:
         check_used((*USED, "policy"), "nothing in a replay reads it")
     else:
         check_used(USED, "nothing in a replay without runs reads it")
-    check_unused("env", ("num_envs",), "each recording has a row of its own")
-    check_unused("env", ("smooth",), "a replay earns no reward")
+    check_unused(("env.num_envs",), "each recording has a row of its own")
+    check_unused(("env.smooth",), "a replay earns no reward")
 
 
 main = partial(run_program, replay, "replay", check, "pkg://coil_robot.conf")

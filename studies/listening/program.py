@@ -165,7 +165,7 @@ def check(config: DictConfig) -> None:
     app.check_used(
         ("run", "track", "evaluation", "donors"), f"run={config.run} has its own configuration"
     )
-    app.check_unused("evaluation", OF_TRAINING, "only a training reads it")
+    app.check_unused(OF_TRAINING, "only a training reads it")
     app.check_run(config)
 
 
