@@ -106,7 +106,7 @@ def check_node(node: Any, name: str, program: Iterable[str] = ()) -> dict[str, A
 
 
 def _checked(node: Any, name: str, program: Iterable[str] = ()) -> Any:
-    """Return a checked value with nodes for the tuples and arrays that callables of others want."""
+    """Return a value as it is built, after the checks of the nodes inside it."""
     if isinstance(node, list):
         return [_checked(value, f"{name}[{index}]") for index, value in enumerate(node)]
     if not isinstance(node, Mapping):
@@ -114,9 +114,7 @@ def _checked(node: Any, name: str, program: Iterable[str] = ()) -> Any:
     node = {key: _checked(value, f"{name}.{key}") for key, value in node.items()}
     if "_target_" not in node:
         return node
-    target = find_target(node["_target_"], name)
-    check_arguments(target, node, name, program)
-    return converted(target, node)
+    return check_arguments(find_target(node["_target_"], name), node, name, program)
 
 
 def find_target(path: Any, name: str) -> Callable[..., Any]:
@@ -159,14 +157,14 @@ def build_all(nodes: Mapping[str, Any], name: str) -> list[Transform]:
 
 def check_arguments(
     target: Callable[..., Any], node: Mapping[str, Any], name: str, program: Iterable[str] = ()
-) -> None:
-    """Check the arguments of a node.
+) -> dict[str, Any]:
+    """Check the arguments of a node, and return it as it is built.
 
     An unknown or missing argument, or one that does not fit its annotation, is a `UserError`.
 
     Annotations of other people are often stricter than their code, and YAML has neither tuples nor
     arrays. So their callables are given any numbers where the annotation is of numbers, arrays or
-    sequences; `converted` makes the tuples and arrays.
+    sequences, with nodes for the tuples and arrays.
 
     Args:
         target: class or function.
@@ -174,13 +172,13 @@ def check_arguments(
         name: key of the node, for the message.
         program: names of the arguments that the program adds.
     """
-    title = getattr(target, "__name__", str(target))
+    title, built = getattr(target, "__name__", str(target)), dict(node)
     given = {key: value for key, value in node.items() if key not in ("_target_", "_partial_")}
     for key in sorted(given.keys() & set(program)):
         raise UserError(f"{name}: {key} of {title} is set by the program; leave it out")
     parameters = _parameters(target)
     if parameters is None:
-        return
+        return built
     known = {p.name: p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
     accepts_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
     for key in sorted(given.keys() - known):
@@ -199,8 +197,11 @@ def check_arguments(
         )
     for key in given.keys() & known:
         annotation = known[key].annotation
-        if not is_foreign(target) or not _may_take(given[key], annotation):
+        if is_foreign(target) and _may_take(given[key], annotation):
+            built[key] = _held(given[key], _kinds(annotation))
+        else:
             _check_type(given[key], annotation, f"{name}.{key}")
+    return built
 
 
 def is_foreign(target: Callable[..., Any]) -> bool:
@@ -208,27 +209,18 @@ def is_foreign(target: Callable[..., Any]) -> bool:
     return not (getattr(target, "__module__", None) or "").startswith("coil_rl.")
 
 
-def converted(target: Callable[..., Any], node: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the node of a callable of other people with nodes for the tuples and arrays it wants.
+def _held(numbers: Any, kinds: set[type]) -> Any:
+    """Return numbers from YAML, or the node of what holds them where an annotation wants another.
 
     Args:
-        target: class or function.
+        kinds: classes of the annotation.
     """
-    if not is_foreign(target):
-        return dict(node)
-    annotations = {each.name: each.annotation for each in _parameters(target) or ()}
-    arguments = dict(node)
-    for key, value in node.items():
-        if not isinstance(value, list) or not _holds_numbers(value):
-            continue
-        kinds = _kinds(annotations.get(key))
-        if kinds & {list, Sequence}:
-            continue
-        if tuple in kinds:
-            arguments[key] = {"_target_": "builtins.tuple", "_args_": [value]}
-        elif np.ndarray in kinds:
-            arguments[key] = {"_target_": "numpy.array", "_args_": [value]}
-    return arguments
+    if not isinstance(numbers, list) or kinds & {list, Sequence}:
+        return numbers
+    for kind, maker in ((tuple, "builtins.tuple"), (np.ndarray, "numpy.array")):
+        if kind in kinds:
+            return {"_target_": maker, "_args_": [numbers]}
+    return numbers
 
 
 def _holds_numbers(value: Any) -> bool:
