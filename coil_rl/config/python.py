@@ -48,9 +48,8 @@ def train(
 
     Args:
         env: the id of a Gymnasium env, such as "CartPole-v1" or "PACKAGE:ID"; the name of a file in
-            conf/env, such as "cone_track"; a class or function that makes a Gymnasium env, or a
-            TorchRL env without batch; or a `Run`, which is trained as it is: of the other arguments
-            it takes `frames` alone.
+            conf/env, such as "cone_track"; or a class or function that makes a Gymnasium env, or a
+            TorchRL env without batch.
         guide: a class or a `functools.partial` of one, an object with `act(observation)`, a
             function, a network; the import path "PACKAGE.MODULE:NAME" of one; the name of a file in
             conf/guide, such as "spline"; a `Controller` of another run; or None.
@@ -73,9 +72,6 @@ def train(
         >>> run = coil_rl.train("CartPole-v1", frames=50_000)  # doctest: +SKIP
         >>> table = run.evaluate(cases=50)  # doctest: +SKIP
     """
-    if isinstance(env, Run):
-        _refuse_others(guide, method, seed, folder, tune, overrides)
-        return env.train(frames)
     folder = Path(folder).expanduser() if folder is not None else new_folder("train")
     run = prepare(
         env,
@@ -88,21 +84,6 @@ def train(
         overrides=overrides,
     )
     return run.train()
-
-
-def _refuse_others(
-    guide: Any, method: Any, seed: int, folder: Any, tune: Any, overrides: Sequence[str]
-) -> None:
-    """Refuse arguments of `train` that say what a `Run` consists of, which it knows itself."""
-    objects = {"guide": guide, "method": method, "folder": folder, "tune": tune}
-    names = [name for name, value in objects.items() if value is not None]
-    names += ["seed"] if seed != 0 else []
-    names += ["overrides"] if overrides else []
-    if names:
-        raise UserError(
-            f"{', '.join(names)}: a Run is trained as it is, with other frames at most; leave out "
-            "what it has already, or give the env instead of the run"
-        )
 
 
 def prepare(
@@ -240,7 +221,7 @@ def _env(env: Any, name: str) -> Words:
     if not callable(env):
         raise UserError(
             f"env is {type(env).__name__}; give the id of a Gymnasium env, the name of a file in "
-            "conf/env, or a class or function that makes an env"
+            "conf/env, or a class or function that makes an env; a Run is trained by its train()"
         )
     path = import_path(env)
     with foreign(f"the env {path or getattr(env, '__name__', 'of the maker')}", "its maker"):

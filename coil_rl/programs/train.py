@@ -46,7 +46,7 @@ def check(config: DictConfig) -> None:
     from coil_rl.config.check import check_read, unread
 
     app.check_run(config)
-    words = app.typed().task
+    words = [text for _, text in app.overrides()]
     if not sweeps.is_sweep():
         check_read(config, words)
         return
@@ -54,10 +54,8 @@ def check(config: DictConfig) -> None:
         say(f"{sentence}, if no other run of this sweep reads it", error=True)
 
 
-def resume(
-    folder: Path, frames: int | None = None, workers: Any = None, changed: str = ""
-) -> float:
-    """Finish a run that was stopped, or train it for longer, and return the same as `train`.
+def resume(folder: Path, frames: int | None = None, workers: Any = None, changed: str = "") -> None:
+    """Finish a run that was stopped, or train it for longer.
 
     Args:
         frames: new length.
@@ -71,7 +69,7 @@ def resume(
     from coil_rl.config.assemble import assemble
     from coil_rl.config.check import check
     from coil_rl.config.folder import read_config
-    from coil_rl.run.folder import is_evaluated, locked
+    from coil_rl.run.folder import is_evaluated
 
     config = read_config(folder, "resume", goes_on=True)
     folder = folder.absolute()
@@ -83,18 +81,13 @@ def resume(
         config.env.workers = workers
     if config.proxy:
         config.proxy["folder"] = str(folder / "distilled")  # not the folder that the file names
-    with locked(folder):
-        run = assemble(config, folder)
-        if is_evaluated(folder):
-            run.check_unchanged()
-        try:
-            if frames is not None or not is_evaluated(folder):
-                check(config)
-        except UserError as error:
-            raise UserError(f"{folder / 'config.yaml'}: {error}") from error
-        if frames is not None:
-            run.lengthen(frames, changed)
-        return run.finish_begun(changed)
+    run = assemble(config, folder)
+    try:
+        if frames is not None or not is_evaluated(folder):
+            check(config)
+    except UserError as error:
+        raise UserError(f"{folder / 'config.yaml'}: {error}") from error
+    run.train(frames, changed=changed)
 
 
 def _refuse_links(folder: Path) -> None:

@@ -329,7 +329,8 @@ class Run:
             changed: as of `train`.
 
         Raises:
-            UserError: if the run has been trained for longer, or its code was changed.
+            UserError: if the run has been trained for longer, or its configuration or its code was
+                changed.
         """
         budget = self.budget
         if frames == budget.frames:
@@ -341,6 +342,7 @@ class Run:
             )
         begun = is_begun(self.folder)
         if begun:
+            self.check_unchanged()
             self._take_code(changed)
         stages = [*budget.stages, budget.frames] if begun else []
         self.budget = replace(budget, frames=frames, stages=stages)
@@ -396,7 +398,7 @@ class Run:
             say(f"{self.folder} goes on with another file of {names}", error=True)
 
     def check_unchanged(self) -> None:
-        """Check that the configuration of a finished run was not edited.
+        """Check that the configuration of a run was not edited.
 
         Raises:
             UserError: if it differs from the one in the checkpoint.

@@ -193,13 +193,9 @@ def test_other_name_of_a_policy_is_refused(alone):
         alone.controller("best")
 
 
-@pytest.mark.parametrize(
-    "others", [{"seed": 5}, {"method": "ppo"}, {"folder": "x"}, {"overrides": ["learner.gamma=1"]}]
-)
-def test_run_is_trained_as_it_is(others, alone):
-    with pytest.raises(UserError, match=f"^{next(iter(others))}: a Run is trained as it is"):
-        coil_rl.train(alone, frames=32, **others)
-    assert not (alone.folder / "config.yaml").exists()
+def test_run_is_no_env(alone):
+    with pytest.raises(UserError, match=r"^env is Run; .* a Run is trained by its train\(\)"):
+        coil_rl.train(alone, frames=32)
 
 
 @pytest.mark.slow
@@ -311,6 +307,9 @@ def test_edited_configuration_of_a_finished_run_is_refused(tmp_path):
     file.write_text(file.read_text().replace("gamma: 0.99", "gamma: 0.9"))
     refused = called("train", f"resume={run.folder}", "trust=[thermostat]", code=2).stderr
     assert "belongs to a run with learner.gamma=0.99, not 0.9" in refused
+    with pytest.raises(UserError, match=r"belongs to a run with learner\.gamma"):
+        coil_rl.open_run(run.folder, trust=["thermostat"]).train(frames=64)
+    assert (run.folder / "evaluation.csv").exists()
 
 
 class Proportional:
