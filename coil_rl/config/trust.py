@@ -151,7 +151,7 @@ def check_config(config: DictConfig, path: Path) -> None:
             )
         target = _import_path(name, key, value)
         if key == "_target_" or target is not None:
-            _check_target(target, name, path)
+            _check_target(target, name, f"{path}: {name:.100} names {target!r:.100}")
         elif str(key).startswith("_") and key != "_partial_":
             raise UserError(f"{path}: {name:.100} is not a key of a run's configuration; remove it")
         # Only a logger is saved with references, and none to itself, so that they cannot grow.
@@ -174,9 +174,14 @@ def _import_path(name: str, key: Any, value: Any) -> Any:
     return value.replace(":", ".", 1) if names_code else None
 
 
-def _check_target(target: Any, name: str, path: Path) -> None:
-    """Raise a `UserError` if an entry names something that a folder may not call."""
-    entry = f"{path}: {name:.100} names {target!r:.100}"
+def _check_target(target: Any, name: str, entry: str) -> None:
+    """Raise a `UserError` if an entry names something that a folder may not call.
+
+    Args:
+        target: what it names.
+        name: its full key.
+        entry: that names it, the beginning of the sentence.
+    """
     package = target.partition(".")[0] if isinstance(target, str) else ""
     if not package.isidentifier():
         raise UserError(f"{entry}, which is not the full name of a class; give one")
