@@ -13,13 +13,13 @@ from typing import Annotated, Any, Unpack
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.advantages import standardise
 from coil_rl.learners.minibatches import of_agent
 from coil_rl.learners.policy import Entries
 from coil_rl.learners.ppo import PPO, OnPolicySettings
+from coil_rl.learners.weights import Weights
 from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Share, checked
 from coil_rl.schedules import Linear, Schedule
 
@@ -73,6 +73,7 @@ class TRPO(PPO):
         )
         self.max_kl, self.damping, self.iterations = max_kl, damping, iterations
         self.backtracks, self.shrink = backtracks, shrink
+        self.of_policy = Weights(self.policy)
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters of the critic."""
@@ -105,12 +106,12 @@ class TRPO(PPO):
         extensions only.
         """
         weights = self.loss_weights(progress)
-        # One advantage cannot be standardised.
-        if weights["loss_objective"] == 0 or len(of_agent(rows)["advantage"]) < 2:
+        if len(of_agent(rows)["advantage"]) < 2:  # one advantage cannot be standardised
             nothing = {name: 0.0 for name in weights if name != "loss_critic"}
             return nothing | {"kl": 0.0, "step": 0.0}
         evaluate = self.surrogate(rows, weights)
-        loss, divergence, losses = evaluate()
+        with self.of_policy.used():
+            loss, divergence, losses = evaluate()
         step = self.natural_step(loss, divergence)
         improved = self.line_search(evaluate, loss, step)
         if improved is None:
@@ -133,8 +134,8 @@ class TRPO(PPO):
         def evaluate() -> tuple[Tensor, Tensor, dict[str, Tensor]]:
             after = self.head.density(Entries(agent_rows))
             ratio = (after.log_prob(agent_rows["action"]) - agent_rows["action_log_prob"]).exp()
-            total = -(ratio * advantage).mean()
-            losses = {"loss_objective": total}
+            losses = {"loss_objective": -(ratio * advantage).mean()}
+            total = weights["loss_objective"] * losses["loss_objective"]
             for name, loss in self.extensions.losses(self.head, steps).items():
                 losses[name] = loss
                 total = total + weights[name] * loss
@@ -147,7 +148,7 @@ class TRPO(PPO):
 
         To second order the `divergence` of the policy from itself becomes the bound.
         """
-        weights = list(self.policy.parameters())
+        weights = self.of_policy.vector
         gradient = derivative(loss, weights)
         slope = derivative(divergence, weights, differentiable=True)
 
@@ -165,15 +166,15 @@ class TRPO(PPO):
         Returns:
             The losses after the step, `kl` and `step`; None if no part will do.
         """
-        weights = list(self.policy.parameters())
-        start, fraction = parameters_to_vector(weights).detach().clone(), 1.0
+        weights = self.of_policy.vector
+        start, fraction = weights.clone(), 1.0
         for _ in range(self.backtracks + 1):
-            vector_to_parameters(start + fraction * step, weights)
+            weights.copy_(start + fraction * step)
             new_loss, divergence, new_losses = evaluate()
             if (new_loss < loss) & (divergence <= self.max_kl):
                 return new_losses | {"kl": divergence, "step": fraction}
             fraction *= self.shrink
-        vector_to_parameters(start, weights)
+        weights.copy_(start)
         return None
 
 
@@ -197,8 +198,6 @@ def conjugate_gradients(
     return solution
 
 
-def derivative(value: Tensor, weights: Sequence[Tensor], differentiable: bool = False) -> Tensor:
-    """Return the derivative of a scalar by all weights, as one vector; the graph is kept."""
-    return parameters_to_vector(
-        torch.autograd.grad(value, weights, retain_graph=True, create_graph=differentiable)
-    )
+def derivative(value: Tensor, weights: Tensor, differentiable: bool = False) -> Tensor:
+    """Return the derivative of a scalar by all weights, a vector; the graph is kept."""
+    return torch.autograd.grad(value, weights, retain_graph=True, create_graph=differentiable)[0]

@@ -1,12 +1,16 @@
+import copy
 import math
 
 import pytest
 import torch
 import worlds
+from any_env import check_same_update
 
 from coil_rl.learners import TRPO
 from coil_rl.learners.trpo import conjugate_gradients
 from coil_rl.run.rollout import Rollout
+from coil_rl.schedules import Linear
+from coil_rl.transforms import Takeover
 
 
 def weights(learner):
@@ -104,3 +108,15 @@ def test_step_is_not_taken_if_the_line_search_fails():
     report = learner.improve(rows)
     assert report["step"] == report["kl"] == 0
     assert torch.equal(before, weights(learner))
+
+
+def test_restored_learner_goes_on_with_the_same_digits_from_any_number_of_steps():
+    """The last digits of a product depend on where its numbers are in the memory."""
+    torch.manual_seed(0)
+    env = worlds.cones(Takeover(Linear(0.5, 0.5)))
+    first, second = (TRPO(env, minibatches=2) for _ in range(2))
+    rollout = Rollout(env, first.policy, 8, first.keys)
+    for _ in range(3):
+        first.update(rollout.collect())
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    check_same_update(first, second, rollout.collect())
