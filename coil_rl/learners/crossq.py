@@ -37,6 +37,7 @@ class CrossQ(SAC):
 
     betas = (0.5, 0.999)
     norm = "batch"
+    with_target = False
     gain = 0.01  # with a fast last layer, and no target networks, values run away
 
     def __init__(
@@ -54,9 +55,6 @@ class CrossQ(SAC):
                 "normalises batches and has no target networks"
             )
         super().__init__(env, in_keys, **settings)
-
-    def after_update(self) -> None:
-        """Do nothing: there are no target networks."""
 
     def critic_losses(self, minibatch: Entries) -> dict[str, Tensor]:
         """Return the loss of all critics."""

@@ -5,7 +5,6 @@ Q(s, a) is moved towards y = r + gamma * Q'(s', argmax_b Q(s', b)), or y = r whe
 terminated. Q' is a target network that follows Q slowly. The policy is epsilon-greedy.
 """
 
-import copy
 from collections.abc import Sequence
 from typing import Unpack
 
@@ -61,7 +60,6 @@ class DQN(OffPolicy):
         >>> metrics = dqn.update(Rollout(env, dqn.policy, steps=8, keys=dqn.keys).collect())
     """
 
-    parts = ("target", *OffPolicy.parts)
     minimised = ("loss",)
     reported = ("loss", "value")
 
@@ -107,10 +105,9 @@ class DQN(OffPolicy):
             first = min(first, HELD_EPSILON)
         self.explorer = EGreedyModule(single, eps_init=first, eps_end=0.0, device=env.device)
         self.policy, self.double = self.build_policy(), double
-        self.target = copy.deepcopy(self.values).requires_grad_(False)
-        self.of_values, self.of_target = Weights(self.values), Weights(self.target)
-        buffers = [*self.values.buffers(), *self.target.buffers()]
-        self.set_update([self.of_values.vector], [self.of_target.vector, *buffers])
+        self.of_values = Weights(self.values)
+        self.follow(self.values, self.of_values)
+        self.set_update([self.of_values.vector], [*self.values.buffers()])
 
     def build_policy(self) -> TensorDictSequential:
         """Return the policy: values, perhaps a bonus for the advised action, choice and noise."""
@@ -121,11 +118,6 @@ class DQN(OffPolicy):
             keys = [self.anchor.advice_key, "action_value"]
             modules.append(networks.FastTensorDictModule(bonus, keys, ["action_value"]))
         return TensorDictSequential(*modules, self.choice, self.explorer)
-
-    @torch.no_grad()
-    def after_update(self) -> None:
-        """Move the target network."""
-        self.of_target.vector.lerp_(self.of_values.vector, self.tau)
 
     def losses(self, minibatch: Entries) -> dict[str, Tensor]:
         """Return the loss of a minibatch [N] and the mean value of the best action, scalars.

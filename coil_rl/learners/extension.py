@@ -11,15 +11,22 @@ from torch import Tensor
 class Extension:
     """Base class of what is added to a learner; by itself it changes nothing.
 
-    An update calls `prepare` once, `weights` once, `losses` for each minibatch, and `finish` once.
-    Learners with replay do not call `prepare`: they store the steps as they are, and learn from
-    each many times.
+    Learners call `meet` when they are made. An update calls `prepare` once, `weights` once,
+    `losses` for each minibatch, and `finish` once. Learners with replay do not call `prepare`: they
+    store the steps as they are, and learn from each many times.
     """
 
     @property
     def keys(self) -> Sequence[NestedKey]:
         """Entries that `losses` reads, besides those that the policy observes."""
         return ()
+
+    def meet(self, critics: Any) -> None:
+        """Take the `Critics` of the learner, or raise a `ValueError` for those that do not fit.
+
+        Args:
+            critics: of actions; None: the learner has none.
+        """
 
     def prepare(self, batch: TensorDictBase) -> None:
         """Change a batch [B, T] in place, before advantages are computed from its rewards."""

@@ -37,8 +37,6 @@ class KickstartLoss(Extension):
         guide: index of the guide in the advice.
         advice_key: entry with the advice, [N, n_guides, A].
 
-    Attributes:
-        critics: of the learner of the policy, if it has critics of actions.
     """
 
     LOSS: ClassVar[str] = "loss_guide"
@@ -51,7 +49,6 @@ class KickstartLoss(Extension):
 
     def __post_init__(self) -> None:
         self.coefficient_at = schedule(self.coefficient)
-        self.critics: Critics | None = None
 
     @property
     def keys(self) -> Sequence[NestedKey]:
@@ -106,15 +103,14 @@ class FilteredKickstartLoss(KickstartLoss):
 
     soft: bool = field(default=False, kw_only=True)
 
-    @property
-    def keys(self) -> Sequence[NestedKey]:
-        """Entries that it reads; raises a `ValueError` for a learner without action values."""
-        if self.critics is None:
+    def meet(self, critics: Critics | None) -> None:
+        """Take the critics; a learner without is a `ValueError`."""
+        if critics is None:
             raise ValueError(
                 "FilteredKickstartLoss compares values of actions; take learner=sac, or "
                 "KickstartLoss"
             )
-        return super().keys
+        self.critics = critics
 
     def each(self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase) -> Tensor:
         """Return the weighted loss of each row of a minibatch, [N]."""
@@ -135,4 +131,4 @@ class FilteredKickstartLoss(KickstartLoss):
         return torch.special.ndtr(gain / spread)
 
     def _values(self, minibatch: TensorDictBase, action: Tensor) -> Tensor:
-        return self.critics.values(minibatch.copy().set("action", action))  # type: ignore[union-attr]
+        return self.critics.values(minibatch.copy().set("action", action))

@@ -84,12 +84,12 @@ class Stateful:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next update depends on, besides its batch."""
-        return {name: _state_of(vars(self)[name]) for name in self.parts}
+        return {name: _state_of(getattr(self, name)) for name in self.parts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state that `state_dict` returned."""
         for name in self.parts:
-            part = vars(self)[name]
+            part = getattr(self, name)
             if isinstance(part, torch.Generator):
                 part.set_state(state[name].cpu())
             elif hasattr(part, "load_state_dict"):

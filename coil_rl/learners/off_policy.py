@@ -1,5 +1,6 @@
 """Off-policy learning with a replay buffer, the base class of `DQN` and `SAC`."""
 
+import copy
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, ClassVar, Literal, TypedDict
@@ -22,6 +23,7 @@ from coil_rl.learners.n_step import NStep
 from coil_rl.learners.normaliser import RawObservations, normaliser
 from coil_rl.learners.policy import Entries, next_of
 from coil_rl.learners.reward_scale import RewardScale
+from coil_rl.learners.weights import Weights
 from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Seed, Share, checked
 from coil_rl.schedules import Schedule, schedule
 from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
@@ -65,10 +67,10 @@ class OffPolicy(Stateful, Learner):
     Where the agent acts its own action is stored, also a residual, because the sum is a part of the
     env.
 
-    A subclass builds its networks, calls `set_update`, perhaps `extend`, and defines `losses`. It
-    names the losses to minimise the sum of (`minimised`) and the values to report (`reported`). A
-    value out of range is a `ValueError`, and so is an env in which the effect or the reward of an
-    action changes over the run.
+    A subclass builds its networks, perhaps with a target (`follow`), calls `set_update` and defines
+    `losses`. It names the losses to minimise the sum of (`minimised`) and the values to report
+    (`reported`). A value out of range is a `ValueError`, and so is an env in which the effect or
+    the reward of an action changes over the run.
 
     Args:
         env: the env, for its device and transforms.
@@ -95,9 +97,12 @@ class OffPolicy(Stateful, Learner):
             steps are sampled alike.
         compile: whether to compile the update, see `GradientStep`.
         anchor: makes the policy start as its guide.
+        auxiliary: extensions, such as losses of the policy (`KickstartLoss`).
         seed: of the samples.
 
     Attributes:
+        target: a copy of the network that rates actions, which follows it slowly; None: there is
+            none.
         keys: entries that a batch must have.
         extensions: what is added to the algorithm.
     """
@@ -105,6 +110,7 @@ class OffPolicy(Stateful, Learner):
     compilable: ClassVar[bool] = True
     parts: ClassVar[tuple[str, ...]] = (
         "policy",
+        "target",
         "gradient",
         "generator",
         "pending_updates",
@@ -115,6 +121,7 @@ class OffPolicy(Stateful, Learner):
     )
     minimised: tuple[str, ...]
     reported: tuple[str, ...]
+    target: Any = None
 
     def __init__(
         self,
@@ -135,6 +142,7 @@ class OffPolicy(Stateful, Learner):
         prior: Share = 0.0,
         compile: bool | Literal["auto"] = "auto",
         anchor: Anchor | None = None,
+        auxiliary: Sequence[Extension] = (),
         seed: Seed = 0,
     ) -> None:
         self.anchor, self.compile = anchor, compile
@@ -176,7 +184,9 @@ class OffPolicy(Stateful, Learner):
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.buffer, self.guide_buffer = self._new_buffer(), self._new_buffer()
         self.prior = round(prior * batch_size)
-        self.extensions = Extensions([RawObservations(env, in_keys, self.normaliser)])
+        self.extensions = Extensions([*auxiliary, RawObservations(env, in_keys, self.normaliser)])
+        self.also_store(*self.extensions.keys)
+        self.reported = (*self.reported, *self.extensions.weights({}, 0.0))
 
     def _new_buffer(self) -> ReplayBuffer:
         # TorchRL's OfflineToOnlineReplayBuffer takes no generator, so a resumed run would draw
@@ -192,6 +202,11 @@ class OffPolicy(Stateful, Learner):
                     if each not in known:
                         known.append(each)
 
+    def follow(self, network: nn.Module, weights: Weights) -> None:
+        """Make the target of a network with these weights."""
+        self.target = copy.deepcopy(network).requires_grad_(False)
+        self.of_target, self.followed = Weights(self.target), weights
+
     def set_update(
         self, parameters: Sequence[nn.Parameter], reads: Sequence[Tensor], **options: Any
     ) -> None:
@@ -199,13 +214,16 @@ class OffPolicy(Stateful, Learner):
 
         Args:
             parameters: that it changes.
-            reads: other tensors that `losses` and `after_update` read.
+            reads: other tensors that `losses` reads, besides those of the target.
             options: further ones of `GradientStep`.
         """
+        known = [self.gamma, self.tau, *reads]
+        if self.target is not None:
+            known += [self.of_target.vector, *self.target.buffers()]
         self.gradient = GradientStep(
             self.losses,
             [parameters],
-            [self.gamma, self.tau, *reads],
+            known,
             lambda progress: [self.learning_rate(progress)],
             eps=1e-8,
             max_grad_norm=self.max_grad_norm,
@@ -215,13 +233,11 @@ class OffPolicy(Stateful, Learner):
             **options,
         )
 
+    @torch.no_grad()
     def after_update(self) -> None:
-        """Act after each minibatch, such as to move target networks; by default do nothing."""
-
-    def extend(self, extensions: Sequence[Extension]) -> None:
-        """Add extensions."""
-        self.extensions = Extensions([*extensions, *self.extensions.each])
-        self.also_store(*self.extensions.keys)
+        """Move the target, after each minibatch."""
+        if self.target is not None:
+            self.of_target.vector.lerp_(self.followed.vector, self.tau)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Store the steps of a batch and learn from stored steps.

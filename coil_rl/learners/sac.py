@@ -14,7 +14,6 @@ With many critics, y has the minimum over a random few of them, and the policy m
 2022). RLPD is this with a share of prior steps in each minibatch (Ball et al. 2023).
 """
 
-import copy
 import math
 from collections.abc import Sequence
 from typing import Annotated, ClassVar, Unpack
@@ -30,7 +29,6 @@ from coil_rl.learners import networks
 from coil_rl.learners.critics import Critics, Norm
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension
-from coil_rl.learners.kickstart import KickstartLoss
 from coil_rl.learners.n_step import discounted
 from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerStep
 from coil_rl.learners.policy import ByKey, Entries, Policy, next_of
@@ -92,15 +90,15 @@ class SAC(OffPolicy):
         dropout: share of the numbers of a hidden layer of the critics that are left out at random.
         uncertainty: whether the policy writes that of the critics, see `Critics`, for
             `AdaptiveMixedAction`.
-        auxiliary: extensions, such as losses of the policy (`KickstartLoss`).
         settings: further ones of `OffPolicy`.
     """
 
-    parts = ("critics", "target", "temperature", *OffPolicy.parts)
+    parts = ("critics", "temperature", *OffPolicy.parts)
     minimised = ("loss_actor", "loss_qvalue", "loss_alpha")
     reported: tuple[str, ...] = (*minimised, "alpha", "entropy", "value")
     betas = (0.9, 0.999)  # of Adam
     values_of_a_critic = 1
+    with_target: ClassVar[bool] = True
     norm: ClassVar[Norm] = "none"  # of the critics, without `critic_layer_norm`
     gain: ClassVar[float] = 1.0  # of the critics
 
@@ -146,6 +144,7 @@ class SAC(OffPolicy):
             updates_per_step=updates_per_step,
             learning_rate=learning_rate,
             max_grad_norm=max_grad_norm,
+            auxiliary=auxiliary,
             **settings,
         )
         self.action_scale, self.action_gain = action_scale, action_gain
@@ -161,7 +160,11 @@ class SAC(OffPolicy):
             gain=self.gain,
             inputs=self.inputs,
         )
-        self.target = copy.deepcopy(self.critics).requires_grad_(False)
+        self.of_critics = Weights(self.critics)
+        if self.with_target:
+            self.follow(self.critics, self.of_critics)
+        for each in auxiliary:
+            each.meet(self.critics)
         log_alpha = torch.tensor(math.log(temperature), device=self.device)
         self.temperature = nn.ParameterDict({"log_alpha": log_alpha})
         size = networks.action_shape(env).numel()
@@ -170,7 +173,6 @@ class SAC(OffPolicy):
         self.target_critics, self.writes_uncertainty = target_critics, uncertainty
         self.policy = self.build_policy()
         self._set_weights()
-        self._extend(auxiliary)
 
     def build_actor(self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp) -> Policy:
         """Return a policy that reads entries that have been normalised already.
@@ -201,28 +203,13 @@ class SAC(OffPolicy):
         return []
 
     def _set_weights(self) -> None:
-        self.of_actor, self.of_critics, self.of_target = map(
-            Weights, (self.actor, self.critics, self.target)
-        )
+        self.of_actor = Weights(self.actor)
         learned = [self.of_actor, self.of_critics, *self.further_weights()]
-        buffers = [*self.policy.buffers(), *self.critics.buffers(), *self.target.buffers()]
         self.set_update(
             [*(each.vector for each in learned), self.temperature["log_alpha"]],
-            [self.of_target.vector, self.target_entropy, *buffers],
+            [self.target_entropy, *self.policy.buffers(), *self.critics.buffers()],
             betas=self.betas,
         )
-
-    def _extend(self, auxiliary: Sequence[Extension]) -> None:
-        for each in auxiliary:
-            if isinstance(each, KickstartLoss):
-                each.critics = self.critics
-        self.extend(auxiliary)
-        self.reported = (*self.reported, *self.extensions.weights({}, 0.0))
-
-    @torch.no_grad()
-    def after_update(self) -> None:
-        """Move the target networks."""
-        self.of_target.vector.lerp_(self.of_critics.vector, self.tau)
 
     def losses(self, minibatch: Entries) -> dict[str, Tensor]:
         """Return the losses of a minibatch [N] by name, and other values, scalars."""
