@@ -19,14 +19,13 @@ from torchrl.modules import EGreedyModule, QValueModule
 
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import AnchoredInputs, AnchoredValues, hold_of
-from coil_rl.learners.encoders import Mlp, ObservationNetwork, without_memory
+from coil_rl.learners.encoders import Mlp, ObservationNetwork
 from coil_rl.learners.n_step import discounted
 from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerStep
 from coil_rl.learners.policy import Entries, next_of, read_through
 from coil_rl.learners.weights import Weights
 from coil_rl.ranges import NonNegative, Positive, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
-from coil_rl.transforms.action_space import nested_key
 
 HELD_EPSILON = 0.3  # largest probability of a random action of a policy that holds a guide
 
@@ -81,11 +80,10 @@ class DQN(OffPolicy):
     ) -> None:
         self.epsilon = schedule(epsilon)
         check_actions(env)
-        in_keys = [nested_key(key) for key in in_keys]
-        network = without_memory(network or Mlp(hidden, "relu"), "DQN")
         super().__init__(
             env,
             in_keys,
+            network or Mlp(hidden, "relu"),
             tau=tau,
             updates_per_step=updates_per_step,
             learning_rate=learning_rate,
@@ -95,9 +93,14 @@ class DQN(OffPolicy):
         self.one_hot = isinstance(env.action_spec, OneHot)
         single = env.action_spec_unbatched  # the network is evaluated on batches of any size
         numbers = ObservationNetwork(
-            env, in_keys, network, single.space.n, action_gain, dtype=env.reward_spec.dtype
+            env,
+            self.in_keys,
+            self.network,
+            single.space.n,
+            action_gain,
+            dtype=env.reward_spec.dtype,
         )
-        keys = read_through(self.inputs, in_keys)
+        keys = read_through(self.inputs, self.in_keys)
         self.values = networks.FastTensorDictModule(numbers, keys, ["action_value"])
         self.choice = QValueModule(spec=single)
         first = float(self.epsilon(0))

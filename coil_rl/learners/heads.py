@@ -19,6 +19,8 @@ class GlobalScaleHead(nn.Module):
         scale: initial standard deviation.
     """
 
+    outputs = 1  # of the network for each number of an action
+
     def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
         super().__init__()
         self.network, self.event = network, event
@@ -41,6 +43,8 @@ class GaussianHead(nn.Module):
         event: shape of an action.
         scale: standard deviation where the network gives 0.
     """
+
+    outputs = 2
 
     def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
         super().__init__()

@@ -119,7 +119,7 @@ def actor(
     gain: float = 0.01,
     *,
     shapes: Shapes | None = None,
-    state_dependent_scale: bool = False,
+    head: type[GlobalScaleHead | GaussianHead] = GlobalScaleHead,
     squash: bool = True,
     clip: bool = True,
     inputs: Inputs | None = None,
@@ -139,8 +139,7 @@ def actor(
         gain: scale of the initial weights of the last layer.
         shapes: shapes of observed entries that the env does not write, without the batch
             dimensions.
-        state_dependent_scale: whether the standard deviation is an output of the network; otherwise
-            it is the same in every state.
+        head: gives mean and standard deviation of numbers.
         squash: whether bounded actions are squashed by tanh; otherwise samples are clipped.
         clip: whether samples that are not squashed are clipped; otherwise the env does that.
         inputs: what networks read in place of some of `in_keys`; the first module of the policy.
@@ -164,17 +163,18 @@ def actor(
 
     valid: Tensor | None = None
     if spec.dtype.is_floating_point:
-        head = _normal_head(network_of, action_shape(env), scale, state_dependent_scale)
+        event = action_shape(env)
+        module: nn.Module = head(network_of(head.outputs * event.numel()), event, scale)
         sample = _sample_of_numbers(env, spec, squash, clip)
     else:
-        head, sample, valid = _choices(env, spec, network_of)
+        module, sample, valid = _choices(env, spec, network_of)
     if anchor is not None and isinstance(inputs, AnchoredInputs):
         if valid is None:
             sample = AnchoredSample(sample, inputs.hold, anchor, env.action_key)
         else:
-            head = AnchoredHead(head, inputs.hold, valid, anchor.choice_weight)
+            module = AnchoredHead(module, inputs.hold, valid, anchor.choice_weight)
             keys = [anchor.advice_key, *keys]
-    return Policy(*before, FastTensorDictModule(head, keys, sample.in_keys), sample)
+    return Policy(*before, FastTensorDictModule(module, keys, sample.in_keys), sample)
 
 
 def inputs_of(env: EnvBase, normaliser: Normaliser | None, anchor: Anchor | None) -> Inputs | None:
@@ -211,16 +211,6 @@ def _choices(
     head = ChoicesHead(network_of(options.numel() * int(options.max())), event, options)
     sample = Sample(["logits"], env.action_key, Choices, {"event_dims": len(event)})
     return head, sample, head.valid
-
-
-def _normal_head(
-    network_of: NetworkOf, event: torch.Size, scale: float, state_dependent_scale: bool
-) -> nn.Module:
-    """Return a head that gives mean and standard deviation of numbers of shape `event`."""
-    size = event.numel()
-    if state_dependent_scale:
-        return GaussianHead(network_of(2 * size), event, scale)
-    return GlobalScaleHead(network_of(size), event, scale)
 
 
 def _sample_of_numbers(env: EnvBase, spec: TensorSpec, squash: bool, clip: bool) -> Sample:

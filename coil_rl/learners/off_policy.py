@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from coil_rl import output
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import Anchor, start_tests
+from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension, Extensions
 from coil_rl.learners.gradient import GradientStep, means
 from coil_rl.learners.learner import Callback, Cases, Learner, Stateful
@@ -26,6 +27,7 @@ from coil_rl.learners.reward_scale import RewardScale
 from coil_rl.learners.weights import Weights
 from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Seed, Share, checked
 from coil_rl.schedules import Schedule, schedule
+from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
 from coil_rl.transforms.guide_transform import GuideTransform
 
@@ -75,6 +77,7 @@ class OffPolicy(Stateful, Learner):
     Args:
         env: the env, for its device and transforms.
         in_keys: entries that are observed.
+        network: architecture of the networks; one with a memory is a `ValueError`.
         normalise: whether to normalise what is observed, or the entries to normalise, see
             `Normaliser`; with "auto" the steps before learning starts decide. Steps are stored as
             they are.
@@ -120,13 +123,14 @@ class OffPolicy(Stateful, Learner):
         "extensions",
     )
     minimised: tuple[str, ...]
-    reported: tuple[str, ...]
+    reported: tuple[str, ...] = ()
     target: Any = None
 
     def __init__(
         self,
         env: EnvBase,
         in_keys: Sequence[NestedKey],
+        network: Mlp,
         *,
         normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         scale_rewards: bool = False,
@@ -146,6 +150,8 @@ class OffPolicy(Stateful, Learner):
         seed: Seed = 0,
     ) -> None:
         self.anchor, self.compile = anchor, compile
+        self.in_keys = in_keys = [nested_key(key) for key in in_keys]
+        self.network = without_memory(network, type(self).__name__)
         self.learning_rate = schedule(learning_rate)
         if not max(starts, 1) <= capacity:
             raise ValueError(f"capacity={capacity} must be at least 1 and at least starts={starts}")

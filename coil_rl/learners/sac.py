@@ -27,15 +27,15 @@ from torchrl.envs import EnvBase
 
 from coil_rl.learners import networks
 from coil_rl.learners.critics import Critics, Norm
-from coil_rl.learners.encoders import Mlp, without_memory
+from coil_rl.learners.encoders import Mlp
 from coil_rl.learners.extension import Extension
+from coil_rl.learners.heads import GaussianHead
 from coil_rl.learners.n_step import discounted
 from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerStep
 from coil_rl.learners.policy import ByKey, Entries, Policy, next_of
 from coil_rl.learners.weights import Weights
 from coil_rl.ranges import Interval, NonNegative, Positive, Share, checked
 from coil_rl.schedules import Schedule
-from coil_rl.transforms.action_space import nested_key
 
 
 class CrossQSettings(ReplaySettings, total=False):
@@ -135,11 +135,10 @@ class SAC(OffPolicy):
                 f"{type(self).__name__} needs continuous actions, but this env has discrete ones; "
                 "use action=continuous, or learner=ppo with method=coil_anchored, or learner=dqn"
             )
-        in_keys = [nested_key(key) for key in in_keys]
-        network = without_memory(network or Mlp(hidden, "relu"), type(self).__name__)
         super().__init__(
             env,
             in_keys,
+            network or Mlp(hidden, "relu"),
             tau=tau,
             updates_per_step=updates_per_step,
             learning_rate=learning_rate,
@@ -148,11 +147,11 @@ class SAC(OffPolicy):
             **settings,
         )
         self.action_scale, self.action_gain = action_scale, action_gain
-        self.actor = self.build_actor(env, in_keys, network)
+        self.actor = self.build_actor(env, self.in_keys, self.network)
         self.critics = Critics(
             env,
-            in_keys,
-            network,
+            self.in_keys,
+            self.network,
             critics,
             outputs=self.values_of_a_critic,
             norm="layer" if critic_layer_norm else self.norm,
@@ -185,7 +184,7 @@ class SAC(OffPolicy):
             network,
             self.action_scale,
             self.action_gain,
-            state_dependent_scale=True,
+            head=GaussianHead,
             clip=False,  # where a bound is missing the critics learn of the sample itself
             inputs=self.inputs,
             anchor=self.anchor,

@@ -9,7 +9,7 @@ from any_env import AnyEnv, action_of, learning
 from tensordict import TensorDict
 from torchrl.envs import PendulumEnv
 
-from coil_rl.learners import DQN, SAC
+from coil_rl.learners import DQN, SAC, Mlp
 from coil_rl.learners.n_step import NStep, discounted
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.learners.policy import Entries
@@ -29,6 +29,7 @@ def replay(env=None, **options):
     """The buffer of a learner, without networks."""
     options = {
         "in_keys": ["th"],
+        "network": Mlp(),
         "capacity": 10,
         "batch_size": 4,
         "updates_per_step": 0.25,
