@@ -1,8 +1,7 @@
 """Distributions of actions, written out.
 
 For small networks it takes longer to construct an object of `torch.distributions` than to compute
-with it, and a rollout does so in each step. The samples are the same to the bit. TorchRL's losses
-take these classes as any other distribution.
+with it, and a rollout does so in each step. The samples are the same to the bit.
 """
 
 import math
@@ -50,15 +49,6 @@ class Density(ABC):
     def summed(self, values: Tensor) -> Tensor:
         """Return the sums over the numbers or choices of an action."""
         return values.flatten(-self.event_dims).sum(-1) if self.event_dims else values
-
-    def rsample_and_log_prob(self, shape: torch.Size = torch.Size()) -> tuple[Tensor, Tensor]:  # noqa: B008
-        """Return what `draw` does; TorchRL's losses call it so, with an empty shape."""
-        return self.draw()
-
-    @property
-    def deterministic_sample(self) -> Tensor:
-        """The deterministic action, by TorchRL's name."""
-        return self.mode
 
 
 class Normal(Density):
@@ -209,11 +199,6 @@ class Choices(Density):
     def mode(self) -> Tensor:
         """The most probable options."""
         return self.logits.softmax(-1).argmax(-1)
-
-    @property
-    def probs(self) -> Tensor:
-        """The probabilities of the options."""
-        return self.logits.softmax(-1)
 
     @property
     def valid(self) -> Tensor:

@@ -92,7 +92,7 @@ def test_probability_of_the_advised_option_at_half_a_choice_weight(count, probab
     """The bonus is half of log(9 (n - 1)), so the odds are 3 to the root of n - 1."""
     env = advised(Categorical(count, ()), option(count))
     data = env.reset()
-    probabilities = learner(env).policy.get_dist(data).probs
+    probabilities = learner(env).policy.get_dist(data).logits.softmax(-1)
     found = (probabilities * data["guide_action"][:, 0]).sum(-1)
     torch.testing.assert_close(found, torch.full((8,), probability))
 

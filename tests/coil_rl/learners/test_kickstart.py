@@ -102,7 +102,7 @@ def replay(auxiliary, **options):
 def test_imitation_is_weighted_by_the_opinion_of_the_critics(soft):
     filtered = FilteredKickstartLoss(soft=soft)
     sac, _, data = replay(filtered)
-    own = sac.actor.get_dist(data.select("observation")).deterministic_sample
+    own = sac.actor.get_dist(data.select("observation")).mode
     both = [
         filtered.critics.values(data.copy().set("action", a))
         for a in (data["guide_action"][:, 0], own)

@@ -164,7 +164,7 @@ def test_standard_deviation_is_initially_the_scale_in_every_state():
     batch = rollout.collect()
     before = sac.policy.get_dist(batch.select("th", "thdot"))
     torch.testing.assert_close(before.scale, torch.full((32, 1), 0.3))
-    assert (before.deterministic_sample == 0).all()
+    assert (before.mode == 0).all()
     sac.update(batch)
     assert sac.policy.get_dist(batch.select("th", "thdot")).scale.std() > 1e-4
 
