@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
@@ -89,8 +90,9 @@ class TabularCoil(Result):
         seeds = tqdm(range(self.worlds), unit="world", desc=stem.name, leave=False, mininterval=0.5)
         rows = [row for seed in seeds for row in self._world(seed)]
         write_csv(rows, stem.with_suffix(".csv"))
+        scores = pd.DataFrame(rows)
         pairs = itertools.product(("state", "class"), self.guides)
-        groups = [self._group(rows, view, guide) for view, guide in pairs]
+        groups = [self._group(scores, view, guide) for view, guide in pairs]
         _draw(groups, self.steps, stem.with_suffix(".png"))
         table = markdown_table(groups, self._columns())
         reached, cases = sum(group["reached"] for group in groups), self.worlds * len(groups)
@@ -161,14 +163,13 @@ class TabularCoil(Result):
         )
         return np.array([_value(mdp, Q.argmax(axis=1)[observations]) for Q in learned.history])
 
-    def _group(self, rows: Sequence[Mapping[str, Any]], view: str, guide: str) -> dict[str, Any]:
+    def _group(self, scores: pd.DataFrame, view: str, guide: str) -> dict[str, Any]:
         """Return shares and mean scores over all worlds, for one view and guide."""
-        of_group = [row for row in rows if row["view"] == view and row["guide"] == guide]
-
-        def scores(key: str) -> Array:
-            return np.array([row[key] for row in of_group]).reshape(self.worlds, len(self.steps))
-
-        own, coil, plain = scores("guide_score"), scores("coil_score"), scores("plain_score")
+        of_group = scores[(scores["view"] == view) & (scores["guide"] == guide)]
+        own, coil, plain = (
+            of_group[f"{name}_score"].to_numpy().reshape(self.worlds, len(self.steps))
+            for name in ("guide", "coil", "plain")
+        )
         reached = (coil >= own - ROUNDING).sum(axis=0)
         shares = reached / self.worlds
         interval = binomtest(int(reached[-1]), self.worlds).proportion_ci(method="wilson")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from coil_paper.reproduce import pages
 from coil_paper.reproduce.result import NO_RUNS, PAGES, Runs, WorldsResult, runs_by_label
@@ -32,7 +33,6 @@ from coil_rl.report import (
 Row = Mapping[str, Any]
 
 PAPER_RETURNS = PAGES["table_4"]["paper"]
-KEYS = ("best", "final", "guide")
 FRACTIONS = {0.1: "a tenth", 0.25: "a quarter", 0.5: "half", 1.0: "all"}  # of the frames
 POINT = ("frames", "mean", "low", "high")  # of a curve
 
@@ -67,19 +67,16 @@ class Table4(WorldsResult):
 
     def _table(self, rows: Sequence[Row]) -> list[dict[str, Any]]:
         """Return one row per label, the best first."""
-        by_label: dict[str, dict[int, Row]] = {}
-        for row in rows:
-            by_label.setdefault(row["label"], {})[row["seed"]] = row
-        reference = by_label.get(self.against, {})
+        runs = pd.DataFrame(rows).set_index("seed")
+        reference = runs["best"][runs["label"] == self.against]
         table = []
-        for label, by_seed in by_label.items():
-            best, final, guide = (np.array([row[key] for row in by_seed.values()]) for key in KEYS)
-            common = [seed for seed in by_seed if seed in reference and label != self.against]
-            ours = np.array([by_seed[seed]["best"] for seed in common])
-            theirs = np.array([reference[seed]["best"] for seed in common])
-            line: dict[str, Any] = {"label": label, "runs": len(by_seed), "guide": guide.mean()}
-            line["better"] = float(wins(ours[:, None], theirs[:, None]).mean()) if common else None
-            for key, values in {"best": best, "final": final, "difference": ours - theirs}.items():
+        for label, own in runs.groupby("label", sort=False):
+            common = own.index.intersection(reference.index if label != self.against else [])
+            ours, theirs = (best[common].to_numpy() for best in (own["best"], reference))
+            line: dict[str, Any] = {"label": label, "runs": len(own), "guide": own["guide"].mean()}
+            line["better"] = float(wins(ours, theirs).mean()) if len(common) else None
+            numbers = {"best": own["best"], "final": own["final"], "difference": ours - theirs}
+            for key, values in numbers.items():
                 line[key] = estimate(values)
                 line[f"{key} cell"] = line[key].cell("+.1f" if key == "difference" else ".1f")
             table.append(line)
