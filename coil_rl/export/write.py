@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Mapping
+from contextlib import ExitStack
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +17,7 @@ from coil_rl.export.parity import LIMIT, WITH_GUIDE, Parity, Step, compare, reco
 from coil_rl.export.policy import ExportedPolicy
 from coil_rl.export.step import NotExportableError, PolicyStep, exportable
 from coil_rl.extras import require
-from coil_rl.files import temporary
+from coil_rl.files import whole_file
 from coil_rl.foreign.controllers import PerRow
 from coil_rl.foreign.shared import FunctionGuide
 from coil_rl.guides.simple import EntryGuide
@@ -165,20 +165,6 @@ def _save(folder: Path, contents: Mapping[str, bytes], contract: Mapping[str, An
     """Write all files, the contract as the last one; none if one cannot be written."""
     driver = (resources.files("coil_rl.export") / DRIVER).read_bytes()
     text = json.dumps(contract, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    files = {**contents, DRIVER: driver, CONTRACT: text.encode()}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise UserError(
-            f"{folder} is a file, but a folder is to be made there; remove it"
-        ) from error
-    unfinished = temporary(folder / "export")
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir()
-    try:
-        for name, content in files.items():
-            (unfinished / name).write_bytes(content)
-        for name in files:
-            (unfinished / name).replace(folder / name)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
+    with ExitStack() as stack:  # the first one to be entered is the last one to appear
+        for name, content in {CONTRACT: text.encode(), **contents, DRIVER: driver}.items():
+            stack.enter_context(whole_file(folder / name)).write_bytes(content)

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from coil_rl import Measure
+from coil_rl import Measure, UserError
 from coil_rl.report import Comparison, Group
 
 NEXT_TO_NOTHING = 0.01  # of a guide's mean reward over its other cases: too little to divide by
 EARNED = "earned"  # measure of a group with fractions: the reward itself
-HEADING = "reward / guide's"
+HEADING, SPEC = "reward / guide's", ".3f"  # of the fractions
 
 References = Mapping[tuple[str, ...], np.ndarray]
 
@@ -18,16 +18,22 @@ References = Mapping[tuple[str, ...], np.ndarray]
 def relative(comparison: Comparison) -> Comparison:
     """Return a comparison whose rewards are fractions of the best guide's in the same case.
 
-    The rewards themselves are the measure `EARNED`. Where a policy has cases in which no guide has
-    rewards to divide by, the comparison is returned as it is.
+    The rewards themselves are the measure `EARNED`.
+
+    Raises:
+        UserError: where a policy has cases in which no guide has rewards to divide by.
     """
     references: dict[tuple[str, ...], np.ndarray] = {}
     for guide in comparison.guides:  # the best first
         reference = _reference(guide)
         if reference is not None:
             references.setdefault(guide.cases, reference)
-    if any(group.cases not in references for group in comparison.groups):
-        return comparison
+    for group in comparison.groups:
+        if group.cases not in references:
+            raise UserError(
+                f"the rewards of {group.name} are to be given as fractions of a guide's, but no "
+                "guide earns anything in the same cases; evaluate one that does"
+            )
     guides = {group: _divided(group, references) for group in comparison.guides}
     agents = [_divided(group, references) for group in comparison.agents]
     agents = [
@@ -36,15 +42,8 @@ def relative(comparison: Comparison) -> Comparison:
     return Comparison(tuple(guides.values()), tuple(agents))
 
 
-def is_relative(comparison: Comparison) -> bool:
-    """Return whether the rewards of a comparison are fractions of a guide's."""
-    return all(EARNED in group.measures for group in comparison.groups)
-
-
 def earned(group: Group) -> Group:
     """Return a group with its rewards themselves."""
-    if EARNED not in group.table:
-        return group
     return replace(group, table=group.table.assign(reward=group.table[EARNED]))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from coil_paper.reproduce import pages
-from coil_paper.reproduce.ratio import EARNED, HEADING, earned, is_relative, relative
+from coil_paper.reproduce.ratio import EARNED, HEADING, SPEC, earned, relative
 from coil_paper.reproduce.result import NO_RUNS, PAGES, Runs, WorldsResult
 from coil_rl.report import (
     GUIDE,
@@ -55,8 +55,7 @@ class Table5(WorldsResult):
                 parts.append(_paper_table(rows))
                 _draw(compared, stem.with_suffix(".png"))
             for actions in ACTIONS:
-                heading = HEADING if is_relative(compared[actions]) else "reward"
-                table = self._policy_table(rows[actions], heading)
+                table = self._policy_table(rows[actions])
                 parts += [f"**{actions.capitalize()} actions**", table]
                 if not world:
                     groups = list(map(earned, compared[actions].groups))
@@ -84,25 +83,21 @@ class Table5(WorldsResult):
 
     def _rows(self, comparison: Comparison) -> list[dict[str, Any]]:
         """Return the measures of each policy, compared with `against` and with the guide."""
-        rows = with_cells(comparison.table(self.against), _spec(comparison))
+        rows = with_cells(comparison.table(self.against), SPEC)
         over_guide = [row["better"] for row in comparison.table(GUIDE)]
         return [
-            row | {"over_guide": better, "reward": row.get(EARNED, row["reward"])}
+            row | {"over_guide": better, "reward": row[EARNED]}
             for row, better in zip(rows, over_guide, strict=True)
         ]
 
-    def _policy_table(self, rows: Sequence[Row], reward: str) -> str:
-        """Return the table of all policies; the terms of the reward are its last columns.
-
-        Args:
-            reward: heading of what they are compared by.
-        """
+    def _policy_table(self, rows: Sequence[Row]) -> str:
+        """Return the table of all policies; the terms of the reward are its last columns."""
         columns = {
             "driver": ("driver", ""),
             "seeds": ("seeds", ""),
             "completed": ("completed", ".0%"),
             "crashes": ("seeds with a crash (95 %)", ""),
-            "reward cell": (f"{reward} (95 %)", ""),
+            "reward cell": (f"{HEADING} (95 %)", ""),
             "difference cell": (f"difference to {self.against} (95 %)", ""),
             "better": (f"better than {self.against}", ".0%"),
             "over_guide": ("better than the guide", ".0%"),
@@ -128,8 +123,7 @@ def _rounded(value: object) -> object:
 def _draw(compared: Mapping[str, Comparison], path: Path) -> None:
     """Draw the scores of the agents, a panel for each kind of actions."""
     panels = {f"{kind} actions": driver_intervals(compared[kind].agents) for kind in ACTIONS}
-    reward = HEADING if is_relative(compared[ACTIONS[0]]) else "reward"
-    draw_intervals(panels, path, measure=f"{reward} (mean)", title="Table 5: unseen tracks")
+    draw_intervals(panels, path, measure=f"{HEADING} (mean)", title="Table 5: unseen tracks")
 
 
 def _claims(worlds: Mapping[str, Mapping[str, Comparison]]) -> str:
@@ -147,12 +141,9 @@ def _claims(worlds: Mapping[str, Mapping[str, Comparison]]) -> str:
             for actions, comparison in by_actions.items():
                 by_name = {group.name: group for group in comparison.groups}
                 if policy in by_name and other in by_name:
-                    cells[actions] = _verdict(
-                        comparison, by_name[policy], by_name[other], measure, sign
-                    )
+                    cells[actions] = _verdict(by_name[policy], by_name[other], measure, sign)
             if cells:
-                ratio = is_relative(by_actions[ACTIONS[0]])
-                paper = _paper_difference(measure, policy, other, ratio)
+                paper = _paper_difference(measure, policy, other)
                 rows.append({"world": world, "claim": claim, "paper": paper} | cells)
     rows.append(_claim_on_crashes(worlds[""]))
     headings = {"paper": "paper"}
@@ -161,9 +152,7 @@ def _claims(worlds: Mapping[str, Mapping[str, Comparison]]) -> str:
     return pages.claims_section(rows, headings)
 
 
-def _verdict(
-    comparison: Comparison, group: Group, other: Group, measure: str, sign: int
-) -> pages.Claim | None:
+def _verdict(group: Group, other: Group, measure: str, sign: int) -> pages.Claim | None:
     """Return the claim that a policy has more of a measure than another one, or less for sign -1.
 
     The result is None if the policies cannot be compared.
@@ -171,7 +160,7 @@ def _verdict(
     pairs = paired(group, other, measure)
     if pairs is None:
         return None
-    spec = _spec(comparison) if measure == "reward" else MEASURE_COLUMNS[measure][1]
+    spec = SPEC if measure == "reward" else MEASURE_COLUMNS[measure][1]
     return pages.Claim(pairs.difference, f"+{spec}", sign)
 
 
@@ -211,22 +200,11 @@ def _paper_table(rows: Mapping[str, Sequence[Row]]) -> str:
     return markdown_table(table, columns)
 
 
-def _spec(comparison: Comparison) -> str:
-    """Return the number format of the rewards of a comparison."""
-    return ".3f" if is_relative(comparison) else comparison.spec
-
-
-def _paper_difference(measure: str, policy: str, other: str, ratio: bool) -> str | None:
-    """Return the paper's difference between two policies; None if it has not both.
-
-    Args:
-        policy: the first policy.
-        other: the second policy.
-        ratio: whether rewards are divided by the guide's.
-    """
+def _paper_difference(measure: str, policy: str, other: str) -> str | None:
+    """Return the paper's difference between two policies; None if it has not both."""
     if policy not in PAPER_UNSEEN or other not in PAPER_UNSEEN:
         return None
     difference = PAPER_UNSEEN[policy][measure] - PAPER_UNSEEN[other][measure]
-    if measure == "reward" and ratio:
-        return f"{difference / PAPER_UNSEEN[GUIDE][measure]:+.3f}"
+    if measure == "reward":
+        return f"{difference / PAPER_UNSEEN[GUIDE][measure]:+{SPEC}}"
     return f"{difference:+{MEASURE_COLUMNS[measure][1]}}"
