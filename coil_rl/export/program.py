@@ -56,10 +56,8 @@ def check(config: DictConfig) -> None:
     from coil_rl.config.compose import check_values
     from coil_rl.envs.meanings import meaning
     from coil_rl.errors import UserError
-    from coil_rl.extras import require
 
     check_values(config)
-    require("an exported policy", "export", "onnx", "onnxscript", "onnxruntime")
     values: Any = OmegaConf.to_container(config.meanings, resolve=True)
     try:
         for name, value in values.items():

@@ -97,9 +97,6 @@ def survey(
         evaluation: the cases and the measures of the episodes.
         donors: number of replacements of the advice per state and guide, as for `intervention`.
         tick: called at every step.
-
-    Raises:
-        ValueError: if nothing writes `guide_action`.
     """
     history: list[TensorDictBase] = []
 
@@ -142,10 +139,8 @@ def _guide_names(env: EnvBase, policy: InterceptedPolicy) -> list[str]:
     """Return the names of the guides whose advice the policy reads, one per slot of the advice."""
     if policy.advising is not None:
         return list(policy.advising.names)
-    for module in env.modules():
-        if isinstance(module, GuideActions):
-            return list(module.names)
-    raise ValueError("nothing writes guide_action: put GuideActions into the env")
+    writes = (module for module in env.modules() if isinstance(module, GuideActions))
+    return list(next(writes).names)
 
 
 class Ablation(NamedTuple):
@@ -192,15 +187,8 @@ def drive_ablated(
 
     Returns:
         The episodes of each ablation, as in `EvaluationResult`.
-
-    Raises:
-        ValueError: if the rows cannot be divided equally.
     """
     rows = env.batch_size.numel()
-    if not removed or rows % len(removed):
-        raise ValueError(
-            f"{rows} rows cannot be divided among {len(removed)} ablations; give a multiple"
-        )
     share = rows // len(removed)
     shape = len(removed), max(1, len(sections.names)), len(replacement)
     replaced = torch.zeros(shape, dtype=torch.bool, device=env.device)

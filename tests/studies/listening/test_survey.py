@@ -138,14 +138,6 @@ def test_rows_along_the_track_contain_every_state_once(found):
     }
 
 
-def test_rows_must_be_a_multiple_of_the_ablations_and_have_advice():
-    removed, zero = ablations(2, 5)[:3], torch.zeros(2, 1)
-    with pytest.raises(ValueError, match="4 rows cannot be divided among 3 ablations"):
-        drive_ablated(guided(cars(4)), FOLLOW, TRACK_SECTIONS, EVALUATION, removed, zero)
-    with pytest.raises(ValueError, match="nothing writes guide_action"):
-        survey(ConeTrackEnv(TRACKS, 2), FOLLOW, TRACK_SECTIONS, EVALUATION)
-
-
 def robots(count):
     return SimulatedRobotEnv(num_envs=count, assignment="cyclic", laps=1, time_limit=20)
 
