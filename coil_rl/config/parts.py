@@ -36,7 +36,7 @@ from coil_rl.config.schema import TrainConfig, fingerprint
 from coil_rl.errors import UserError
 from coil_rl.files import temporary, whole_file
 from coil_rl.foreign.guard import hold
-from coil_rl.foreign.gymnasium_env import GymnasiumEnv
+from coil_rl.foreign.gymnasium_env import NOT_OBSERVED, GymnasiumEnv
 from coil_rl.guides import ControllerGuide
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import MEAN_CASE, measures_of
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
 
 # Parts of a configuration that name entries of the env of a method; its guides are parts of
 # `method.transforms`.
-NOT_OBSERVED = ("info", "controller")  # of an env: for evaluation, and of what acts beside it
 READERS = ["observes", "method", "watch", "learner", "degrade", "action", "evaluation"]
 PROXIES = "proxies"  # subfolder of a run with the networks that replace guides without parameters
 FILES = ("config.yaml", "policy_last.pt")  # files of a run that are needed to load its policy

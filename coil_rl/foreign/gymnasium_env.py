@@ -36,6 +36,7 @@ from coil_rl.foreign.rows import GymnasiumRows
 from coil_rl.foreign.workers import Workers, choose, timed
 from coil_rl.ranges import Count, Processes, Seed, checked
 
+NOT_OBSERVED = ("info", "controller")  # for evaluation, and of what acts beside the env
 RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "controller", "next")
 
 

@@ -8,30 +8,33 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from matplotlib.lines import Line2D
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase, TransformedEnv
 
+from coil_rl.foreign.gymnasium_env import NOT_OBSERVED
 from coil_rl.report import style
 from coil_rl.report.pictures import Picture
 from coil_rl.report.statistics import Array
-from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.transforms.action_space import ActionSpace, observed_choices, space_of
+from coil_rl.transforms.discrete_actions import DiscreteActions
 from coil_rl.transforms.normalised_action import given_units
 
 if TYPE_CHECKING:
-    from torchrl.envs import EnvBase
-
     from coil_rl.run.evaluation import EvaluationResult
 
-OBSERVED, ADVICE, EXECUTED = "observation", "guide_action", "executed_action"
-MOST = {"observation": 6, "action": 3, "advice": 3}  # numbers that are drawn
+EXECUTED = "executed_action"
+MOST_OBSERVED, MOST_OF_ACTION = 6, 3  # numbers that are drawn
 PANEL_HEIGHT = 0.85  # inches
 
 
-# Of one policy in the first case, in the units of the env: what it observed before each step, the
-# action that was executed, and what its first guide advised; without what it does not have.
+# Of one policy in the first case, in the units of the env: what it observed before each step, by
+# entry, the action that was executed, and what its first guide advised; without what it does not
+# have.
 Trace = dict[str, list[list[float]]]
-OBSERVATION, ACTION, ADVISED = "observation", "action", "advice"
+ACTION, ADVISED = "action", "guide_action"
 
 
 class InTime(Picture):
@@ -54,20 +57,11 @@ class InTime(Picture):
         after: TensorDictBase,
     ) -> None:
         """Note a step of each policy; see `Picture.watch`."""
-        key, units = env.action_key, given_units(env)
-        shown: dict[str, Tensor] = {}
-        if OBSERVED in before:
-            shown[OBSERVATION] = before[OBSERVED]
-        shown[ACTION] = after[EXECUTED] if EXECUTED in after else before[key]
-        if ADVICE in before:
-            space = ActionSpace(env.full_action_spec[key], env.batch_dims)
-            shown[ADVISED] = space.actions(before[ADVICE][..., 0, :])
-        for kind, values in shown.items():
-            is_action = kind != OBSERVATION
-            given = units.denormalise(values) if is_action and units is not None else values
-            flat = given.reshape(env.batch_size.numel(), -1)[:, : MOST[kind]].double().tolist()
+        shown = _observed(env, before) | _actions(env, before, after)
+        for title, values in shown.items():
+            flat = values.reshape(env.batch_size.numel(), -1).double().tolist()
             for name, row in rows.items():
-                self.traces.setdefault(name, {}).setdefault(kind, []).append(flat[row])
+                self.traces.setdefault(name, {}).setdefault(title, []).append(flat[row])
 
     def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
         """Draw the picture.
@@ -81,6 +75,50 @@ class InTime(Picture):
         if shown:
             rate = next(iter(results.values())).rate
             draw_in_time(shown, folder / "in_time.png", rate=rate)
+
+
+def _observed(env: EnvBase, before: TensorDictBase) -> dict[str, Tensor]:
+    """Return the first numbers that an env shows, [*batch, n], by the title of their entry.
+
+    They are those of `observation`; without it, those of all entries but pictures. Choices are in
+    the numbering of the env.
+    """
+    base, left = _base(env), MOST_OBSERVED
+    choices, shown = observed_choices(base), dict[str, Tensor]()
+    keys = list(base.observation_spec.keys(True, True))
+    for key in ["observation"] if "observation" in keys else keys:
+        value = None if key[0] in NOT_OBSERVED else before.get(key, None)
+        if value is None or value.dtype == torch.uint8 or not left:
+            continue
+        numbers = choices[key](value) if key in choices else value
+        numbers = numbers.reshape(*env.batch_size, -1)[..., :left]
+        shown[key if isinstance(key, str) else ".".join(key)] = numbers
+        left -= numbers.shape[-1]
+    return shown
+
+
+def _actions(env: EnvBase, before: TensorDictBase, after: TensorDictBase) -> dict[str, Tensor]:
+    """Return the executed action and the advice of the first guide, as the env takes actions."""
+    key, units, own = env.action_key, given_units(env), space_of(_base(env), env.action_key)
+    values = [part.values for part in env.modules() if isinstance(part, DiscreteActions)]
+    space = ActionSpace(env.full_action_spec[key], env.batch_dims)
+
+    def numbers(action: Tensor) -> Tensor:
+        """Return the value of an agent's choice of a number, else its action."""
+        return values[0][action].unsqueeze(-1) if values else action
+
+    given = {ACTION: after[EXECUTED] if EXECUTED in after else numbers(before[key])}
+    if ADVISED in before:
+        given[ADVISED] = numbers(space.actions(before[ADVISED][..., 0, :]))
+    shown = {}
+    for title, action in given.items():
+        sent = own.executed(action if units is None else units.denormalise(action))
+        shown[title] = sent.reshape(*env.batch_size, -1)[..., :MOST_OF_ACTION]
+    return shown
+
+
+def _base(env: EnvBase) -> EnvBase:
+    return env.base_env if isinstance(env, TransformedEnv) else env
 
 
 def draw_in_time(traces: Mapping[str, Trace], path: style.Target, *, rate: float) -> None:
