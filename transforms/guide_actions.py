@@ -1,8 +1,8 @@
 """Advice: the actions of guides as an additional observation, as in COIL.
 
 It is the central idea of the paper (section 3, equation 97): the agent sees what its guides would
-do and learns by reward when to listen. `Guides` runs several guides as one module, `GuideCache`
-keeps the advice for the states in which episodes begin, and `GuideActions` is the transform.
+do and learns by reward when to listen. `Guides` runs several guides as one module, and
+`GuideActions` is the transform.
 """
 
 from __future__ import annotations
@@ -246,53 +246,12 @@ def _converted(value: Tensor, dtype: torch.dtype) -> Tensor:
     return value.to(dtype) if value.is_floating_point() else value
 
 
-class GuideCache:
-    """Cache of advice by observation, for the first states of episodes.
-
-    Episodes start in few states, and a lookup is much faster than a guide on one row.
-
-    Args:
-        max_rows: number of observations to keep; once there are more, no new ones are cached.
-    """
-
-    def __init__(self, max_rows: int = 256) -> None:
-        self.max_rows = max_rows
-        self.index: dict[bytes, int] = {}
-        self.advice: Tensor | None = None
-
-    def __call__(self, data: TensorDictBase, advise: Callable[[TensorDictBase], Tensor]) -> Tensor:
-        """Return the advice for data.
-
-        Args:
-            data: observations, [N].
-            advise: returns the advice [N, ...] for data [N]; called on new rows only.
-        """
-        leaves = data.values(True, True)
-        columns = [each.reshape(len(data), each.shape[1:].numel()).double() for each in leaves]
-        keys = [row.tobytes() for row in torch.cat(columns, 1).cpu().numpy()]
-        new: dict[bytes, int] = {}
-        for row, key in enumerate(keys):
-            if key not in self.index:
-                new.setdefault(key, row)
-        if len(self.index) + len(new) > self.max_rows:
-            return advise(data)
-        if new:
-            advice = advise(data[list(new.values())])
-            self.advice = advice if self.advice is None else torch.cat([self.advice, advice])
-            self.index.update(zip(new, range(len(self.index), len(self.advice)), strict=True))
-        if self.advice is None:
-            return advise(data)
-        return self.advice[[self.index[key] for key in keys]]
-
-
 class GuideActions(ActionTransform):
     """Write the action of each guide into the observation.
 
     The agent is free to use the advice. A guide is a TensorDictModule that reads observations of
     the env and writes an action, or anything else that `ControllerGuide` takes. Guides run in
-    evaluation mode, without gradients, on a copy of the data. If all guides have the attribute
-    `pure = True` (the action is a deterministic function of the guide's input entries of the same
-    row), the advice for the first states of episodes is cached. With discrete actions the advice is
+    evaluation mode, without gradients, on a copy of the data. With discrete actions the advice is
     one-hot; a guide may write an index, in the numbering of the env, or a one-hot vector. Advice is
     clamped to the bounds of the action. Guides act in the unit of the env; behind
     `NormalisedAction` the advice is normalised.
@@ -337,8 +296,6 @@ class GuideActions(ActionTransform):
         super().__init__(in_keys=module.in_keys, out_keys=module.out_keys)
         self.guides, self.action_key = module.eval(), module.action_key
         self.needs_past = bool(self.supplied or module.memories)
-        pure = all(getattr(guide, "pure", False) for guide in module.guides.values())
-        self._cache = GuideCache() if pure and not self.needs_past else None
         if any(map(_is_by_row, module.guides.values())):
             self.passed = (self.out_keys[0],)
         self._checked: set[str] = set()
@@ -471,15 +428,7 @@ class GuideActions(ActionTransform):
         # TorchRL discards the other rows; in a large batch nearly every step resets a few rows.
         rows: tuple[Tensor, ...] = mask.reshape(tensordict.batch_size).nonzero(as_tuple=True)
         data = tensordict_reset.select(*self.in_keys, strict=False)[rows]
-        written: State = {}
-        if self._cache is not None and not self.rests:
-            before = self.calls
-            data.set(self.out_keys[0], self._cache(data, self._advice))
-            # What is kept counts too: a process that resumes the run has kept nothing yet.
-            self.calls = before + data.numel() * len(self.names)
-        else:
-            state = self.first(data)
-            written = self.observe(data, {**state, "row": self.rows[rows]})
+        written = self.observe(data, {**self.first(data), "row": self.rows[rows]})
         written[self.out_keys[0]] = data[self.out_keys[0]]
         for key, part in written.items():
             whole = part.new_zeros((*tensordict_reset.batch_size, *part.shape[1:]))

@@ -37,7 +37,6 @@ class ConePlannerGuide(TensorDictModuleBase):
     """
 
     in_keys, out_keys = ["cones", "cone_count", "steering"], ["action"]
-    pure = True
 
     def __init__(
         self,

@@ -71,7 +71,6 @@ class SplineGuide(TensorDictModuleBase):
         torch.Size([4, 5, 1])
     """
 
-    pure = True
     spacing = 1.0  # m between targets
     cones = 8  # nearest ones of each side that make pairs
     midpoints, targets = 24, 12  # at most

@@ -60,7 +60,6 @@ class SplineMemoryGuide(SplineGuide):
         torch.Size([4, 5, 1, 1])
     """
 
-    pure = False
     cones, midpoints = 16, 64
 
     def __init__(

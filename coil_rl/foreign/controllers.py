@@ -225,7 +225,7 @@ class ControllerGuide(HostedGuide):
         guide = _guide_of(thing, title, keys, dict(options or {}))
         self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
         super().__init__()
-        self.guide, self.pure = guide, getattr(called(thing), "pure", False)
+        self.guide = guide
         self.title = title
 
     @property

@@ -117,7 +117,6 @@ class ClassicGuide(TensorDictModuleBase):
     """
 
     in_keys, out_keys = ["observation"], ["action"]
-    pure = True
 
     def __init__(
         self,

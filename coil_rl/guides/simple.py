@@ -35,8 +35,6 @@ class ConstantGuide(TensorDictModuleBase):
         out_key: entry for the action, [*batch, A].
     """
 
-    pure = True
-
     def __init__(
         self,
         value: float | Sequence[float],

@@ -1,12 +1,11 @@
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import ConstantGuide, SplineGuide, ZeroGuide
-from coil_rl.transforms.guide_actions import GuideActions, GuideCache
+from coil_rl.transforms.guide_actions import GuideActions
 
 
 def cone_env(guides, cars=6):
@@ -40,36 +39,3 @@ def test_guide_changes_no_other_entry():
     reset = cone_env({"overwrite": guide}).reset()
     assert "action" not in reset
     assert (reset["observation"] <= 1).all()
-
-
-def rows(*values):
-    x = torch.tensor(values, dtype=torch.float32)
-    return TensorDict({"x": torch.stack([x, 2 * x], -1), "n": x.long()}, [len(values)])
-
-
-def test_cached_advice_equals_the_function_and_the_cache_is_bounded():
-    calls = []
-
-    def function(data):
-        calls.append(len(data))
-        return data["x"].sum(-1, keepdim=True) + data["n"].unsqueeze(-1)
-
-    def check(cache, *batches):
-        calls.clear()
-        advice = [cache(data, function) for data in batches]
-        called_with = sum(calls)
-        for one, data in zip(advice, batches, strict=True):
-            assert torch.equal(one, function(data))
-        return called_with
-
-    batches = [rows(1, 2, 1), rows(2), rows(3, 3, 1), rows(), rows(1, 2, 3)]
-    assert check(GuideCache(), *batches) == 3, "the function should be called for new rows only"
-    small = GuideCache(max_rows=3)
-    assert check(small, rows(1, 2, 3), rows(1, 4), rows(1, 4)) == 3 + 2 * 2
-    assert len(small.index) == 3
-
-
-def test_cache_tells_observations_apart_by_every_digit():
-    near = TensorDict({"observation": torch.tensor([[1.0], [1.0 + 1e-6]])}, [2])
-    advice = GuideCache()(near, lambda data: 1000 * data["observation"])
-    assert torch.equal(advice, 1000 * near["observation"])

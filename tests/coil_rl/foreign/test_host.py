@@ -28,7 +28,7 @@ SOURCE = """
 from tensordict.nn import TensorDictModuleBase
 
 class Guide(TensorDictModuleBase):
-    in_keys, out_keys, pure = ["steering"], ["action"], True
+    in_keys, out_keys = ["steering"], ["action"]
 
     def __init__(self, gain=1.0):
         super().__init__()
