@@ -53,12 +53,9 @@ class Spline:
         return self._at(self.knots[-1] * fraction)
 
     def equidistant(self, samples: int) -> Tensor:
-        """Evaluate from first to last point in equal steps: [D, samples, *batch], m."""
-        ends = self.values[:, :1], self.values[:, -1:]
-        if samples <= 2:
-            return torch.cat(ends[:samples], 1)
+        """Evaluate from first to last point in equal steps: [D, samples, *batch] m, at least 3."""
         inner = constant(tuple(k / (samples - 1) for k in range(1, samples - 1)), self.knots)
-        return torch.cat([ends[0], self.along(inner), ends[1]], 1)
+        return torch.cat([self.values[:, :1], self.along(inner), self.values[:, -1:]], 1)
 
     def _at(self, u: Tensor) -> Tensor:
         """Evaluate at parameters u [S, *batch] m, from 0 to the last knot: [D, S, *batch], m."""

@@ -78,11 +78,9 @@ class ActionDelay(Delay):
         if not self.max_lag:
             return state
         past, age = self._of_memory("past"), self._of_memory("age")
-        values = torch.cat([state[past], data[self.action_key].unsqueeze(data.ndim)], data.ndim)
         lag = torch.minimum(state[self._of_memory("lag")], state[age])
-        data.set(self.action_key, self._late(values, lag))
         return {
             **state,
             age: (state[age] + 1).clamp(max=self.max_lag),
-            past: values.narrow(data.ndim, 1, self.max_lag),
+            past: self._delay(data, self.action_key, state[past], lag),
         }

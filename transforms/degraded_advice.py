@@ -7,7 +7,7 @@ shuffled and removed advice are placebos.
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cache, cached_property
 from typing import Annotated, Literal
 
@@ -18,7 +18,7 @@ from torchrl.data import Composite, TensorSpec
 
 from coil_rl.ranges import Finite, Interval, NonNegative, checked
 from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested_key
-from coil_rl.transforms.guide_transform import SeededGenerator
+from coil_rl.transforms.guide_transform import DrawingLink, SeededGenerator
 from coil_rl.transforms.link import Link, State
 
 LONGEST_DELAY = 10_000  # steps, each of which is kept for every row
@@ -74,14 +74,6 @@ class DegradedAdvice(Link):
         if self.space is None:
             return advice
         return self.space.normalise(advice.movedim(-2, 0)).movedim(0, -2)
-
-    def _missing(self, data: TensorDictBase) -> Tensor:
-        """Return NaN for all numbers of the advice, which the data need not have yet."""
-        if self.key in data.keys(True, True):
-            return torch.full_like(data[self.key], torch.nan)
-        spec = self.parent.full_observation_spec[self.key]
-        shape = (*data.batch_size, *spec.shape[len(self.parent.batch_size) :])
-        return torch.full(shape, torch.nan, dtype=spec.dtype, device=data.device)
 
     def _write(self, tensordict: TensorDictBase, advice: Tensor) -> TensorDictBase:
         """Write normalised advice in its own unit and within its bounds."""
@@ -175,37 +167,21 @@ class PartialAdvice(DegradedAdvice):
         return advice.clamp(min=0) if self.side == "left" else advice.clamp(max=0)
 
 
-class _DrawnAdvice(DegradedAdvice):
+class _DrawnAdvice(DrawingLink, DegradedAdvice):
     """Base class of advice changed by random numbers, drawn anew at every step.
 
     Args:
         seed: of the draws.
     """
 
-    _sample: Callable[..., Tensor]  # draws numbers of a shape with a generator
-
     def __init__(self, seed: int, key: NestedKey) -> None:
         super().__init__(key)
         self.rng = SeededGenerator(seed)
 
-    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
-        """Draw the numbers of the first step, see `SeededGenerator.draw`."""
-        return self._drawn(data, after_reset=reset is not None and "_reset" in reset)
-
-    def sent(self, data: TensorDictBase, state: State) -> State:
-        """Draw the numbers of the next step."""
-        return self._drawn(data)
-
-    def _drawn(self, data: TensorDictBase, *, after_reset: bool = False) -> State:
-        """Draw one number for each number of the advice."""
-        shape = self._missing(data).shape
-        (draws,) = self.rng.draw(self._sample, [shape], after_reset=after_reset)
-        return {"draws": draws}
-
     def observe(self, data: TensorDictBase, state: State) -> State:
         """Write the degraded advice; the state is what was drawn for it."""
         advice = self._normalised(data)
-        self._write(data, self.changed(advice, state["draws"].to(advice)))
+        self._write(data, self.changed(advice, state[self.key].to(advice)))
         return {}
 
     def changed(self, advice: Tensor, draws: Tensor) -> Tensor:
@@ -220,8 +196,6 @@ class NoisyAdvice(_DrawnAdvice):
     Args:
         sigma: standard deviation in normalised actions.
     """
-
-    _sample = staticmethod(torch.randn)
 
     def __init__(
         self, sigma: NonNegative = 0.3, seed: int = 0, key: NestedKey = "guide_action"
@@ -242,7 +216,7 @@ class RandomAdvice(_DrawnAdvice):
         high: largest number, in normalised actions, finite and more than `low`.
     """
 
-    _sample = staticmethod(torch.rand)
+    sample = staticmethod(torch.rand)
 
     def __init__(
         self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action"
@@ -347,7 +321,7 @@ class DelayedAdvice(DegradedAdvice):
         """Return that nothing was advised before, as NaN; the first advice takes its place."""
         if not self.slots:
             return {}
-        missing = self._missing(data).unsqueeze(-3)
+        missing = torch.full_like(self._entry(data, self.key), torch.nan).unsqueeze(-3)
         return {self.memory_key: missing.repeat_interleave(self.slots, -3)}
 
     def observe(self, data: TensorDictBase, state: State) -> State:

@@ -71,17 +71,19 @@ class Delay(Disturbance):
         shape = (*tensordict.batch_size, 1)
         return self.rng.sample(drawn, shape).to(tensordict.device or "cpu")
 
-    def _late(self, values: Tensor, lag: Tensor) -> Tensor:
-        """Return the value of each row that is `lag` [*batch, 1] steps old.
+    def _delay(self, data: TensorDictBase, key: NestedKey, past: Tensor, lag: Tensor) -> Tensor:
+        """Replace an entry by that of some steps ago; return the past for the next step.
 
         Args:
-            values: [*batch, max_lag + 1, *shape], oldest first.
-            lag: at most `max_lag`.
+            past: of the entry, [*batch, max_lag, *shape], oldest first.
+            lag: steps, [*batch, 1], at most `max_lag`.
         """
-        dim = lag.ndim - 1
+        dim = data.ndim
+        values = torch.cat([past, data[key].unsqueeze(dim)], dim)
         rest = values.shape[dim + 1 :]
         index = (self.max_lag - lag).reshape(*lag.shape, *(1 for _ in rest))
-        return values.gather(dim, index.expand(*lag.shape, *rest)).squeeze(dim)
+        data.set(key, values.gather(dim, index.expand(*lag.shape, *rest)).squeeze(dim))
+        return values.narrow(dim, 1, self.max_lag)
 
     @property
     def state(self) -> Mapping[NestedKey, TensorSpec]:

@@ -17,7 +17,6 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
-from torchrl.envs import EnvBase, Transform
 
 from coil_rl.transforms.action_space import (
     ActionSpace,
@@ -298,7 +297,6 @@ class GuideActions(ActionTransform):
         self.needs_past = bool(self.supplied or module.memories)
         if any(map(_is_by_row, module.guides.values())):
             self.passed = (self.out_keys[0],)
-        self._checked: set[str] = set()
         self.calls = 0  # number of actions that guides were asked for
         self.rests = False
 
@@ -322,6 +320,11 @@ class GuideActions(ActionTransform):
         batch = self.parent.batch_size
         return torch.arange(batch.numel(), device=self.parent.device).reshape(*batch, 1)
 
+    @cached_property
+    def _checked(self) -> set[str]:
+        """Names of the guides whose actions were checked in this env."""
+        return set()
+
     @property
     def names(self) -> list[str]:
         """Names of the guides, one per row of the advice."""
@@ -332,11 +335,6 @@ class GuideActions(ActionTransform):
         self.rests, self.supplied = True, []
         self.in_keys: list[NestedKey] = []
         self.needs_past = bool(self.guides.memories)
-
-    def set_container(self, container: Transform | EnvBase) -> None:
-        """Set the env, which may have other rows than an earlier one."""
-        super().set_container(container)
-        self._checked = set()
 
     def train(self, mode: bool = True) -> GuideActions:
         """Set the training mode; guides stay in evaluation mode."""

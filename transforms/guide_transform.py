@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.ranges import Index, checked
 from coil_rl.transforms.action_space import ActionTransform, nested_key
+from coil_rl.transforms.link import Link, State
 
 Schedule = Callable[[float], float]
 
@@ -182,3 +183,26 @@ class SeededGenerator(nn.Module):
     def set_extra_state(self, state: Tensor) -> None:
         """Restore the generator."""
         self.generator.set_state(state.cpu())
+
+
+class DrawingLink(Link):
+    """Base class of links that change their `in_keys` by random numbers, drawn anew at each step.
+
+    The state in `observe` is one number for each number of these entries, by their keys.
+    """
+
+    sample: Callable[..., Tensor] = staticmethod(torch.randn)  # of a shape, with a generator
+    rng: SeededGenerator
+
+    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
+        """Draw the numbers of the first step, see `SeededGenerator.draw`."""
+        return self._drawn(data, after_reset=reset is not None and "_reset" in reset)
+
+    def sent(self, data: TensorDictBase, state: State) -> State:
+        """Draw the numbers of the next step."""
+        return self._drawn(data)
+
+    def _drawn(self, data: TensorDictBase, *, after_reset: bool = False) -> State:
+        shapes = [self._entry(data, key).shape for key in self.in_keys]
+        draws = self.rng.draw(self.sample, shapes, after_reset=after_reset)
+        return dict(zip(self.in_keys, draws, strict=True))

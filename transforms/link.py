@@ -94,6 +94,14 @@ class Link(Transform):
             if isinstance(getattr(type(self), name, None), cached_property):
                 del self.__dict__[name]
 
+    def _entry(self, data: TensorDictBase, key: NestedKey) -> Tensor:
+        """Return an entry of the data; zeros where they do not have it yet."""
+        if key in data.keys(True, True):
+            return data[key]
+        zero = self.parent.full_observation_spec[key].zero()
+        row = zero[(0,) * self.parent.batch_dims]
+        return row.expand(*data.batch_size, *row.shape)
+
     def _state_in(self, data: TensorDictBase) -> State:
         found = ((key, data.get(key, None)) for key in self._keys)
         return {key: value for key, value in found if value is not None}

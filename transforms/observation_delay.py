@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 
-import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, NonTensor, TensorSpec
 
@@ -94,9 +93,7 @@ class ObservationDelay(Delay):
         after = {lag: state[lag]}
         for key in self.late_keys:
             past = self._past_key(key)
-            values = torch.cat([state[past], data[key].unsqueeze(data.ndim)], data.ndim)
-            after[past] = values.narrow(data.ndim, 1, self.max_lag)
-            data.set(key, self._late(values, state[lag]))
+            after[past] = self._delay(data, key, state[past], state[lag])
         return after
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -14,12 +14,12 @@ from torchrl.envs import EnvBase, Transform
 from coil_rl.ranges import NonNegative, checked
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.disturbance import Disturbance
-from coil_rl.transforms.guide_transform import SeededGenerator
+from coil_rl.transforms.guide_transform import DrawingLink, SeededGenerator
 from coil_rl.transforms.link import State
 
 
 @checked
-class ObservationNoise(Disturbance):
+class ObservationNoise(DrawingLink, Disturbance):
     """Observations with Gaussian noise, independent at every step, within the bounds of the entry.
 
     Noise takes no number out of its bounds; one that lies outside without it is noisy inwards only.
@@ -78,19 +78,6 @@ class ObservationNoise(Disturbance):
             if isinstance(part, Transform) and not isinstance(part, Disturbance):
                 changed += part.out_keys
         return {key: found[key] for key in self.in_keys if key in found and key not in changed}
-
-    def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
-        """Draw the noise of the first step."""
-        return self._drawn(data, after_reset=reset is not None and "_reset" in reset)
-
-    def sent(self, data: TensorDictBase, state: State) -> State:
-        """Draw the noise of the next step."""
-        return self._drawn(data)
-
-    def _drawn(self, data: TensorDictBase, *, after_reset: bool = False) -> State:
-        shapes = [data[key].shape for key in self.in_keys]
-        draws = self.rng.draw(torch.randn, shapes, after_reset=after_reset)
-        return dict(zip(self.in_keys, draws, strict=True))
 
     def observe(self, data: TensorDictBase, state: State) -> State:
         """Write the noisy entries; the state is their noise."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,10 +30,8 @@ def demo(path: Path) -> None:
     from coil_rl.envs import shipped_track
 
     print(f"demo: one lap on a track that {POLICY} has never seen ...", flush=True)
-    laps = driven()
-    agent, guide = laps[:1], laps[1:]
-    lines, crashed = {}, {}
-    for name, result in (("guide alone", guide), ("agent with its advice", agent)):
+    laps, lines, crashed = driven(), {}, {}
+    for name, result in zip(("guide alone", "agent with its advice"), laps.values(), strict=True):
         lines[name] = [pose[:, :2] for pose in result.histories["pose"]]
         crashed[name] = [bool(episode["crashed"]) for episode in result.episodes]
     draw_lines([shipped_track(TRACK)], lines, path, crashed=crashed)
@@ -40,7 +39,7 @@ def demo(path: Path) -> None:
         f"demo: {path} shows where both drove: the guide steers for the middle between the cones "
         "that it sees, the agent observes what the guide would do and decides itself."
     )
-    for name, result in (("guide", guide), ("agent", agent)):
+    for name, result in laps.items():
         print(f"demo: {name}: {_outcome(result)}")
     print("Next:")
     for command in (
@@ -52,32 +51,17 @@ def demo(path: Path) -> None:
         print(f"  {command}")
 
 
-def driven() -> EvaluationResult:
-    """Return one lap of the agent, and one of its guide, on the same track."""
-    from importlib import resources
-
-    import torch
-
-    from coil_rl.config.assemble import assemble
-    from coil_rl.config.folder import folder_of, read_config
-    from coil_rl.config.parts import build_evaluation
+def driven() -> dict[str, EvaluationResult]:
+    """Return one lap of the guide, and one of the agent, on the same track."""
+    from coil_rl.config.python import pretrained
     from coil_rl.guides.simple import FollowAdvice
-    from coil_rl.run.parts import TEST
-    from coil_rl.run.policy_batch import Acting, OnRows, traced
 
-    folder = folder_of(POLICY)
-    config = read_config(folder, "run")
-    torch.set_num_threads(config.threads)
-    file = str(resources.files("coil_rl.envs") / "tracks" / "test" / f"{TRACK}.csv")
-    tracks = {"_target_": "coil_rl.envs.load_tracks", "path": file}
-    config.env.laps = 1
-    config.evaluation.env.tracks = tracks
-    config.evaluation.cases = [TRACK]
-    run = assemble(config, folder)
-    env = run.make_env(2, TEST)
-    policy = OnRows([Acting(traced(run.policy(env)), whole=True), Acting(FollowAdvice(env))])
-    evaluation = build_evaluation(config, {"pose": ("info", "pose")})
-    return evaluation.run(env, policy)
+    run = pretrained(POLICY)
+    evaluation = replace(run.trial.evaluation, record={"pose": ("info", "pose")})
+    env: Any = run.trial.env(1)  # of the first case, which is `TRACK`
+    env.base_env.laps = 1
+    policies = {"guide": FollowAdvice(env), "agent": run.policy(env)}
+    return {name: evaluation.run(env, policy) for name, policy in policies.items()}
 
 
 def _outcome(result: EvaluationResult) -> str:

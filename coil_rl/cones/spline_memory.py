@@ -8,7 +8,6 @@ entries of the data (see `GuideMemory`), so the guide works for any batch.
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from coil_rl.cones.spline import TARGET_REACHED, SplineGuide
@@ -17,6 +16,7 @@ from coil_rl.envs.sight import SIGHT, Frame, field_of_view_margin
 from coil_rl.envs.sorting import append, first_come, rows_in_use
 from coil_rl.envs.splines import slots_in_use
 from coil_rl.ranges import Positive, checked
+from coil_rl.transforms.guide_memory import primer_of
 
 TARGETS, CONES = 192, 128  # room for targets, and for the cones of a side
 CANDIDATES = 15  # targets of one path, at most
@@ -70,23 +70,25 @@ class SplineMemoryGuide(SplineGuide):
         sharpness: float = 1.8,
         max_steering: float = 80.0,
     ) -> None:
-        # Name, shape in a row, first value, type.
+        # What a row remembers at the start of an episode.
         self.memory = {
-            "path_pose": ((3,), 0.0, torch.float32),  # m, m, radians
-            "path_targets": ((2, TARGETS), NOWHERE, torch.float32),
-            "path_target_count": ((1,), 0, torch.int64),
-            "path_passed": ((TARGETS,), False, torch.bool),
+            "path_pose": torch.zeros(3),  # m, m, radians
+            "path_targets": torch.full((2, TARGETS), NOWHERE),
+            "path_target_count": torch.zeros(1, dtype=torch.int64),
+            "path_passed": torch.zeros(TARGETS, dtype=torch.bool),
             # Ever seen: coordinate, side, cone. Half precision is enough to tell cones, and resets
             # cost less.
-            "path_cones": ((2, 2, CONES), NOWHERE, torch.float16),
-            "path_cone_count": ((2,), 0, torch.int64),
+            "path_cones": torch.full((2, 2, CONES), NOWHERE, dtype=torch.float16),
+            "path_cone_count": torch.zeros(2, dtype=torch.int64),
             # At the last step: coordinate, cone, side.
-            "path_in_view": ((2, self.cones, 2), NOWHERE, torch.float32),
+            "path_in_view": torch.full((2, self.cones, 2), NOWHERE),
         }
         if oddities:
-            self.memory["path_chosen"] = ((2,), NOWHERE, torch.float32)
-            self.memory["path_gate"] = ((2,), NOWHERE, torch.float32)  # middle of the circle
-            self.memory["path_in_circle"] = ((1,), False, torch.bool)
+            self.memory |= {
+                "path_chosen": torch.full((2,), NOWHERE),
+                "path_gate": torch.full((2,), NOWHERE),  # middle of the circle
+                "path_in_circle": torch.zeros(1, dtype=torch.bool),
+            }
         keys = ["cones", "cone_count", "steering", "motion", "is_init", *self.memory]
         super().__init__("quadratic", 1.0, gain, sharpness, max_steering, keys)
         self.out_keys: list[NestedKey] = [*self.out_keys, *(("next", key) for key in self.memory)]
@@ -94,11 +96,7 @@ class SplineMemoryGuide(SplineGuide):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare the memory."""
-        specs, first = {}, {}
-        for key, (shape, value, dtype) in self.memory.items():
-            specs[key] = Unbounded(shape, dtype=dtype)
-            first[key] = value
-        return TensorDictPrimer(specs, default_value=first, expand_specs=True)
+        return primer_of(self.memory)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the advice and the memory for the next step."""
