@@ -60,8 +60,7 @@ class ActionDelay(Delay):
         """Lag and age of each row, and the actions on their way."""
         if not self.max_lag:
             return {}
-        shape, device = (*self.parent.batch_size, 1), self.parent.device
-        age = Bounded(0, self.max_lag, shape, device=device, dtype=torch.int64)
+        age = self._of_rows(Bounded, 0, self.max_lag, dtype=torch.int64)
         return {**super().state, self._of_memory("age"): age}
 
     @cached_property

@@ -62,5 +62,4 @@ class AdviceDropout(GuideTransform):
     @property
     def state(self) -> Mapping[NestedKey, TensorSpec]:
         """Whether there is advice in this episode."""
-        shape, device = (*self.parent.batch_size, 1), self.parent.device
-        return {"advice_given": Binary(1, shape=shape, device=device, dtype=torch.bool)}
+        return {"advice_given": self._of_rows(Binary, 1, dtype=torch.bool)}

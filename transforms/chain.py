@@ -38,7 +38,8 @@ class Chain(nn.Module):
     def __init__(self, env: Env, policy: nn.Module, links: Iterable[Link] | None = None) -> None:
         super().__init__()
         links = links_of(env.transform) if links is None else links
-        self.links = nn.ModuleList([*links, Remembered(env, policy)])
+        self._links: list[Link] = [*links, Remembered(env, policy)]
+        self.links = nn.ModuleList(self._links)
         self.policy, self.action_key = policy, env.action_key
         # Transforms hold a weak reference to their env; the tuple keeps it from being a submodule.
         self._env = (env,)
@@ -57,11 +58,11 @@ class Chain(nn.Module):
         Args:
             data: without entries, [*batch].
         """
-        return [link.first(data) for link in self._links()]
+        return [link.first(data) for link in self._links]
 
     def remembered(self, past: Past) -> dict[tuple[int, NestedKey], Tensor]:
         """Return what changes within an episode, by the number of the link and the key."""
-        parts = enumerate(zip(self._links(), past, strict=True))
+        parts = enumerate(zip(self._links, past, strict=True))
         return {(n, key): own[key] for n, (link, own) in parts if not link.constant for key in own}
 
     def forward(self, data: TensorDictBase, past: Past | None) -> tuple[TensorDictBase, Past]:
@@ -71,7 +72,7 @@ class Chain(nn.Module):
             data: what the env writes, [*batch]; all else is written into it.
             past: state after the step before; None: an episode begins.
         """
-        links, states = list(self._links()), Past()
+        links, states = self._links, Past()
         for number, link in enumerate(links):
             state = link.first(data) if past is None else past[number]
             states.append(link.observe(data, state))
@@ -81,11 +82,6 @@ class Chain(nn.Module):
             states[number] = links[number].act(data, states[number])
         pairs = zip(links, states, strict=True)
         return data, [link.sent(data, state) for link, state in pairs]
-
-    def _links(self) -> Iterator[Link]:
-        for link in self.links:
-            if isinstance(link, Link):
-                yield link
 
 
 def links_of(transform: Transform, *, tensors: bool = False) -> Iterator[Link]:
@@ -115,11 +111,8 @@ def _links_in(transform: Transform, tensors: bool) -> Iterator[Link]:
     if isinstance(transform, Compose):
         for each in transform.transforms:
             yield from _links_in(each, tensors)
-    elif isinstance(transform, Link):
-        if not isinstance(transform, Disturbance):
-            yield transform
     elif not isinstance(transform, LEFT_OUT):
-        yield Other(transform, tensors)
+        yield transform if isinstance(transform, Link) else Other(transform, tensors)
 
 
 class Other(Link):

@@ -8,7 +8,7 @@ was given is `("next", "executed_action")` [*batch, *A], in the unit of the agen
 learners with replay learn from the executed action where the agent could have chosen it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Unpack
 
 import torch
@@ -74,13 +74,6 @@ class CombinedAction(GuideTransform):
                 "or Takeover, which replaces the agent's action in some steps"
             )
         return super().transform_observation_spec(observation_spec)
-
-    def _spec_of_rows(
-        self, kind: Callable[..., TensorSpec], *bounds: float, dtype: torch.dtype
-    ) -> TensorSpec:
-        """Return the spec of one number a row, [*batch, 1]."""
-        shape = (*self.parent.batch_size, 1)
-        return kind(*bounds, shape=shape, device=self.parent.device, dtype=dtype)
 
 
 class ResidualAction(CombinedAction):
@@ -222,7 +215,7 @@ class AdaptiveMixedAction(CombinedAction):
     def state(self) -> Mapping[NestedKey, TensorSpec]:
         """The weight of the agent."""
         dtype = self.action_space.dtype
-        return {WEIGHT: self._spec_of_rows(Bounded, self.low, self.high, dtype=dtype)}
+        return {WEIGHT: self._of_rows(Bounded, self.low, self.high, dtype=dtype)}
 
 
 class _ActionSwitch(CombinedAction):
@@ -273,7 +266,7 @@ class _ActionSwitch(CombinedAction):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add `agent_acts` and what is remembered and recorded."""
         observation_spec = super().transform_observation_spec(observation_spec)
-        observation_spec[ACTS] = self._spec_of_rows(Binary, 1, dtype=torch.bool)
+        observation_spec[ACTS] = self._of_rows(Binary, 1, dtype=torch.bool)
         return observation_spec
 
 
@@ -394,4 +387,4 @@ class JumpStart(_ActionSwitch):
     @property
     def state(self) -> Mapping[NestedKey, TensorSpec]:
         """The remaining steps of the guide."""
-        return {REMAINING: self._spec_of_rows(Unbounded, dtype=torch.int64)}
+        return {REMAINING: self._of_rows(Unbounded, dtype=torch.int64)}

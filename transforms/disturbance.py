@@ -90,8 +90,7 @@ class Delay(Disturbance):
         """The lag of each row and its past."""
         if not self.max_lag:
             return {}
-        shape, device = (*self.parent.batch_size, 1), self.parent.device
-        lag = Bounded(0, self.max_lag, shape, device=device, dtype=torch.int64)
+        lag = self._of_rows(Bounded, 0, self.max_lag, dtype=torch.int64)
         specs: dict[NestedKey, TensorSpec] = {self._of_memory("lag"): lag}
         dim = len(self.parent.batch_size)
         for key, spec in self._kept().items():

@@ -7,10 +7,11 @@ the env is given. See `Chain`, which applies them without an env.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import TypeAlias
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
@@ -93,6 +94,13 @@ class Link(Transform):
         for name in [*self.__dict__]:
             if isinstance(getattr(type(self), name, None), cached_property):
                 del self.__dict__[name]
+
+    def _of_rows(
+        self, kind: Callable[..., TensorSpec], *bounds: float, dtype: torch.dtype
+    ) -> TensorSpec:
+        """Return the spec of one number for each row of the env, [*batch, 1]."""
+        shape = (*self.parent.batch_size, 1)
+        return kind(*bounds, shape=shape, device=self.parent.device, dtype=dtype)
 
     def _entry(self, data: TensorDictBase, key: NestedKey) -> Tensor:
         """Return an entry of the data; zeros where they do not have it yet."""
