@@ -19,7 +19,7 @@ from torch import Tensor
 
 from coil_rl.envs.boundaries import Boundaries
 from coil_rl.envs.constants import constant
-from coil_rl.envs.limits import Degrees, Laps, Seconds, Starts
+from coil_rl.envs.limits import Degrees, Kept, Laps, Seconds, Starts
 from coil_rl.envs.meanings import of_cones
 from coil_rl.envs.reward import LapsEnv
 from coil_rl.envs.seeded_env import declare_specs
@@ -118,7 +118,7 @@ class ConeTrackEnv(LapsEnv):
         sight: Annotated[float, Interval(gt=0, le=100)] = SIGHT,
         hold_boundary: bool = False,
         finish_in_sight: bool = False,
-        kept_cones: Count = 16,
+        kept_cones: Kept = 16,
         speed: Positive = 2.0,
         car_length: Positive = 2.0,
         max_steering: Degrees = 80.0,

@@ -4,9 +4,8 @@ The self-evolving spline of definition A.2 is the path of `SplineMemoryGuide`, f
 sees a new cone. A spline is stored as its positions and second derivatives at its knots, which
 determine the curve between two knots. The cubic smoothing spline and the least-squares parabola are
 therefore one class with two fits. Both take `points` [D, K, *batch] in m, in order, K >= 2, and
-`count` [*batch], the number of real points of each row; other slots may hold any finite number.
-They raise ValueError for other shapes. A row with two points yields a line, with one a constant,
-with none zeros.
+`count` [*batch], the number of real points of each row; other slots may hold any finite number. A
+row with two points yields a line, with one a constant, with none zeros.
 
 The batch comes last, so each step of a recursion over the K slots is one contiguous operation for
 the whole batch. Sums are taken in slot order and no branch depends on data, so a row's result
@@ -25,7 +24,7 @@ import torch
 from torch import Tensor
 
 from coil_rl.envs.constants import constant, flat_index
-from coil_rl.ranges import checked
+from coil_rl.ranges import NonNegative, checked
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ class Spline:
 
 @checked
 def spline_fit(
-    spline: Literal["cubic", "quadratic"], smoothing: float
+    spline: Literal["cubic", "quadratic"], smoothing: NonNegative
 ) -> Callable[[Tensor, Tensor], Spline]:
     """Return the fit of that name, a function of points and their count.
 
@@ -112,8 +111,6 @@ def smoothing_spline(points: Tensor, count: Tensor, smoothing: float) -> Spline:
         count: [*batch], number of real points of each row.
         smoothing: lambda, m^3; 0 interpolates.
     """
-    if not 0 <= smoothing < math.inf:
-        raise ValueError(f"smoothing={smoothing} must be a finite number of at least 0")
     real, knots, step, h = _chords(points, count)
     # In float32 the system of close points is solved with errors that are a hundred times those of
     # the points themselves.
@@ -252,11 +249,6 @@ def _chords(points: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor, Tens
         Masks of real slots [K+1, *batch], of which the last one is never real; knots [K, *batch] m;
         steps from each point to the next one [D, K-1, *batch] m; and their lengths [K-1, *batch] m.
     """
-    if points.ndim < 2 or points.shape[1] < 2 or points.shape[2:] != count.shape:
-        raise ValueError(
-            f"points {list(points.shape)} and count {list(count.shape)} must be [D, K, *batch] and "
-            "[*batch], K >= 2"
-        )
     real = (count - constant(range(points.shape[1] + 1), points[0])).clamp_(0, 1)
     second = real[1:-1]
     step = (points[:, 1:] - points[:, :-1]) * second

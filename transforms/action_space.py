@@ -347,12 +347,8 @@ class ActionTransform(Link):
         """Units in which the env gets the action, None if they are those of its spec."""
         return given_units(self.parent)
 
-    def given_vectors(self, action: Tensor) -> Tensor:
-        """Return an action, as the env was given it, as vectors of `action_space` [..., A].
-
-        They are within its bounds, to which an env clamps what it is given.
-        """
-        vectors = self.action_space.vectors(action)
+    def observed(self, vectors: Tensor) -> Tensor:
+        """Return vectors [..., A] in the unit of the env as the agent sees them, within bounds."""
         if self.given_units is not None:
             vectors = self.given_units.normalise(vectors)
         return self.action_space.clamp(vectors)

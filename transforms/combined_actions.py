@@ -8,6 +8,7 @@ was given is `("next", "executed_action")` [*batch, *A], in the unit of the agen
 learners with replay learn from the executed action where the agent could have chosen it.
 """
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Unpack
 
@@ -55,9 +56,9 @@ class CombinedAction(GuideTransform):
         data.set(self.action_key, executed).set(EXECUTED, executed)
         return state
 
+    @abstractmethod
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
         """Return the action to execute, [*batch, *A], by the observation and the agent's action."""
-        raise NotImplementedError
 
     @property
     def records(self) -> Mapping[NestedKey, TensorSpec]:
@@ -249,9 +250,9 @@ class _ActionSwitch(CombinedAction):
         agent = tensordict[ACTS].reshape(tensordict.batch_size)
         return torch.where(expand_as_right(agent, action), action, advice)
 
+    @abstractmethod
     def _agent_acts(self, data: TensorDictBase, state: State) -> Tensor:
         """Return whether the agent acts in a state, [*batch, 1], in training."""
-        raise NotImplementedError
 
     def observe(self, data: TensorDictBase, state: State) -> State:
         """Write whether the agent acts."""

@@ -7,6 +7,7 @@ shuffled and removed advice are placebos.
 
 import math
 import warnings
+from abc import abstractmethod
 from collections.abc import Mapping
 from functools import cache, cached_property
 from typing import Annotated, Literal
@@ -184,9 +185,9 @@ class _DrawnAdvice(DrawingLink, DegradedAdvice):
         self._write(data, self.changed(advice, state[self.key].to(advice)))
         return {}
 
+    @abstractmethod
     def changed(self, advice: Tensor, draws: Tensor) -> Tensor:
         """Return the degraded advice, [*batch, n_guides, A], by the numbers that were drawn."""
-        raise NotImplementedError
 
 
 @checked

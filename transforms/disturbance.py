@@ -7,6 +7,7 @@ has its own delays.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -98,9 +99,9 @@ class Delay(Disturbance):
             specs[key] = spec.unsqueeze(dim).expand(size).clone()
         return specs
 
+    @abstractmethod
     def _kept(self) -> Mapping[NestedKey, TensorSpec]:
         """Return for each key of the memory the spec of what it keeps of one step."""
-        raise NotImplementedError
 
     def _check_env(self, spec: Composite) -> None:
         """Raise a `ValueError` for an env in which the past cannot be kept."""

@@ -468,12 +468,6 @@ class GuideActions(ActionTransform):
             raise unfit_action(name, guide, action, batch, self.guide_space, str(error)) from None
         return self.observed(advice)
 
-    def observed(self, advice: Tensor) -> Tensor:
-        """Return advice in the unit of the env as the agent sees it."""
-        if self.given_units is None:
-            return advice
-        return self.action_space.clamp(self.given_units.normalise(advice))
-
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the advice and the memory.
 

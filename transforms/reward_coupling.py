@@ -64,8 +64,9 @@ class RewardCoupling(GuideTransform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         reward = next_tensordict[self.reward_key]
         space = self.action_space
-        action = space.normalise(self.given_vectors(tensordict[self.action_key]))
-        difference = action - space.normalise(self.advice(tensordict))
+        # An env clamps what it is given.
+        action = self.observed(space.vectors(tensordict[self.action_key]))
+        difference = space.normalise(action) - space.normalise(self.advice(tensordict))
         distance = torch.linalg.vector_norm(difference, self.order, -1, keepdim=True)
         distance = distance.to(reward.dtype)
         next_tensordict.set("task_reward", reward).set("guide_distance", distance)

@@ -18,7 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.limits import Degrees
+from coil_rl.envs.limits import Degrees, Kept
 from coil_rl.envs.recordings.cautions import about_demonstrations, cautions_about
 from coil_rl.envs.recordings.folders import RecordingError, files_of
 from coil_rl.envs.recordings.mcap_files import read_messages
@@ -134,7 +134,7 @@ class McapReplayEnv(EnvBase):
         spline: Literal["cubic", "quadratic"] = "cubic",
         smoothing: float = 0.1,
         smooth: Annotated[float, Interval(ge=-1e6, le=1e6)] = -0.1,
-        kept_cones: Count = 16,
+        kept_cones: Kept = 16,
         sight: Positive | None = None,
         speed: Positive = 0.15,
         car_length: Positive = 2 / 7,

@@ -121,8 +121,10 @@ class SimulatedRobotEnv(LapsEnv):
         self.start_in_finish = inside & (self.start_lap_start > NEVER)
         self._register_laps(reward)
         self.scan: Tensor = nn.Buffer(torch.full((num_envs, self.lidar.beams), torch.inf))
-        # The last scans, and the cones and their numbers that were perceived in them.
-        self._seen: tuple[Tensor, Tensor, Tensor] | None = None
+        # The cones that were perceived in it, and their number.
+        kept = self.perception.kept_cones
+        self.cones: Tensor = nn.Buffer(torch.zeros(num_envs, 2, kept, 2))
+        self.count: Tensor = nn.Buffer(torch.zeros(num_envs, 2, dtype=torch.int64))
         declare_specs(self, self._reset())
         self.set_seed(seed)
 
@@ -132,22 +134,16 @@ class SimulatedRobotEnv(LapsEnv):
         max_steering = math.degrees(self.max_steering)
         return of_cones(self.perception.sight, max_steering, self.perception.scale)
 
-    def set_extra_state(self, state: Tensor) -> None:
-        """Restore the state of the generator; the scans are perceived anew."""
-        super().set_extra_state(state)
-        self._seen = None
-
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         # All robots draw and measure, reset or not: the order of random numbers must not depend on
         # the data.
         rows, _ = self._begin(tensordict)
         mask = torch.zeros(self.batch_size, dtype=torch.bool).index_fill(0, rows, True)
         standing = self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams)
-        known = self._seen is not None and self._seen[0] is self.scan
         self.scan = torch.where(mask.unsqueeze(-1), self._measure(standing, rows), self.scan)
         self.memory.reset(mask)
         # Robots that are not reset see what they saw, which does not change their memory.
-        return self._first(self._perceive(rows if known else None))
+        return self._first(self._perceive(rows))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
@@ -205,13 +201,10 @@ class SimulatedRobotEnv(LapsEnv):
         scans = self.scan if rows is None else self.scan[rows]
         found, number = self.perception(scans.numpy(), self.lidar.angles.numpy())
         cones, count = torch.from_numpy(found).float(), torch.from_numpy(number)
-        if rows is not None and self._seen is not None:
-            _, all_cones, all_counts = self._seen
-            cones, count = (
-                all_cones.index_copy(0, rows, cones),
-                all_counts.index_copy(0, rows, count),
-            )
-        self._seen = self.scan, cones, count
+        if rows is not None:
+            cones = self.cones.index_copy(0, rows, cones)
+            count = self.count.index_copy(0, rows, count)
+        self.cones, self.count = cones, count
         observation, self.valid = self.memory(cones, count)
         return {"observation": observation, "cones": cones, "cone_count": count}
 

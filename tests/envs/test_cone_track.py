@@ -237,6 +237,7 @@ def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
         ({"reward": {"finish": 1e300}}, "reward.finish=1e[+]300 must be between -1e6 and 1e6"),
         ({"reward": {"speed": 1.0}}, r"reward has no weight \['speed'\]; it has finish, second"),
         ({"smoothing": -0.1}, "smoothing=-0.1 must be"),
+        ({"kept_cones": 1}, "kept_cones=1 must be at least 2"),
         ({"tracks": []}, "at least one track"),
     ],
 )

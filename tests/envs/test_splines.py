@@ -243,16 +243,3 @@ def test_gradients_agree_with_finite_differences(fit, n: int) -> None:
     assert torch.autograd.gradcheck(lambda p: tensors(fit(p, count))[1:], points.requires_grad_())
     fractions = torch.tensor([[0.3, 0.2], [0.9, 0.7]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda p, at: fit(p, count).along(at), (points, fractions))
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda points, count: smoothing_spline(points, count[:3], 0.1), "count"),
-        (lambda points, count: least_squares_parabola(points[:, :1], count), "K >= 2"),
-        (lambda points, count: smoothing_spline(points, count, -1), "smoothing=-1"),
-    ],
-)
-def test_invalid_arguments_are_rejected(call, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        call(*random_batch())
