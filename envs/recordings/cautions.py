@@ -58,7 +58,8 @@ def _about_view(env: "McapReplayEnv", number: int, recording: Recording) -> str:
         problems.append("no scan shows both boundaries")
     elif both_valid.mean() < MOST:
         problems.append(f"only {both_valid.mean():.0%} of the scans show both boundaries")
-    ordered = in_order(env.cones[scans].cpu().numpy(), env.count[scans].cpu().numpy())
+    known = env.known[scans]
+    ordered = in_order(known["cones"].cpu().numpy(), known["cone_count"].cpu().numpy())
     if len(ordered) and ordered.mean() < IN_ORDER:
         problems.append(
             "the left cones lie left of the right ones (the scans are mirrored, as of a laser that "
@@ -190,7 +191,7 @@ def about_demonstrations(env: "McapReplayEnv") -> Iterator[str]:
     _check_different(env.recordings)
     for row, recording in enumerate(env.recordings):
         scans = env.scans_of(row)
-        stale, standing = env.stale[scans], env.standing[scans]
+        stale, standing = env.known["stale"][scans], env.known["standing"][scans]
         number, usable = len(stale), int((~stale & ~standing).sum())
         kept, total = kept + usable, total + number
         line = (

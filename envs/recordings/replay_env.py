@@ -187,30 +187,32 @@ class McapReplayEnv(EnvBase):
         Args:
             kept_cones: K.
         """
-        views = [_perceive(each, self.perception, kept_cones) for each in self.recordings]
-        self.cones = _joined([cones for cones, _ in views])
-        self.count = _joined([count for _, count in views])
-        poses = [_from_start(each.poses(self.car_length)) for each in self.recordings]
-        self.pose = _joined([pose.astype(np.float32) for pose in poses])
-        self.seconds = _joined([each.seconds.astype(np.float32) for each in self.recordings])
+        known: Any = torch.cat([self._known_of(each, kept_cones) for each in self.recordings])
         # Much faster here, for all scans at once, than step by step.
-        samples, valid = self.memory.estimate(self.cones, self.count)
+        samples, valid = self.memory.estimate(known["cones"], known["cone_count"])
         self.samples: Tensor = nn.Buffer(samples, persistent=False)
         self.valid: Tensor = nn.Buffer(valid, persistent=False)
-        steering = [self._recorded_steering(each) for each in self.recordings]
-        self.recorded = _joined([np.nan_to_num(angle) for angle, _ in steering])
-        self.stale = _joined([np.isnan(angle) for angle, _ in steering])
-        self.standing = _joined([speed < STANDS for _, speed in steering])
+        self.known: TensorDictBase = known.to(self.device)
 
-    def _recorded_steering(
-        self, recording: Recording
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Return the recorded action and speed (m/s) at each scan, [N]; NaN where unknown."""
-        if recording.commands is None:
-            unknown = np.full(len(recording.ranges), np.nan)
-            return unknown.astype(np.float32), unknown
-        angle, _, speed = recording.steering(self.speed, self.car_length)
-        return (angle / self.max_steering).clip(-1, 1).astype(np.float32), speed
+    def _known_of(self, recording: Recording, kept_cones: int) -> TensorDict:
+        """Return what is known of each scan of a recording, [N], by the names of the entries."""
+        cones, count = _perceive(recording, self.perception, kept_cones)
+        angle = speed = np.full(len(recording.ranges), np.nan)
+        if recording.commands is not None:
+            angle, _, speed = recording.steering(self.speed, self.car_length)
+        action = (angle / self.max_steering).clip(-1, 1).astype(np.float32)
+        known = {
+            "cones": cones,
+            "cone_count": count,
+            "pose": _from_start(recording.poses(self.car_length)).astype(np.float32),
+            "time": recording.seconds.astype(np.float32),
+            "recorded": np.nan_to_num(action),
+            "stale": np.isnan(action),
+            "standing": speed < STANDS,
+        }
+        return TensorDict(
+            {name: torch.from_numpy(each) for name, each in known.items()}, len(cones)
+        )
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: the env is deterministic."""
@@ -223,14 +225,14 @@ class McapReplayEnv(EnvBase):
         self.history = self.history.masked_fill(mask, 0)
         self.memory.reset(mask)
         # Rows that are not reset perceive their scan again, which does not change their memory.
-        return self._tensordict(self._perceive(), torch.zeros_like(self.history[0]))
+        return self._entries(torch.zeros_like(self.history[0]))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
         roughness = (action - recent_mean(self.history)).abs()
         self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
         self.steps = self.steps + 1
-        out = self._tensordict(self._perceive(), roughness)
+        out = self._entries(roughness)
         out["reward"] = out["info", "reward", "smooth"]
         done = (self.steps >= self.length).unsqueeze(-1)
         out["done"], out["truncated"] = done, done.clone()
@@ -241,43 +243,39 @@ class McapReplayEnv(EnvBase):
         """Return the index of each row's current scan among all scans [B]."""
         return self.first + torch.minimum(self.steps, self.length - 1)
 
-    def _perceive(self) -> dict[str, Tensor]:
-        """Update the memory with the current scans; return the entries that come from them."""
-        current = self._current()
-        cones, count = self.cones.index_select(0, current), self.count.index_select(0, current)
-        samples, valid = self.samples.index_select(3, current), self.valid.index_select(1, current)
-        observation, valid = self.memory.remember(samples, valid)
-        return {"observation": observation, "cones": cones, "cone_count": count, "valid": valid}
-
-    def _tensordict(self, view: dict[str, Tensor], roughness: Tensor) -> TensorDict:
-        """Put the entries of a reset or a step together.
+    def _entries(self, roughness: Tensor) -> TensorDict:
+        """Update the memory with the current scans; return the entries of a reset or a step.
 
         Args:
-            view: the entries that come from the scan.
             roughness: [B], |a - mean of the last 20 actions|.
         """
-        current, steering = self._current(), self.history[0].unsqueeze(-1)
-        stale, standing = self.stale[current], self.standing[current]
-        usable = ~stale & ~standing & (self.passes == 0) & (self.steps < self.length)
-        reward = {"smooth": self.smooth * roughness.unsqueeze(-1)}
+        current = self.first + torch.minimum(self.steps, self.length - 1)
+        known, steering = self.known[current], self.history[0].unsqueeze(-1)
+        samples, valid = self.samples.index_select(3, current), self.valid.index_select(1, current)
+        observation, valid = self.memory.remember(samples, valid)
+        usable = ~known["stale"] & ~known["standing"] & (self.passes == 0)
         info = {
             "scan": (current - self.first).unsqueeze(-1),
-            "time": self.seconds.index_select(0, current).unsqueeze(-1),
-            "pose": self.pose.index_select(0, current),
-            "valid": view["valid"],
+            "time": known["time"].unsqueeze(-1),
+            "pose": known["pose"],
+            "valid": valid,
             "smoothness": roughness.unsqueeze(-1),
-            "recorded": self.recorded[current].unsqueeze(-1),
-            "stale": stale.unsqueeze(-1),
-            "standing": standing.unsqueeze(-1),
-            "usable": usable.unsqueeze(-1),
+            "recorded": known["recorded"].unsqueeze(-1),
+            "stale": known["stale"].unsqueeze(-1),
+            "standing": known["standing"].unsqueeze(-1),
+            "usable": (usable & (self.steps < self.length)).unsqueeze(-1),
             "track": self.track.unsqueeze(-1),
-            "reward": TensorDict(reward, self.batch_size),
+            "reward": TensorDict({"smooth": self.smooth * roughness.unsqueeze(-1)}, known.shape),
         }
-        entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
-        entries["steering"] = steering
-        entries["info"] = TensorDict(info, self.batch_size, device=self.device)
-        entries["omega"] = (steering * self.max_steering).sin() * (self.speed / self.car_length)
-        return TensorDict(entries, self.batch_size, device=self.device)
+        entries: dict[str, Any] = {
+            "observation": observation,
+            "cones": known["cones"],
+            "cone_count": known["cone_count"],
+            "steering": steering,
+            "info": TensorDict(info, known.shape, device=self.device),
+            "omega": (steering * self.max_steering).sin() * (self.speed / self.car_length),
+        }
+        return TensorDict(entries, known.shape, device=self.device)
 
 
 def _scans(path: str, topic: str) -> int:
@@ -299,11 +297,6 @@ def _messages(path: Path, topic: str, states: tuple[tuple[int, int], ...]) -> in
         states: sizes and times of change of the files, which only keep the memory true.
     """
     return len(read_messages(path, [topic]).messages[topic])
-
-
-def _joined(parts: Sequence[NDArray[Any]]) -> Tensor:
-    """Return arrays end to end as a buffer that is not saved, as it follows from the recordings."""
-    return nn.Buffer(torch.from_numpy(np.concatenate(parts)), persistent=False)
 
 
 def _from_start(poses: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -71,9 +71,9 @@ def test_recorded_steering_is_learned_and_the_imitation_drives(folder):
 
     samples = checkpoint.load(folder / "three" / "dataset.pt")
     env = McapReplayEnv([folder / f"{name}.mcap" for name in "abc"], Perception(classifier()))
-    usable = ~env.stale & ~env.standing
+    usable = ~env.known["stale"] & ~env.known["standing"]
     # The samples are in the order of the rows, which are the recordings.
-    torch.testing.assert_close(samples["action"].squeeze(-1), env.recorded[usable])
+    torch.testing.assert_close(samples["action"].squeeze(-1), env.known["recorded"][usable])
     tracks = samples["info"]["track"].squeeze(-1)
     assert torch.bincount(tracks).tolist() == [33, 33, 12]
 
