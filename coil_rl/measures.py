@@ -228,28 +228,3 @@ def with_denominators(
         of_measures = {f"{name}_episodes": count[name] for name in partial}
         result.append({**row, "episodes": count["episodes"], **of_measures})
     return result
-
-
-def with_shares(
-    rows: Sequence[Mapping[str, Any]],
-    counts: Sequence[Mapping[str, int]],
-    columns: Mapping[str, Sequence[str]],
-) -> list[dict[str, Any]]:
-    """Return rows whose means over fewer episodes than ran say so, as `12.3 (4 of 8)`.
-
-    Args:
-        rows: of `summarise`.
-        counts: of `denominators`.
-        columns: heading and number format by name.
-    """
-    shown = []
-    for row, count in zip(rows, counts, strict=True):
-        cells = dict(row)
-        for name, (_, spec) in columns.items():
-            known, episodes = count.get(name, 0), count["episodes"]
-            if not 0 < known < episodes:
-                continue
-            number = "-" if math.isnan(row[name]) else format(row[name], spec)
-            cells[name] = f"{number} ({known} of {episodes})"
-        shown.append(cells)
-    return shown

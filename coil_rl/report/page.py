@@ -11,14 +11,13 @@ from itertools import chain
 from statistics import mean
 from typing import Any
 
-from coil_rl.measures import with_shares
 from coil_rl.record import UNTESTED
 from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning, points
 from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run, begun_with
 from coil_rl.report.sentences import REPORT
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
-from coil_rl.report.table import AUTO_FORMAT, TABLES, Table, fitted, return_format
+from coil_rl.report.table import AUTO_FORMAT, TABLES, Table, return_format
 
 Block = Table | str  # a table or a paragraph
 
@@ -39,12 +38,11 @@ def section(
     """
     columns = _columns(comparison, rows, against)
     shown = with_cells(rows, comparison.spec)
-    columns = fitted(shown, columns)
-    shown = with_shares(shown, [group.counts() for group in comparison.groups], columns)
+    counts = [group.counts() for group in comparison.groups]
     parts = _parts(comparison, TERM, "term of the reward", AUTO_FORMAT)
     parts += _parts(comparison, PER_STEP, "reward of a step", ".3f")
     cases = cases_table(comparison.groups, "report_cases.csv")
-    return [Table(shown, columns), *parts, cases]
+    return [Table(shown, columns, counts), *parts, cases]
 
 
 def _columns(

@@ -22,6 +22,7 @@ P_FORMAT = "p"  # of a p-value, see `p_text`
 
 Rows = Sequence[Mapping[str, object]]
 Columns = Mapping[str, Sequence[str]]
+Counts = Sequence[Mapping[str, int]]
 
 
 def return_format(returns: Iterable[float]) -> str:
@@ -67,10 +68,10 @@ class Table:
     Args:
         rows: as `markdown_table` takes them.
         columns: as `markdown_table` takes them.
+        counts: as `markdown_table` takes them.
 
     Attributes:
         headings: of the columns.
-        specs: number formats of the columns, none of them `AUTO_FORMAT`.
         numeric: whether each column has only numbers; none has without rows.
         cells: of each row.
 
@@ -78,28 +79,27 @@ class Table:
         ValueError: if no row has a column, or a number does not fit its format.
     """
 
-    def __init__(self, rows: Rows, columns: Columns) -> None:
+    def __init__(self, rows: Rows, columns: Columns, counts: Counts = ()) -> None:
         keys = dict.fromkeys(chain.from_iterable(rows))
-        for key, (heading, _) in columns.items():
+        self.headings, self.numeric = list[str](), list[bool]()
+        of_columns = []
+        for key, (heading, spec) in columns.items():
             if rows and key not in keys:
                 raise ValueError(
                     f"No row has {key!r} for the column {heading!r}; "
                     f"the rows have: {', '.join(keys)}."
                 )
-        values = [[plain(row.get(key)) for row in rows] for key in columns]  # by column
-        self.headings = [heading for heading, _ in columns.values()]
-        self.specs = [
-            return_format(filter(_is_number, column)) if spec == AUTO_FORMAT else spec
-            for (_, spec), column in zip(columns.values(), values, strict=True)
-        ]
-        self.numeric = [
-            bool(column) and all(_is_missing(value) or _is_number(value) for value in column)
-            for column in values
-        ]
-        of_columns = [
-            [_cell(value, spec) for value in column]
-            for column, spec in zip(values, self.specs, strict=True)
-        ]
+            values = [plain(row.get(key)) for row in rows]
+            if spec == AUTO_FORMAT:
+                spec = return_format(filter(_is_number, values))
+            for row, count in enumerate(counts):
+                if 0 < count.get(key, 0) < count["episodes"]:
+                    number = _cell(values[row], spec).text
+                    values[row] = f"{number} ({count[key]} of {count['episodes']})"
+            self.headings.append(heading)
+            are_numbers = (_is_missing(value) or _is_number(value) for value in values)
+            self.numeric.append(bool(values) and all(are_numbers))
+            of_columns.append([_cell(value, spec) for value in values])
         self.cells = list(map(list, zip(*of_columns, strict=True)))
 
     def __str__(self) -> str:
@@ -139,7 +139,7 @@ def _cell(value: object, spec: str) -> Cell:
     return Cell(text, float(number[0].replace(",", "")) if number else None)
 
 
-def markdown_table(rows: Rows, columns: Columns) -> str:
+def markdown_table(rows: Rows, columns: Columns, counts: Counts = ()) -> str:
     """Return a Markdown table.
 
     Args:
@@ -147,6 +147,8 @@ def markdown_table(rows: Rows, columns: Columns) -> str:
             stays as it is, so a cell may be a formatted "31.2 ± 0.4".
         columns: heading (with unit) and number format by key, in the order of the table. The format
             `AUTO_FORMAT` is that of `return_format` for the column.
+        counts: of each row the number of `episodes`, and by key in how many of them there is a
+            number; a mean over fewer of them says so, as `12.3 (4 of 8)`.
 
     Raises:
         ValueError: if no row has a column, or a number does not fit its format.
@@ -163,17 +165,7 @@ def markdown_table(rows: Rows, columns: Columns) -> str:
         | guide  |    31.2 | no    |
         | agent  |       - | yes   |
     """
-    return str(Table(rows, columns))
-
-
-def fitted(rows: Rows, columns: Columns) -> dict[str, tuple[str, str]]:
-    """Return columns with a number format in place of each `AUTO_FORMAT`.
-
-    Args:
-        columns: as `markdown_table` takes them.
-    """
-    table = Table(rows, columns)
-    return dict(zip(columns, zip(table.headings, table.specs, strict=True), strict=True))
+    return str(Table(rows, columns, counts))
 
 
 def write_csv(rows: Sequence[Mapping[str, object]], path: str | os.PathLike[str]) -> None:

@@ -26,13 +26,12 @@ from coil_rl.measures import (
     denominators,
     summarise,
     with_denominators,
-    with_shares,
 )
 from coil_rl.output import decoration, progress, say
 from coil_rl.report import Returns, markdown_table
 from coil_rl.report.pictures import Picture
 from coil_rl.report.statistics import difference
-from coil_rl.report.table import AUTO_FORMAT, fitted, return_format
+from coil_rl.report.table import AUTO_FORMAT, return_format
 from coil_rl.run.beside import Driver
 from coil_rl.run.evaluation import EvaluationResult, evaluate_policy
 from coil_rl.run.parts import TEST, EnvMaker
@@ -269,8 +268,7 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, said: Sequenc
     count = len(trial.evaluation.cases)
     shown = [count <= MAX_CASES or row["case"] == MEAN_CASE for row in judgement.table]
     rows, counts = (list(compress(each, shown)) for each in (judgement.table, judgement.counts))
-    columns = fitted(rows, columns)
-    page = [markdown_table(with_shares(rows, counts, columns), columns)]
+    page = [markdown_table(rows, columns, counts)]
     page += SENTENCES.said("many_cases", cases=count, shown=MAX_CASES)
     if has_policy and count > 1 and trial.guides:
         # An env that fails with random actions costs this sentence, and not the results.

@@ -9,7 +9,6 @@ from coil_rl.measures import (
     measures_of,
     summarise,
     with_denominators,
-    with_shares,
 )
 
 
@@ -95,7 +94,7 @@ def test_summary_is_the_mean_over_cases_of_means_over_episodes():
     assert [row["clearance"] for row in rows] == [0.1, 0.4, 0.1]
 
 
-def test_mean_over_fewer_episodes_says_so():
+def test_episodes_of_a_mean_over_fewer_are_counted():
     measures = {"lap_time": Measure("lap"), "speed": Measure("speed")}
     lap_times = [5.0, math.nan, 7.0, math.nan]
     episodes = [
@@ -104,18 +103,12 @@ def test_mean_over_fewer_episodes_says_so():
     ]
     rows, counts = summarise(episodes, measures), denominators(episodes, measures)
     assert [count["lap_time"] for count in counts] == [1, 1, 2]
-    columns = {"lap_time": ("lap", ".1f"), "speed": ("speed", ".1f")}
-    shown = with_shares(rows, counts, columns)
-    assert [row["lap_time"] for row in shown] == ["5.0 (1 of 2)", "7.0 (1 of 2)", "6.0 (2 of 4)"]
-    assert shown[-1]["speed"] == 2
     full = with_denominators(rows, counts)
     assert list(full[0]) == [*rows[0], "episodes", "lap_time_episodes"]
     assert (full[-1]["episodes"], full[-1]["lap_time_episodes"]) == (4, 2)
-    rows[-1]["lap_time"] = math.nan
-    assert with_shares(rows, counts, columns)[-1]["lap_time"] == "- (2 of 4)"
     complete = [{**episode, "lap_time": 1.0} for episode in episodes]
     rows, counts = summarise(complete, measures), denominators(complete, measures)
-    assert with_denominators(rows, counts) == rows == with_shares(rows, counts, columns)
+    assert with_denominators(rows, counts) == rows
 
 
 def test_mean_over_cases_counts_a_measure_by_the_episodes_that_have_it():

@@ -50,6 +50,19 @@ def test_returns_have_enough_digits_in_any_unit(returns, expected):
     assert [line.strip("| ") for line in lines] == expected
 
 
+def test_mean_over_fewer_episodes_says_so():
+    rows = [{"lap": lap, "speed": 2.0} for lap in (5.0, 7.25, math.nan, math.nan)]
+    counts = [{"episodes": 4, "lap": known, "speed": 4} for known in (4, 3, 2, 0)]
+    columns = {"lap": ("lap", AUTO_FORMAT), "speed": ("speed", ".1f"), "of": ("of", "")}
+    lines = markdown_table([row | {"of": ""} for row in rows], columns, counts).splitlines()[2:]
+    assert [[cell.strip() for cell in line.split("|")[1:3]] for line in lines] == [
+        ["5.00", "2.0"],
+        ["7.25 (3 of 4)", "2.0"],
+        ["- (2 of 4)", "2.0"],
+        ["-", "2.0"],
+    ]
+
+
 def test_text_cannot_break_the_table():
     rows = [{"lap": "31.2 ± 0.4"}, {"lap": "a|b\nc"}, {"lap": "1_000"}]
     heading, _, *lines = markdown_table(rows, {"lap": ("|a - g|", ".1f")}).splitlines()
