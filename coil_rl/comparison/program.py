@@ -31,7 +31,8 @@ from coil_rl.errors import UserError
 from coil_rl.programs import app, folders
 
 CONFIG_DIR = ("--config-dir", "-cd")  # of Hydra: a folder with YAML files of the user
-OWN = ("minutes", "folder", "seed", "tune")  # arguments that coil-train does not have
+NUMBERS: dict[str, type[float] | type[int]] = {"minutes": float, "seed": int}
+OWN = (*NUMBERS, "folder", "tune")  # arguments that coil-train does not have
 
 
 def compare(arguments: Sequence[str]) -> None:
@@ -42,9 +43,7 @@ def compare(arguments: Sequence[str]) -> None:
     """
     own, words = _split(arguments)
     folder = folders.folder(own["folder"]) if "folder" in own else None
-    minutes, seed = _number(own, "minutes", 2.0), _number(own, "seed", 0)
-    if not isinstance(seed, int):
-        raise UserError(f"seed={own['seed']} must be a whole number")
+    numbers: dict[str, Any] = {key: _number(key, own[key]) for key in own.keys() & NUMBERS.keys()}
     # Mistakes, in a moment.
     composed = compose_train([*words, "method=coil_anchored", "run_dir=unused"])
     # They import PyTorch, which takes seconds.
@@ -59,8 +58,7 @@ def compare(arguments: Sequence[str]) -> None:
     place = new_folder("compare") if folder is None else folder
     others = [argument for argument in arguments if not argument.startswith("folder=")]
     command = shlex.join(["coil-compare", *others, f"folder={place}"])
-    given = Named(words, nodes)
-    comparison = Comparison(given, place, minutes=float(minutes), seed=seed, command=command)
+    comparison = Comparison(Named(words, nodes), place, command=command, **numbers)
     try:
         comparison.run()
     except KeyboardInterrupt:
@@ -91,14 +89,13 @@ def _split(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     return own, words
 
 
-def _number(own: dict[str, str], key: str, default: float) -> float:
+def _number(key: str, text: str) -> float:
     """Return a number of the command line."""
-    if key not in own:
-        return default
-    value = _value(key, own[key])
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 2**63:
-        raise UserError(f"{key}={own[key]} must be a number, at least 0")
-    return value
+    try:
+        return NUMBERS[key](text)
+    except ValueError as error:
+        kind = "a whole number" if NUMBERS[key] is int else "a number"
+        raise UserError(f"{key}={text} must be {kind}") from error
 
 
 def _value(key: str, text: str) -> Any:

@@ -6,7 +6,9 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from omegaconf import DictConfig
 from torchrl.envs import EnvBase
 
@@ -127,13 +129,13 @@ def measure(plain: Mapping[str, DictConfig], overhead: float) -> Pace:
         length = _length(env, follow)
         env = make_env.plain(EPISODES, TEST)
         length = max(length, _length(env, uniform(env)))
-        guided = _stepped(*make_env.guided(ROWS, TEST))
+        guided, _ = _stepped(*make_env.guided(ROWS, TEST))
         env = make_env.plain(ROWS, TEST)
-        clock = _stepped(env, uniform(env))
-        step = clock.seconds / ROWS
-        learning = {name: _frame(config) + clock.waiting / ROWS for name, config in plain.items()}
+        seconds, waiting = _stepped(env, uniform(env))
+        step = seconds / ROWS
+        learning = {name: _frame(config) + waiting / ROWS for name, config in plain.items()}
     learning = {name: max(frame, step) for name, frame in learning.items()}
-    return Pace(step, max(guided.seconds / ROWS - step, 0.0), learning, length, overhead)
+    return Pace(step, max(guided / ROWS - step, 0.0), learning, length, overhead)
 
 
 def _length(env: EnvBase, policy: Policy) -> float:
@@ -145,42 +147,27 @@ def _length(env: EnvBase, policy: Policy) -> float:
     return float(steps.mean())
 
 
-class Clock:
-    """Time of pieces of work that does not depend on what else the machine does.
+def seconds_of(laps: ArrayLike) -> tuple[float, float]:
+    """Return the mean seconds of a piece of work, and those that it waits.
 
-    It is the processor's time of this process, and what even the fastest piece waited besides, such
-    as for a process or a device.
+    They do not depend on what else the machine does: it is the processor's time of this process,
+    and what even the fastest piece waited besides, such as for a process or a device.
+
+    Args:
+        laps: seconds of each piece, on the wall and of the processor, [pieces, 2].
     """
-
-    def __init__(self) -> None:
-        self.laps: list[tuple[float, float]] = []  # on the wall, and of the processor
-        self.begun = time.perf_counter(), time.process_time()
-
-    def lap(self) -> None:
-        """End a piece."""
-        now = time.perf_counter(), time.process_time()
-        self.laps.append((now[0] - self.begun[0], now[1] - self.begun[1]))
-        self.begun = now
-
-    @property
-    def waiting(self) -> float:
-        """Seconds that a piece waits."""
-        return max(min((wall - own for wall, own in self.laps), default=0.0), 0.0)
-
-    @property
-    def seconds(self) -> float:
-        """Mean seconds of a piece."""
-        return sum(own for _, own in self.laps) / max(len(self.laps), 1) + self.waiting
+    wall, own = np.asarray(laps).T
+    waiting = max(float((wall - own).min()), 0.0)
+    return float(own.mean()) + waiting, waiting
 
 
-def _stepped(env: EnvBase, policy: Policy) -> Clock:
-    """Return the clock of some steps of all rows; the first step may prepare something."""
-    steps = itertools.islice(episodes(env, policy), STEPS + 1)
-    next(steps)
-    clock = Clock()
-    for _ in steps:
-        clock.lap()
-    return clock
+def _stepped(env: EnvBase, policy: Policy) -> tuple[float, float]:
+    """Return `seconds_of` steps of all rows; the first step may prepare something."""
+    times = [
+        (time.perf_counter(), time.process_time())
+        for _ in itertools.islice(episodes(env, policy), STEPS + 1)
+    ]
+    return seconds_of(np.diff(times, axis=0))
 
 
 def _frame(config: DictConfig) -> float:
