@@ -109,12 +109,8 @@ def ours(
     Returns:
         The deterministic policy, and the gradient steps per CPU second of the updates.
     """
-    torch.manual_seed(seed)
-    env = normalised_env(env_id, values["envs"], seed)
-    units = given_units(env)
-    learner = our_learner(algorithm, env, values, seed)
-    rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
-    stopwatch, steps = updates_of(learner, "update"), 0.0
+    learner, rollout, stopwatch = our_training(algorithm, env_id, values, seed)
+    units, steps = given_units(rollout.env), 0.0
     for count in range(frames // rollout.frames):
         metrics = learner.update(rollout.collect(), count * rollout.frames / frames)
         epochs = values.get("epochs", 0)
@@ -127,6 +123,17 @@ def ours(
         return action if units is None else units.denormalise(action)
 
     return act, per_second(steps, stopwatch)
+
+
+def our_training(
+    algorithm: str, env_id: str, values: Mapping[str, Any], seed: int
+) -> tuple[PPO | SAC | DQN, Rollout, Stopwatch]:
+    """Return our learner, its rollout and the CPU time of its updates; see `ours`."""
+    torch.manual_seed(seed)
+    env = normalised_env(env_id, values["envs"], seed)
+    learner = our_learner(algorithm, env, values, seed)
+    rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
+    return learner, rollout, updates_of(learner, "update")
 
 
 def normalised_env(env_id: str, envs: int, seed: int = 0) -> EnvBase:
@@ -178,13 +185,7 @@ def theirs(
     algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int
 ) -> tuple[Act, float]:
     """Train the learner of Stable-Baselines3; see `ours`."""
-    from stable_baselines3.common.env_util import make_vec_env
-
-    # Its default, rgb_array, makes LunarLander slower and slower: particles are added, but no
-    # picture removes them.
-    envs = make_vec_env(env_id, values["envs"], seed=seed, env_kwargs={"render_mode": None})
-    model = their_learner(algorithm, envs, values, seed)
-    stopwatch = updates_of(model, "train")
+    model, stopwatch = their_training(algorithm, env_id, values, seed)
     model.learn(frames)
     steps = model._n_updates
     if algorithm == "ppo":  # which counts epochs
@@ -194,6 +195,19 @@ def theirs(
         return torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])
 
     return act, per_second(steps, stopwatch)
+
+
+def their_training(
+    algorithm: str, env_id: str, values: Mapping[str, Any], seed: int
+) -> tuple[Any, Stopwatch]:
+    """Return the learner of Stable-Baselines3 and the CPU time of its updates; see `ours`."""
+    from stable_baselines3.common.env_util import make_vec_env
+
+    # Its default, rgb_array, makes LunarLander slower and slower: particles are added, but no
+    # picture removes them.
+    envs = make_vec_env(env_id, values["envs"], seed=seed, env_kwargs={"render_mode": None})
+    model = their_learner(algorithm, envs, values, seed)
+    return model, updates_of(model, "train")
 
 
 def their_learner(algorithm: str, envs: Any, values: Mapping[str, Any], seed: int) -> Any:

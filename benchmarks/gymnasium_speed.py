@@ -8,14 +8,10 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
 
-import torch
-
-from benchmarks.beside_sb3 import VALUES, normalised_env, our_learner, their_learner
+from benchmarks.beside_sb3 import VALUES, our_training, their_training
 from benchmarks.timing import Row, Stopwatch, median_ratio, medians
-from coil_rl.run.rollout import Rollout
 
 ENVS = ("Pendulum-v1", "CartPole-v1", "LunarLanderContinuous-v3")
-Work = tuple[Callable[[], Any], Stopwatch]  # a batch and its updates, and the time of the latter
 
 
 def measure_gymnasium(args: Namespace) -> list[Row]:
@@ -37,10 +33,14 @@ def measure_gymnasium(args: Namespace) -> list[Row]:
 
 def compared(args: Namespace, env_id: str, values: dict[str, Any]) -> Row:
     """Return the speeds of both on an env, and the ratios of the whole and of its parts."""
-    subjects = {"ours": ours(env_id, values), "sb3": theirs(env_id, values)}
+    learner, rollout, own = our_training("ppo", env_id, values, 0)
+    model, their = their_training("ppo", env_id, values, 0)
     frames = values["envs"] * values["steps"]
-    rates: dict[str, list[float]] = {name: [] for name in subjects}
-    parts: dict[str, list[float]] = {}
+    subjects: dict[str, tuple[Callable[[], Any], Stopwatch]] = {
+        "ours": (lambda: learner.update(rollout.collect()), own),
+        "sb3": (lambda: model.learn(frames, reset_num_timesteps=False), their),
+    }
+    rates: dict[str, list[float]] = {}
     for work, _ in subjects.values():
         work()
     for _ in range(args.repeats):
@@ -50,35 +50,11 @@ def compared(args: Namespace, env_id: str, values: dict[str, Any]) -> Row:
             work()
             seconds = time.process_time() - start
             updates = stopwatch.seconds["updates"]
-            rates[name].append(frames / seconds)
-            parts.setdefault(f"{name} collection", []).append(frames / (seconds - updates))
-            parts.setdefault(f"{name} update", []).append(frames / updates)
-    row: Row = {f"{name} (frames/s)": rate for name, rate in medians(rates).items()}
-    row["ratio"] = median_ratio(rates["ours"], rates["sb3"])
-    for part in ("collection", "update"):
-        row[f"ratio, {part}"] = median_ratio(parts[f"ours {part}"], parts[f"sb3 {part}"])
-    return {**row, "rounds": rates}
-
-
-def ours(env_id: str, values: dict[str, Any]) -> Work:
-    """Return a batch and its updates of our learner."""
-    torch.manual_seed(0)
-    env = normalised_env(env_id, values["envs"])
-    learner = our_learner("ppo", env, values, seed=0)
-    rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
-    stopwatch = Stopwatch(time.process_time)
-    stopwatch.wrap(learner, "update", "updates")
-    return lambda: learner.update(rollout.collect()), stopwatch
-
-
-def theirs(env_id: str, values: dict[str, Any]) -> Work:
-    """Return a batch and its updates of the learner of Stable-Baselines3."""
-    from stable_baselines3.common.env_util import make_vec_env
-
-    # Its default, rgb_array, makes LunarLander slower and slower.
-    envs = make_vec_env(env_id, values["envs"], seed=0, env_kwargs={"render_mode": None})
-    model = their_learner("ppo", envs, values, seed=0)
-    stopwatch = Stopwatch(time.process_time)
-    stopwatch.wrap(model, "train", "updates")
-    frames = values["envs"] * values["steps"]
-    return lambda: model.learn(frames, reset_num_timesteps=False), stopwatch
+            rates.setdefault(name, []).append(frames / seconds)
+            rates.setdefault(f"{name}, collection", []).append(frames / (seconds - updates))
+            rates.setdefault(f"{name}, update", []).append(frames / updates)
+    median = medians(rates)
+    row: Row = {f"{name} (frames/s)": median[name] for name in subjects}
+    for part in ("", ", collection", ", update"):
+        row[f"ratio{part}"] = median_ratio(rates[f"ours{part}"], rates[f"sb3{part}"])
+    return {**row, "rounds": {name: rates[name] for name in subjects}}

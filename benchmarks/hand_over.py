@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from benchmarks.promise import plain_episodes
 from coil_rl.errors import UserError
 from coil_rl.report import markdown_table
 from coil_rl.report.runs import GUIDE, Run, read_runs
@@ -87,7 +86,7 @@ def differences_of(runs: Sequence[Run]) -> list[NDArray[np.float64]]:
         if not run.finished:
             continue
         own, guide = (
-            plain_episodes(run, name).sort_values("case")["reward"].to_numpy()
+            run.episodes_of(name).sort_values("case")["reward"].to_numpy()
             for name in (run.label, GUIDE)
         )
         if len(own) == len(guide) and not np.allclose(own, guide):

@@ -21,6 +21,7 @@ import argparse
 import hashlib
 import json
 import math
+import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,7 +30,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
@@ -93,20 +93,13 @@ class Arm:
         )
 
 
-def plain_episodes(run: Run, driver: str) -> pd.DataFrame:
-    """Return the evaluation of a policy with deterministic actions and the advice as it is."""
-    table = run.evaluation
-    plain = (table["advice"] == "") & (table["actions"] == "deterministic")
-    return table[plain & (table["driver"] == driver)]
-
-
 def mean_reward(run: Run, driver: str) -> float:
     """Return the mean reward of a policy; NaN if there is no such policy.
 
     Raises:
         ValueError: if the reward of an episode is NaN.
     """
-    rewards = plain_episodes(run, driver)["reward"]
+    rewards = run.episodes_of(driver)["reward"]
     if unknown := int(rewards.isna().sum()):
         raise ValueError(
             f"{run.folder}: the reward of {driver} is nan in {unknown} of {len(rewards)} cases of "
@@ -151,7 +144,7 @@ def arms_of(runs: Sequence[Run]) -> dict[Key, Arm]:
 
 def _cases(run: Run) -> set[str]:
     """Return the cases in which the policy of a run was evaluated."""
-    return set(plain_episodes(run, run.label)["case"])
+    return set(run.episodes_of(run.label)["case"])
 
 
 def paired(arm: Arm, alone: Arm) -> tuple[Arm, Arm]:
@@ -192,29 +185,27 @@ def best_alone(arms: Mapping[Key, Arm]) -> str:
     return max(means, key=lambda learner: means[learner])
 
 
-def rows_of_task(name: str, arms: Mapping[Key, Arm], learner: str) -> list[dict[str, object]]:
+def rows_of_task(
+    name: str, arms: Mapping[Key, Arm], learner: str, parts: Mapping[str, range] | None = None
+) -> list[dict[str, object]]:
     """Return a row of the table for each method with each guide.
 
     Args:
         arms: see `arms_of`.
         learner: what they are compared with, see `best_alone`.
+        parts: seeds whose difference has a column of its own, by its name.
     """
     alone = arms[learner, ALONE]
     scale = scale_of(arms, alone)
-    return [
-        {"task": name, "method": method, "arm": arm, "learner": learner} | _row(each, alone, scale)
-        for (method, arm), each in arms.items()
-        if arm != ALONE
-    ]
-
-
-def add_parts(rows: Sequence[dict[str, object]], arms: Mapping[Key, Arm], others: int) -> None:
-    """Add to the rows of a task the difference with the first seeds, and with the others."""
-    for row in rows:
-        arm, alone = arms[str(row["method"]), str(row["arm"])], arms[str(row["learner"]), ALONE]
-        scale = scale_of(arms, alone)
-        row["claimed"] = _part(arm, alone, scale, range(others))
-        row["others"] = _part(arm, alone, scale, range(others, max(arm.runs) + 1))
+    rows: list[dict[str, object]] = []
+    for (method, arm), each in arms.items():
+        if arm != ALONE:
+            row = {"task": name, "method": method, "arm": arm, "learner": learner}
+            of_parts = {
+                title: _part(each, alone, scale, seeds) for title, seeds in (parts or {}).items()
+            }
+            rows.append(row | _row(each, alone, scale) | of_parts)
+    return rows
 
 
 def _part(arm: Arm, alone: Arm, scale: float, seeds: range) -> str:
@@ -400,12 +391,12 @@ def _all_rows(
     """
     rows: list[dict[str, Any]] = []
     each: list[dict[str, object]] = []
+    parts = {}
+    if others is not None:
+        parts = {"claimed": range(others), "others": range(others, sys.maxsize)}
     for task, runs in with_ppo(folder, runs_of(folder)).items():
         arms = arms_of(runs)
-        found = rows_of_task(task, arms, best_alone(arms))
-        if others is not None:
-            add_parts(found, arms, others)
-        rows += found
+        rows += rows_of_task(task, arms, best_alone(arms), parts)
         each += rows_of_runs(task, arms)
     if not rows:
         raise ValueError(f"{folder} has no run with a guide; train it: +arm=intact,random")

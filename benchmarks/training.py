@@ -215,7 +215,7 @@ def measure_sb3(args: Namespace) -> list[Row]:
     """
     if not has_yardstick(args):
         return [{"not measured": "Stable-Baselines3 runs PPO with continuous actions"}]
-    if find_spec("stable_baselines3") is None or find_spec("gymnasium") is None:
+    if find_spec("stable_baselines3") is None:
         reason = "Stable-Baselines3 is not installed: python -m pip install 'coil-rl[bench]'"
         return [{"not measured": reason}]
     (cars, steps), *_ = args.batches

@@ -28,7 +28,6 @@ from benchmarks.promise import (
     fingerprint,
     guide_of,
     paired,
-    plain_episodes,
     rows_of_task,
     scale_of,
     verdict,
@@ -124,7 +123,6 @@ def _row(
     row: dict[str, Any] = dict.fromkeys(COLUMNS, math.nan)
     row |= {name: compared[name] for name in COLUMNS if name in compared}
     row |= dict(zip(("task", "method", "arm"), (task, *key), strict=True))
-    row["verdict"] = compared.get("verdict", "")
     row["seeds"] = len(runs)
     row["ppo"] = float(np.mean([alone.reward(seed) for seed in alone.runs]))
     row["end"] = float(np.mean([arm.reward(seed) for seed in arm.runs]))
@@ -133,8 +131,7 @@ def _row(
     row |= _learning(runs)
     scale = scale_of(arms, arms[PPO, ALONE])
     row |= {name: 100 * row[name] / scale for name in ("first", "lowest")}
-    row["effort"] = effort(row["seeds"], row["frames"], reference)
-    row |= {name: score(row[of], row) for name, of in SCORES.items()}
+    row |= derived(row, reference)
     row["fingerprint"] = fingerprint(runs[0].settings)
     return row | _versions(runs)
 
@@ -144,6 +141,14 @@ def _versions(runs: Sequence[Run]) -> dict[str, str]:
     found = [record.VERSIONS.need(run.folder) for run in runs]
     columns = {name: dict.fromkeys(each.get(name, "") for each in found) for name in VERSIONS}
     return {name: " / ".join(filter(None, column)) for name, column in columns.items()}
+
+
+def derived(row: Mapping[str, Any], reference: Reference) -> dict[str, Any]:
+    """Return what follows from the other numbers of a row: its scores, effort and verdict."""
+    found: dict[str, Any] = {name: score(row[of], row) for name, of in SCORES.items()}
+    found["effort"] = effort(row["seeds"], row["frames"], reference)
+    decided = verdict(row["difference"], row["low"], row["high"])
+    return found | {"verdict": "" if row["arm"] == ALONE else decided}
 
 
 def score(value: float, row: Mapping[str, Any]) -> float:
@@ -169,7 +174,7 @@ def _learning(runs: Sequence[Run]) -> dict[str, float | None]:
 def _of_run(run: Run) -> dict[str, float]:
     """Return the numbers of one run; returns of the curve's cases relative to its guide."""
     found, returns = learning(run), points(run.curve, RETURN)[:, 1].tolist()
-    crashed = plain_episodes(run, run.label).get("crashed")
+    crashed = run.episodes_of(run.label).get("crashed")
     return {
         "frames": found["frames"],
         "guide_calls": run.curve[-1].get("guide/calls", math.nan) if run.curve else math.nan,
@@ -216,12 +221,12 @@ def check_row(row: Mapping[str, str]) -> dict[str, Any]:
         raise ValueError(
             f"{place}: reached={reached}, but frames_to_guide={row['frames_to_guide']}"
         )
-    _check_numbers(place, row, numbers, known[row["task"]])
+    numbered = {**row, **numbers, "seeds": seeds, REACHED: reached}
+    _check_derived(place, numbered, known[row["task"]])
     if not re.fullmatch("[0-9a-f]{10}", row["fingerprint"]):
         raise ValueError(f"{place}: fingerprint={row['fingerprint']} is not ten hexadecimal digits")
     if missing := [name for name in VERSIONS if not row[name]]:
         raise ValueError(f"{place}: the versions of {', '.join(missing)} are missing")
-    numbered = {**row, **numbers, "seeds": seeds, REACHED: reached}
     return {name: numbered[name] for name in COLUMNS}
 
 
@@ -236,19 +241,15 @@ def read_rows(file: Path) -> list[dict[str, Any]]:
         return [check_row(row) for row in csv.DictReader(table)]
 
 
-def _check_numbers(
-    place: str, row: Mapping[str, str], numbers: Mapping[str, float], reference: Reference
-) -> None:
-    """Compute again what follows from other numbers of a row."""
-    for name, of in SCORES.items():
-        expected = score(numbers[of], numbers)
-        if not np.isclose(numbers[name], expected, atol=SAME, equal_nan=True):
-            raise ValueError(f"{place}: {name}={row[name]}, but its returns give {expected:.6f}")
-    if reference.level != GUIDE and numbers["reference"] != float(reference.level):
+def _check_derived(place: str, row: Mapping[str, Any], reference: Reference) -> None:
+    """Raise a `ValueError` if something does not follow from the other numbers of a row."""
+    for name, expected in derived(row, reference).items():
+        own = row[name]
+        if isinstance(expected, str):
+            follows = own == expected
+        else:
+            follows = np.isclose(own, expected, atol=SAME, equal_nan=True)
+        if not follows:
+            raise ValueError(f"{place}: {name}={own}, but its other numbers give {expected}")
+    if reference.level != GUIDE and row["reference"] != float(reference.level):
         raise ValueError(f"{place}: reference={row['reference']}, expected {reference.level}")
-    found = effort(int(row["seeds"]), numbers["frames"], reference)
-    if row["effort"] != found:
-        raise ValueError(f"{place}: effort={row['effort']}, but seeds and frames make it {found}")
-    decided = verdict(numbers["difference"], numbers["low"], numbers["high"])
-    if row["verdict"] != ("" if row["arm"] == ALONE else decided):
-        raise ValueError(f"{place}: verdict={row['verdict']}, but its interval says {decided}")

@@ -58,19 +58,12 @@ def read_outcome(folder: Path, arms: Sequence[str], failed: Mapping[str, str]) -
             if reasons:
                 rows.append({"policy": name, "note": f"failed: {reasons[0]}"})
             continue
-        tables = [_own(run) for run in runs[name]]
+        tables = [run.episodes_of(run.label) for run in runs[name]]
         returns = np.stack([table["reward"].to_numpy() for table in tables])
         rising = any(still_rising(run.curve) for run in runs[name])
         entries[name] = Entry(name, returns, rising)
         rows.append(_learned_row(entries[name], tables, runs[name], reasons))
     return Outcome(entries, rows, {name: each for name, each in runs.items() if each})
-
-
-def _own(run: Run) -> pd.DataFrame:
-    """Return the deterministic episodes of the policy of a run."""
-    table = run.evaluation
-    own = (table["driver"] == run.label) & (table["actions"] == "deterministic")
-    return table[own & (table["advice"] == "")]
 
 
 def _row(entry: Entry, tables: Sequence[pd.DataFrame], calls: float = 0) -> dict[str, Any]:

@@ -78,6 +78,12 @@ class Run:
         """Whether the run has been evaluated."""
         return not self.evaluation.empty
 
+    def episodes_of(self, driver: str) -> pd.DataFrame:
+        """Return the evaluation of a policy with deterministic actions and the advice as it is."""
+        table = self.evaluation
+        plain = (table["advice"] == "") & (table["actions"] == "deterministic")
+        return table[plain & (table["driver"] == driver)]
+
 
 def read_runs(folders: Sequence[Path]) -> list[Run]:
     """Return all runs in some folders, at any depth, sorted by folder.

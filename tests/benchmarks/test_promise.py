@@ -51,10 +51,10 @@ def small(folder, arms, seeds=1):
     return folder
 
 
-def rows_of(runs):
+def rows_of(runs, parts=None):
     """Return the rows of a task, compared with the learner that is best alone."""
     arms = promise.arms_of(runs)
-    return promise.rows_of_task("task", arms, promise.best_alone(arms))
+    return promise.rows_of_task("task", arms, promise.best_alone(arms), parts)
 
 
 def printed(monkeypatch, capsys, *words):
@@ -211,14 +211,13 @@ def test_program_writes_the_table(folder, monkeypatch, capsys):
 @pytest.mark.slow
 def test_seeds_that_confirm_have_a_column_of_their_own(folder):
     runs = read_runs([folder / "pendulum"])
-    rows = rows_of(runs)
-    promise.add_parts(rows, promise.arms_of(runs), 1)
+    rows = rows_of(runs, {"claimed": range(1), "others": range(1, 9)})
     scale = rows[0]["guide"] - rows[1]["guide"]
     for column, seed in (("claimed", 0), ("others", 1)):
         intact = promise.arms_of(runs)["coil_anchored", "intact"]
         expected = 100 * (intact.reward(seed) - intact.guide) / scale
         assert rows[0][column].startswith(f"{expected:+.1f} (")
-    promise.add_parts(rows, promise.arms_of(runs), 2)
+    rows = rows_of(runs, {"claimed": range(2), "others": range(2, 9)})
     assert rows[0]["others"] == ""
     assert f"{rows[0]['difference']:+.1f}" in rows[0]["claimed"]
 
