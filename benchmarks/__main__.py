@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hydra.errors import HydraException
 from tqdm import tqdm
 
 from benchmarks.driving import (
@@ -41,7 +40,6 @@ from benchmarks.training import (
     measure_training,
 )
 from coil_rl.config.check import check
-from coil_rl.config.messages import sentence
 from coil_rl.errors import UserError
 from coil_rl.programs.app import program
 from coil_rl.report import markdown_table
@@ -193,10 +191,7 @@ def check_configuration(args: Namespace) -> None:
             raise UserError(
                 f"{override} has no effect: the methods ppo and coil are compared; leave it out"
             )
-    try:
-        check(train_config(args, "coil"))
-    except HydraException as error:
-        raise UserError(sentence(error)) from error
+    check(train_config(args, "coil"))
 
 
 def goals(results: Mapping[str, Any]) -> list[Row]:

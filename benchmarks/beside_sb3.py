@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import (
     Compose,
@@ -35,6 +35,7 @@ from benchmarks.timing import Stopwatch
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.learners import DQN, PPO, SAC, Mlp
 from coil_rl.report import markdown_table
+from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
 from coil_rl.transforms.normalised_action import given_units, normalising
@@ -266,14 +267,11 @@ def per_second(steps: float, stopwatch: Stopwatch) -> float:
 def mean_return(env_id: str, act: Act) -> float:
     """Return the mean return of one episode from each of the fixed seeds."""
     env = GymnasiumEnv(env_id, EPISODES, first_seed=FIRST_SEED)
-    carrier = env.reset()
-    running, total = torch.ones(EPISODES, 1, dtype=torch.bool), torch.zeros(EPISODES, 1)
-    while running.any():
-        step = env.step(carrier.set("action", act(carrier["observation"])))
-        total += step["next", "reward"] * running
-        running &= ~step["next", "done"]
-        carrier = step["next"].exclude("reward")
-    return float(total.mean())
+
+    def policy(state: TensorDictBase) -> TensorDictBase:
+        return state.set("action", act(state["observation"]))
+
+    return evaluate_policy(env, policy).mean_reward
 
 
 def main(argv: Sequence[str] | None = None) -> None:

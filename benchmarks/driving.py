@@ -13,15 +13,14 @@ from multiprocessing.synchronize import Barrier
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_module
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch.profiler import profile
 from torchrl.envs import EnvBase, TransformedEnv
 
-import coil_rl.config.schema  # noqa: F401  registers the schema
 from benchmarks.timing import Row, measure, median_ratio, medians, synchronise
+from coil_rl import compose_train
 from coil_rl.compiled import compile_steps
 from coil_rl.config.parts import build_bare_env, build_guides
 from coil_rl.envs import (
@@ -39,9 +38,8 @@ ROBOTS = 256  # in the simulator, side by side
 
 def train_config(args: Namespace, method: str, *more: str) -> DictConfig:
     """Return the configuration of `coil-train` with the overrides of the command line."""
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        fixed = [f"method={method}", f"device={args.device}", "logger=none", "run_dir=unused"]
-        return compose("train", [*fixed, *args.overrides, *more])
+    fixed = [f"method={method}", f"device={args.device}", "logger=none", "run_dir=unused"]
+    return compose_train([*fixed, *args.overrides, *more])
 
 
 def driving_env(args: Namespace, cars: int, guide: bool) -> EnvBase:

@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from argparse import Namespace
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, cast
@@ -19,15 +20,13 @@ from omegaconf import OmegaConf
 from benchmarks.driving import train_config
 from benchmarks.ppo import PlainPPO
 from benchmarks.timing import Row, Stopwatch, Work, clock_of, measure, median_ratio, medians
-from coil_rl.compiled import compile_steps
+from coil_rl.config.assemble import assemble
 from coil_rl.config.nodes import build
 from coil_rl.config.parts import build_bare_env, build_guides, build_learner, env_maker
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.learners.ppo import PPO
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import read_runs
-from coil_rl.run.experiment import Experiment, watched_keys
-from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
 METHODS = ("ppo", "coil")
@@ -58,14 +57,11 @@ class Training:
         compile: bool = False,
     ) -> None:
         config = train_config(args, method, *(["learner.compile=true"] if compile else []))
-        env = env_maker(config)(cars)
-        if config.compile:
-            compile_steps(env)
-        learner = build_learner(config, env)
-        keys = [*learner.keys, *watched_keys(env, {})]
-        rollout = Rollout(env, learner.policy, steps, keys, config.training.noise_correlation)
-        self.folder = tempfile.TemporaryDirectory()  # for the best policy
-        self.experiment = Experiment(learner, rollout, 1, Path(self.folder.name))
+        self.folder = tempfile.TemporaryDirectory()
+        run = assemble(config, Path(self.folder.name))
+        run.budget = replace(run.budget, rows=cars, steps=steps)
+        self.experiment = run.training(0)
+        learner = self.experiment.learner
         while isinstance(learner, OffPolicy) and len(learner.buffer) < learner.starts:
             self()
 

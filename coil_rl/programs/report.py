@@ -50,10 +50,6 @@ class EnvPart:
     compared: Mapping[str, Comparison]
     against: str | None
 
-    def tables(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the rows of the table of policies, by kind of actions."""
-        return {kind: each.table(self.against) for kind, each in self.compared.items()}
-
     def sections(self, folder: Path, strokes: Mapping[str, Stroke], kind: str) -> list[Section]:
         """Return the sections, the figures in the first one; the figures are written, too.
 
@@ -69,10 +65,10 @@ class EnvPart:
         suffix = re.sub(r"[^\w.-]+", "_", f"_{self.env}") if self.env else ""
         figures = draw_report(self.runs, self.compared, folder, strokes, f"{suffix}.{kind}")
         sections: list[Section] = []
-        for actions, rows in self.tables().items():
+        for actions, comparison in self.compared.items():
             heading = f"{actions} actions"
             heading = f"{self.env}, {heading}" if self.env else heading.capitalize()
-            blocks = page.section(self.compared[actions], rows, self.against)
+            blocks = page.section(comparison, self.against)
             if not sections:
                 blocks += page.what_differs(self.differing, "policy")
             sections.append(Section(heading, blocks, [] if sections else figures))
@@ -144,7 +140,7 @@ def report(config: DictConfig) -> None:
     drawn = [group for comparison in compared for group in comparison.agents or comparison.guides]
     strokes = style.strong_strokes(dict.fromkeys(group.name for group in drawn))
     folder = folders[0]
-    first = {part.env: next(iter(part.tables().values())) for part in parts}
+    first = {part.env: next(iter(part.compared.values())).table(against) for part in parts}
     overview = [*page.summary(first, against), *page.what_differs(envs, "env")]
     sections = [Section("", overview)] if overview else []
     for part in parts:
@@ -167,8 +163,8 @@ def report(config: DictConfig) -> None:
     text = "\n\n".join(filter(None, map(_markdown, sections)))
     text = "\n".join(map(printable, text.split("\n")))
     write_text(folder / "report.md", text)
-    write_csv(_rows(parts, EnvPart.tables), folder / "report.csv")
-    write_csv(_rows(parts, _cases), folder / "report_cases.csv")
+    write_csv(_rows(parts, lambda each: each.table(against)), folder / "report.csv")
+    write_csv(_rows(parts, lambda each: each.case_table()), folder / "report_cases.csv")
     write_csv([row for part in parts for row in part.curves()], folder / "report_curves.csv")
     write_text(folder / "report.tex", "\n\n".join(filter(None, map(_latex, sections))))
     html = html_page(f"Report of {folder.resolve().name}", sections)
@@ -214,19 +210,14 @@ def _latex(section: Section) -> str:
     return "\n\n".join([f"% {section.heading}", *tables]) if tables else ""
 
 
-def _cases(part: EnvPart) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of each policy and case, by kind of actions."""
-    return {kind: comparison.case_table() for kind, comparison in part.compared.items()}
-
-
 def _rows(
-    parts: Sequence[EnvPart], tables: Callable[[EnvPart], dict[str, list[dict[str, Any]]]]
+    parts: Sequence[EnvPart], table: Callable[[Comparison], list[dict[str, Any]]]
 ) -> list[dict[str, Any]]:
     """Return the rows of the tables of all envs and kinds of actions as one table."""
     rows = []
     for part in parts:
-        for kind, table in tables(part).items():
-            rows += [{"env": part.env, "actions": kind, **row} for row in table]
+        for kind, comparison in part.compared.items():
+            rows += [{"env": part.env, "actions": kind, **row} for row in table(comparison)]
     return rows
 
 

@@ -27,15 +27,13 @@ GUIDE_RETURN = "guide/"  # prefix of columns of metrics.csv
 GUIDE_CALLS = "guide/calls"  # is no return
 
 
-def section(
-    comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None
-) -> list[Block]:
+def section(comparison: Comparison, against: str | None) -> list[Block]:
     """Return the section for one kind of actions.
 
     Args:
-        rows: `comparison.table(against)`.
         against: what the policies are compared with, see `Comparison.table`.
     """
+    rows = comparison.table(against)
     columns = _columns(comparison, rows, against)
     shown = with_cells(rows, comparison.spec)
     counts = [group.counts() for group in comparison.groups]

@@ -45,7 +45,7 @@ def report(folder):
     compared = {"deterministic": compare(runs)}
     strokes = style.strong_strokes({run.label for run in runs})
     figures = draw_report(runs, compared, folder, strokes)
-    blocks = page.section(compared["deterministic"], compared["deterministic"].table(None), None)
+    blocks = page.section(compared["deterministic"], None)
     section = Section("Deterministic actions", blocks, figures)
     return html_page(f"Report of {folder.name}", [section])
 

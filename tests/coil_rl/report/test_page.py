@@ -12,7 +12,7 @@ from coil_rl.report.runs import Run, read_runs
 
 def section(folder, against=None):
     comparison = compare(read_runs([folder]))
-    return list(map(str, page.section(comparison, comparison.table(against), against)))
+    return list(map(str, page.section(comparison, against)))
 
 
 def cells(table):
@@ -196,7 +196,7 @@ def test_measure_of_some_episodes_counts_as_often_as_it_is_known(tmp_path):
     row = comparison.table()[0]
     assert row["lap_time"] == (5 * 50 + 80 + 10 * 50) / 16
     assert (row["lap_time_episodes"], row["episodes"]) == (16, 20)
-    assert "51.88 (16 of 20)" in str(page.section(comparison, [row], None)[0])
+    assert "51.88 (16 of 20)" in str(page.section(comparison, None)[0])
     by_case = {case["case"]: case for case in comparison.case_table()}
     assert [by_case[case]["episodes"] for case in "ab"] == [10, 10]
     assert [by_case[case]["lap_time_episodes"] for case in "ab"] == [10, 6]
