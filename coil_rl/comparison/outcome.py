@@ -14,7 +14,7 @@ from coil_rl.comparison.arms import GUIDE, OPPOSITE, TUNE, ZERO
 from coil_rl.comparison.baselines import NAME, action_words, read_baselines
 from coil_rl.comparison.entry import ZERO_ACTIONS, Entry
 from coil_rl.report.curves import points
-from coil_rl.report.runs import RETURN, Run, read_runs
+from coil_rl.report.runs import RETURN, Run, by_label, read_runs
 from coil_rl.run.reasons import POLICIES, still_rising
 
 
@@ -47,14 +47,12 @@ def read_outcome(folder: Path, arms: Sequence[str], failed: Mapping[str, str]) -
         entries[str(name)] = Entry(str(name), table["reward"].to_numpy()[None], action=action)
         asked = int(table["steps"].sum()) if name in (GUIDE, OPPOSITE) else 0
         rows.append(_row(entries[str(name)], [table], calls=asked))
-    runs: dict[str, list[Run]] = {name: [] for name in arms}
     found = read_runs([folder]) if any(folder.rglob("config.yaml")) else []
-    for run in found:
-        if run.finished and run.label in runs:
-            runs[run.label].append(run)
+    of_labels = by_label(run for run in found if run.finished)
+    runs = {name: of_labels[name] for name in arms if name in of_labels}
     for name in arms:
         reasons = [reason for job, reason in failed.items() if job.startswith(f"{name}_seed")]
-        if not runs[name]:
+        if name not in runs:
             if reasons:
                 rows.append({"policy": name, "note": f"failed: {reasons[0]}"})
             continue
@@ -63,7 +61,7 @@ def read_outcome(folder: Path, arms: Sequence[str], failed: Mapping[str, str]) -
         rising = any(still_rising(run.curve) for run in runs[name])
         entries[name] = Entry(name, returns, rising)
         rows.append(_learned_row(entries[name], tables, runs[name], reasons))
-    return Outcome(entries, rows, {name: each for name, each in runs.items() if each})
+    return Outcome(entries, rows, runs)
 
 
 def _row(entry: Entry, tables: Sequence[pd.DataFrame], calls: float = 0) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from coil_rl.errors import UserError
 from coil_rl.measures import Measure, with_denominators
 from coil_rl.record import DRIVER
 from coil_rl.report.guides import is_guide, shared_guides
-from coil_rl.report.runs import FALLBACK, GUIDE, Run
+from coil_rl.report.runs import FALLBACK, GUIDE, Run, by_label
 from coil_rl.report.sentences import listed
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
 from coil_rl.report.table import return_format
@@ -310,14 +310,12 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
         UserError: if two runs have the same label and seed, or the same label and other cases.
     """
     finished = [run for run in runs if run.finished]
-    labels: dict[str, pd.DataFrame] = {}
+    labels = {label: _join_runs(own) for label, own in by_label(finished).items()}
     needs_guide: dict[str, bool | None] = {}
     measures: dict[str, Measure] = {}
     for run in reversed(finished):  # the first run of a name defines it
         measures |= run.measures
         needs_guide[run.label] = run.needs_guide
-    for label in dict.fromkeys(run.label for run in finished):
-        labels[label] = _join_runs([run for run in finished if run.label == label])
     guides = _guides(labels, measures)
     agents: list[Group] = []
     for label, frame in labels.items():

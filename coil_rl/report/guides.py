@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from coil_rl.report.configurations import guide_follows_seed, of_guide
-from coil_rl.report.runs import GUIDE, Run
+from coil_rl.report.runs import GUIDE, Run, by_label
 from coil_rl.report.sentences import REPORT, listed
 
 SAME_RETURN = 1e-5  # of the range of the compared returns; the rest is rounding
@@ -105,8 +105,7 @@ def of_guides_of_labels(runs: Sequence[Run]) -> list[str]:
 
 def _without_seed(runs: Sequence[Run]) -> tuple[Numbers, list[pd.DataFrame]]:
     """Return the evaluations of the guides that do not depend on the seed, see `_numbered`."""
-    labels = dict.fromkeys(run.label for run in runs)
-    of_labels = ([run for run in runs if run.label == label] for label in labels)
+    of_labels = by_label(runs).values()
     kept = chain.from_iterable(each for each in of_labels if not guide_follows_seed(each))
     return _numbered((run.label, run.seed, run.evaluation) for run in kept)
 

@@ -6,7 +6,7 @@ says how to read them.
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from statistics import mean
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 from coil_rl.record import UNTESTED
 from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning, points
-from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run, begun_with
+from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run, begun_with, by_label
 from coil_rl.report.sentences import REPORT
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
 from coil_rl.report.table import AUTO_FORMAT, TABLES, Table, return_format
@@ -88,7 +88,7 @@ def guide_training(runs: Sequence[Run]) -> list[Table]:
     """
     rows: list[dict[str, Any]] = []
     columns = {"label": ("guides' own return, before to after", ""), "seeds": ("seeds", "")}
-    for label, of_label in _trained(runs):
+    for label, of_label in by_label(run for run in runs if run.curve).items():
         row: dict[str, Any] = {"label": label, "seeds": len(of_label)}
         for key in dict.fromkeys(chain.from_iterable(run.curve[0] for run in of_label)):
             if key.startswith(GUIDE_RETURN) and key != GUIDE_CALLS:
@@ -108,7 +108,7 @@ def training(runs: Sequence[Run]) -> list[Block]:
     The list is empty if nothing was trained.
     """
     rows: list[dict[str, Any]] = []
-    for label, of_label in _trained(runs):
+    for label, of_label in by_label(run for run in runs if run.curve).items():
         numbers = [learning(run) for run in of_label]
         row: dict[str, Any] = {key: mean(seed[key] for seed in numbers) for key in numbers[0]}
         row["label"], row["seeds"] = label, len(of_label)
@@ -230,12 +230,6 @@ def begun(runs: Sequence[Run]) -> list[str]:
         if (source := begun_with(run.settings)) is not None:
             sources.setdefault(run.label, {})[source] = None
     return REPORT.said("begun", labels=sources)
-
-
-def _trained(runs: Sequence[Run]) -> Iterator[tuple[str, list[Run]]]:
-    """Yield each label with its runs that have a learning curve."""
-    for label in dict.fromkeys(run.label for run in runs if run.curve):
-        yield label, [run for run in runs if run.label == label and run.curve]
 
 
 def _other(against: str | None) -> str:

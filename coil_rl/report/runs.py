@@ -112,6 +112,14 @@ def read_runs(folders: Sequence[Path]) -> list[Run]:
     return list(runs.values())
 
 
+def by_label(runs: Iterable[Run]) -> dict[str, list[Run]]:
+    """Return runs by their label, in their order."""
+    found: dict[str, list[Run]] = {}
+    for run in runs:
+        found.setdefault(run.label, []).append(run)
+    return found
+
+
 def begun_with(settings: Mapping[str, Any]) -> str | None:
     """Return which earlier policy or data a run began with; None if it began with neither."""
     if init := settings.get("init"):
