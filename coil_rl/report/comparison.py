@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -310,18 +311,17 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
         UserError: if two runs have the same label and seed, or the same label and other cases.
     """
     finished = [run for run in runs if run.finished]
-    labels = {label: _join_runs(own) for label, own in by_label(finished).items()}
-    needs_guide: dict[str, bool | None] = {}
+    labels = by_label(finished)
+    joined = {label: _join_runs(own) for label, own in labels.items()}
     measures: dict[str, Measure] = {}
     for run in reversed(finished):  # the first run of a name defines it
         measures |= run.measures
-        needs_guide[run.label] = run.needs_guide
-    guides = _guides(labels, measures)
+    guides = _guides(chain.from_iterable(labels.values()), measures)
     agents: list[Group] = []
-    for label, frame in labels.items():
+    for label, frame in joined.items():
         rows = frame[~is_guide(frame) & (frame["actions"] == actions)]
         for (driver, advice), own in rows.groupby(["driver", "advice"], sort=False):
-            needs = None if advice else needs_guide[label] or driver.endswith(FALLBACK)
+            needs = None if advice else labels[label][0].needs_guide or driver.endswith(FALLBACK)
             agents.append(
                 Group(
                     driver,
@@ -366,14 +366,14 @@ def _index(name: str, rows: pd.DataFrame) -> pd.DataFrame:
     return rows.set_index(["seed", "case"]).drop(columns=list(DRIVER), errors="ignore")
 
 
-def _guides(labels: Mapping[str, pd.DataFrame], measures: Mapping[str, Measure]) -> list[Group]:
+def _guides(runs: Iterable[Run], measures: Mapping[str, Measure]) -> list[Group]:
     """Return the different guides of all labels, best first.
 
     Args:
-        labels: the evaluations by label.
+        runs: as `shared_guides` takes them.
         measures: definitions by name.
     """
-    guides, different = shared_guides(labels)
+    guides, different = shared_guides(runs)
     names = [name for name, _ in guides]
     groups = []
     for name, of_runs in guides:

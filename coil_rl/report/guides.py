@@ -6,7 +6,7 @@ have one number, so that guides are compared by sets of numbers.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import Any
 
@@ -30,9 +30,7 @@ def is_guide(frame: pd.DataFrame) -> pd.Series:
     return drivers.isin([name for name in drivers.unique() if name.split()[:1] == [GUIDE]])
 
 
-def shared_guides(
-    labels: Mapping[str, pd.DataFrame],
-) -> tuple[list[tuple[str, OfRuns]], list[pd.DataFrame]]:
+def shared_guides(runs: Iterable[Run]) -> tuple[list[tuple[str, OfRuns]], list[pd.DataFrame]]:
     """Return the different guides of all labels by their names, and the different evaluations.
 
     Every run evaluates its guides: equal results of one guide count once, and labels share a guide
@@ -40,12 +38,9 @@ def shared_guides(
     seed.
 
     Args:
-        labels: the evaluations by label.
+        runs: finished runs, those of a label one after the other.
     """
-    tables: list[tuple[str, int, pd.DataFrame]] = []
-    for label, frame in labels.items():
-        tables += [(label, seed, rows) for seed, rows in frame.groupby("seed", sort=False)]
-    numbers, different = _numbered(tables)
+    numbers, different = _numbered(runs)
     guides: list[tuple[str, OfRuns]] = []
     for name, of_labels in numbers.items():
         of_name: list[OfRuns] = []
@@ -107,20 +102,15 @@ def _without_seed(runs: Sequence[Run]) -> tuple[Numbers, list[pd.DataFrame]]:
     """Return the evaluations of the guides that do not depend on the seed, see `_numbered`."""
     of_labels = by_label(runs).values()
     kept = chain.from_iterable(each for each in of_labels if not guide_follows_seed(each))
-    return _numbered((run.label, run.seed, run.evaluation) for run in kept)
+    return _numbered(kept)
 
 
-def _numbered(
-    tables: Iterable[tuple[str, int, pd.DataFrame]],
-) -> tuple[Numbers, list[pd.DataFrame]]:
-    """Return the number of the evaluation of each guide, and the different evaluations.
-
-    Args:
-        tables: label, seed and evaluation of each run.
-    """
+def _numbered(runs: Iterable[Run]) -> tuple[Numbers, list[pd.DataFrame]]:
+    """Return the number of the evaluation of each guide, and the different evaluations."""
     numbers: Numbers = {}
     different: list[pd.DataFrame] = []
-    for label, seed, table in tables:
+    for run in runs:
+        table = run.evaluation
         for name, rows in table[is_guide(table)].groupby("driver", sort=False):
             of_name = numbers.setdefault(str(name), {})
             known = dict.fromkeys(chain.from_iterable(each.values() for each in of_name.values()))
@@ -128,7 +118,7 @@ def _numbered(
             number = next(equal, len(different))
             if number == len(different):
                 different.append(rows)
-            of_name.setdefault(label, {})[seed] = number
+            of_name.setdefault(run.label, {})[run.seed] = number
     return numbers, different
 
 
