@@ -60,7 +60,7 @@ def learnability(alone: Run, advised: Run) -> float:
         coil_rl.open_run(run.folder, trust=["benchmarks"]) for run in (alone, advised)
     )
     env = guided.make_env.around(guided.make_env.bare(EPISODES, TEST, None)).eval()
-    policy = learned.load_policy(env, "last")
+    policy = learned.policy(env, "last")
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         data = env.rollout(STEPS, policy, break_when_any_done=False)
     difference = data["action"] - data["guide_action"][..., 0, :]

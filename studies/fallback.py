@@ -147,7 +147,8 @@ class Fallback(Beside):
             critic.load_state_dict(checkpoint.load(newest, run.device)["learner"]["critic"])
         guide = FollowAdvice(env)
         values = [
-            values_of(critic, after)[running.reshape(-1)] for after, running in episodes(env, guide)
+            values_of(critic, after)[running.reshape(-1)]
+            for _, after, running in episodes(env, guide)
         ]
         of_guide = torch.cat(values)
         leave, back = of_guide.quantile(of_guide.new_tensor([LEAVE, BACK])).tolist()

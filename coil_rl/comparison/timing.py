@@ -142,7 +142,7 @@ def _length(env: EnvBase, policy: Policy) -> float:
     """Return the mean number of steps of an episode; one that does not end counts as `LONGEST`."""
     rows = env.batch_size.numel()
     steps = torch.zeros(rows)
-    for _, running in itertools.islice(episodes(env, policy), LONGEST):
+    for _, _, running in itertools.islice(episodes(env, policy), LONGEST):
         steps += running.reshape(rows, -1)[:, 0].cpu()
     return float(steps.mean())
 

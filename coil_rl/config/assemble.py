@@ -34,7 +34,6 @@ from coil_rl.config.parts import (
 from coil_rl.config.trust import to_trust
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
-from coil_rl.measures import measures_of
 from coil_rl.run.curve import GuideReturns
 from coil_rl.run.folder import locked
 from coil_rl.run.judge import Trial, guide_titles
@@ -84,7 +83,6 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         label=config.label,
         seed=config.seed,
         watch=OmegaConf.to_container(config.watch),
-        failure=measures_of(config.evaluation.measures).get("crashed"),
         noise_correlation=config.training.noise_correlation,
         logger=partial(make_logger, config.logger) if config.logger else None,
         callbacks=guide_returns,
@@ -230,7 +228,7 @@ class LearnedGuide(HostedGuide):
             opened = assemble(config, self.folder)
             # The transforms need the specs of an env; some need at least two rows.
             env = opened.make_env.around(opened.make_env.bare(2, TRAIN, None)).eval()
-            policy = opened.load_policy(env, which)
+            policy = opened.policy(env, which)
         self.chain = Chain(env, policy, links_of(env.transform, tensors=True))
         self.space = space_of(env.base_env, env.base_env.action_key)
         guides = [each for each in self.chain.links if isinstance(each, GuideActions)]

@@ -35,7 +35,6 @@ def evaluate(config: DictConfig) -> float:
     from coil_rl.config.folder import run_folder
     from coil_rl.config.parts import env_maker
     from coil_rl.run.judge import judge, report_outcome
-    from coil_rl.run.parts import SOME_ROWS
 
     torch.set_num_threads(config.threads)
     results = Path(config.run_dir)
@@ -49,10 +48,7 @@ def evaluate(config: DictConfig) -> float:
         judge(trial(alone, env_maker(alone)), None, results, config.seed)
     else:
         run = assemble(alone, folder)
-        env = run.trial.env(SOME_ROWS)  # not of the training, whose env may be another
-        run.try_out(env)
-        policy = run.policy(env)
-        judge(run.trial, policy, results, config.seed, run.drivers(policy))
+        run.judge(run.trial, results, config.seed)
     return report_outcome(results)
 
 

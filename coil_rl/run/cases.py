@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.measures import Measure
 from coil_rl.output import progress
-from coil_rl.run.evaluation import Totals, totals_of
+from coil_rl.run.evaluation import Totals, episodes
 from coil_rl.run.exploration import exploring
 from coil_rl.run.parts import SOME_ROWS
 from coil_rl.run.policy_batch import Acting, OnRows, memory_keys, traced
@@ -64,7 +64,7 @@ class TrainingCases:
     def __post_init__(self) -> None:
         self.generator = torch.Generator().manual_seed(self.seed)
         self.env: EnvBase | None = None
-        self.env_seed, self.count, self.copies = 0, 0, 1
+        self.env_seed, self.count = 0, 0
         self.taken: list[int] = []
         self.longest = 0
 
@@ -76,19 +76,15 @@ class TrainingCases:
         """Begin a comparison: forget the env of the one before, of which nothing may be left."""
         self.env = None
 
-    def renew(self, count: int, copies: int = 1) -> None:
+    def renew(self, count: int) -> None:
         """Draw that many new cases.
 
         An env with their rows is made when a policy acts in them.
-
-        Args:
-            copies: number of rows that have each case; row i has case `i % count`. Only an env
-                for which `can_copy` holds has more than one.
         """
         self.env_seed = int(torch.randint(SEEDS, (), generator=self.generator))
-        self.count, self.copies = count, copies
+        self.count = count
         if self.env is None:
-            self._build(count * copies)
+            self._build(count)
 
     def blocks(self, first: int, frames: int) -> Iterator[int]:
         """Yield the number of new cases of each part of a test, as long as its frames allow.
@@ -107,6 +103,15 @@ class TrainingCases:
         """Return whether several rows of the env can have the same case."""
         env = self._build(SOME_ROWS) if self.env is None else self.env
         return isinstance(env.base_env if isinstance(env, TransformedEnv) else env, SeededEnv)
+
+    def env_of(self, parts: int) -> EnvBase:
+        """Return the env with some rows for each of the present cases; row i is case `i % count`.
+
+        Args:
+            parts: number of rows for each case. Only an env for which `can_copy` holds has more
+                than one.
+        """
+        return self._build(self.count * parts)
 
     def _build(self, rows: int) -> EnvBase:
         """Return the env with that many rows; it is made unless it has them."""
@@ -129,23 +134,23 @@ class TrainingCases:
             sampled: whether each samples its actions, as in training; None: none does.
         """
         sampled = [False] * len(policies) if sampled is None else sampled
-        if len(policies) > 1 and self._can_act_beside(policies):
-            env = self._build(self.count * len(policies))
+        pairs = list(zip(policies, sampled, strict=True))
+        if len(pairs) > 1 and self._can_act_beside(policies):
+            env = self.env_of(len(pairs))
             beside = [
-                Acting(self._exploring(env, traced(policy), samples, len(policies)), samples)
-                for policy, samples in zip(policies, sampled, strict=True)
+                Acting(self._exploring(env, traced(policy), samples, len(pairs)), samples)
+                for policy, samples in pairs
             ]
-            totals = self._acted(env, OnRows(beside), sampled=False, teaches=True)
+            totals = self._acted(env, OnRows(beside))
             self.taken = [int(part.sum()) for part in totals.steps.split(self.count)]
             return list(totals.results()["return"].split(self.count))
-        env = self._build(self.count)
-        self.taken, returns = [], []
-        for policy, samples in zip(policies, sampled, strict=True):
-            exploring = self._exploring(env, policy, samples)
-            totals = self._acted(env, exploring, sampled=samples, teaches=True)
-            self.taken.append(int(totals.steps.sum()))
-            returns.append(totals.results()["return"])
-        return returns
+        env = self.env_of(1)
+        alone = [
+            self._acted(env, self._exploring(env, policy, samples), sampled=samples)
+            for policy, samples in pairs
+        ]
+        self.taken = [int(totals.steps.sum()) for totals in alone]
+        return [totals.results()["return"] for totals in alone]
 
     def _exploring(
         self, env: EnvBase, policy: TensorDictModuleBase, samples: bool, parts: int = 1
@@ -167,29 +172,24 @@ class TrainingCases:
             and not any(memory_keys(policy) for policy in policies)
         )
 
-    def returns(self, policy: TensorDictModuleBase) -> Tensor:
-        """Return the return of a policy in each row of the present cases, [rows]."""
-        env = self._build(self.count * self.copies)
-        return self._acted(env, policy, sampled=False).results()["return"]
+    def returns(self, policy: TensorDictModuleBase, parts: int = 1) -> Tensor:
+        """Return the return of a policy in each row of the present cases, [rows].
+
+        Args:
+            parts: see `env_of`.
+        """
+        return self._acted(self.env_of(parts), policy).results()["return"]
 
     def _acted(
-        self,
-        env: EnvBase,
-        policy: TensorDictModuleBase,
-        *,
-        sampled: bool,
-        teaches: bool = False,
+        self, env: EnvBase, policy: TensorDictModuleBase, *, sampled: bool = False
     ) -> Totals:
         """Return the totals of a policy in the rows of the present cases, and count its steps."""
-        keys, learn = self.taught if self.taught is not None and teaches else ((), None)
+        keys, learn = ((), None) if self.taught is None else self.taught
         steps: list[TensorDictBase] = []
-
-        def seen(before: TensorDictBase, after: TensorDictBase) -> None:
-            steps.append(before.exclude("next").set("next", after).select(*keys).clone())
-
-        measured = {"return": Measure(unravel_key(env.reward_key), "sum")}
-        before = guide_calls(env)
+        totals = Totals({"return": Measure(unravel_key(env.reward_key), "sum")})
+        calls = guide_calls(env)
         with (
+            torch.no_grad(),
             torch.random.fork_rng(),
             progress(unit="step", desc="test", leave=False, mininterval=0.5) as bar,
         ):
@@ -198,16 +198,17 @@ class TrainingCases:
                 if isinstance(part, SeededGenerator):  # of a transform: the env does not seed it
                     part.generator.manual_seed(self.env_seed + number)
             torch.manual_seed(self.env_seed)
-            options = {"sampled": sampled, "cases": self.count, "tick": bar.update}
-            if learn is not None:
-                options["seen"] = seen
-            totals = totals_of(env, policy, measured, **options)
+            options: Any = {"sampled": sampled, "cases": self.count, "tick": bar.update}
+            for before, after, running in episodes(env, policy, **options):
+                totals.add(after, running)
+                if learn is not None:
+                    steps.append(before.exclude("next").set("next", after).select(*keys).clone())
         if learn is not None:
             learn(torch.stack(steps, -1))
         self.steps += int(totals.steps.sum())
         self.episodes += totals.steps.numel()
         self.longest = max(self.longest, int(totals.steps.max()))
-        self.calls += guide_calls(env) - before
+        self.calls += guide_calls(env) - calls
         return totals
 
     def state_dict(self) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.report.runs import EVALUATION, RETURN
 from coil_rl.run import checkpoint
-from coil_rl.run.evaluation import totals_of
+from coil_rl.run.evaluation import Totals, episodes
 from coil_rl.run.judge import guide_titles
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.parts import EnvMaker
@@ -34,7 +34,7 @@ Watch = Mapping[str, Mapping[str, Sequence[str]]]  # name to key, of "episode" a
 
 @dataclass(eq=False)
 class EvaluationCurve:
-    """Keeps policies of a run, and evaluates them in sets of cases; a `Callback`.
+    """Keeps policies of a run, and evaluates them in sets of cases.
 
     It writes `policies/FRAMES.pt`. The results are filled into the rows of the updates after which
     the policies were kept.
@@ -61,9 +61,6 @@ class EvaluationCurve:
     points: int = 16
     batches: int = 1
 
-    # It acts after the row of an update was logged.
-    names: Sequence[str] = field(default=(), init=False)
-
     def __post_init__(self) -> None:
         self.columns = columns_of(self.envs, self.watch)
 
@@ -80,18 +77,20 @@ class EvaluationCurve:
         self.metrics, self.stages = metrics, list(stages)
         self.frames_of_update, self.frames_before = frames, before
 
-    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+    def due(self, update: int) -> bool:
         """Return whether a policy is to be kept, or the kept ones to be evaluated."""
         return update in self.kept() or bool(self.batch(update))
 
-    def after_update(self, update: int) -> dict[str, float]:
-        """Keep the policy, and evaluate the kept ones, if it is time and it is not done."""
+    def after_update(self, update: int) -> None:
+        """Keep the policy, and evaluate the kept ones, if it is time and it is not done.
+
+        The row of the update has been logged.
+        """
         if update in self.kept():
             self.keep(update)
         batch = self.batch(update)
         if batch and math.isnan(self.metrics.rows[batch[-1]][RETURN]):
             self.metrics.fill(dict(zip(batch, self.evaluate(batch), strict=True)))
-        return {}
 
     def kept(self) -> list[int]:
         """Return the updates of the run after which the policy is kept."""
@@ -165,6 +164,7 @@ def evenly(ends: Sequence[int], parts: int) -> list[int]:
     return sorted(numbers)
 
 
+@torch.no_grad()
 def measures(
     env: EnvBase,
     policy: TensorDictModuleBase,
@@ -188,7 +188,10 @@ def measures(
     for group, reduction in (("episode", "last"), ("step", "mean")):
         keys = (watch or {}).get(group, {})
         measured |= {name: Measure.of(key, reduction=reduction) for name, key in keys.items()}
-    return totals_of(env, policy, measured, cases=cases, tick=tick).results()
+    totals = Totals(measured)
+    for _, after, running in episodes(env, policy, cases=cases, tick=tick):
+        totals.add(after, running)
+    return totals.results()
 
 
 class GuideReturns:

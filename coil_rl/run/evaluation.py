@@ -85,15 +85,11 @@ def evaluate_policy(
     """
     measures = {"reward": Measure(unravel_key(env.reward_key), "sum"), **(measures or {})}
     totals, recorded = Totals(measures), {name: list[Tensor]() for name in record or {}}
-    options: dict[str, Any] = {"sampled": sampled, "tick": tick}
-    options["cases"] = different or len(cases) or None
-    step: dict[str, TensorDictBase] = {}
-    if watch is not None:
-        options["seen"] = lambda before, after: step.update(before=before)
-    for after, running in episodes(env, policy, **options):
+    drawn = different or len(cases) or None
+    for before, after, running in episodes(env, policy, sampled=sampled, cases=drawn, tick=tick):
         totals.add(after, running)
         if watch is not None:
-            watch(running.reshape(-1), step["before"], after)
+            watch(running.reshape(-1), before, after)
         for name, key in (record or {}).items():
             recorded[name].append(after[key])
     steps = totals.steps.tolist()
@@ -194,17 +190,6 @@ class Totals:
         return results
 
 
-@torch.no_grad()
-def totals_of(
-    env: EnvBase, policy: TensorDictModuleBase, measures: Mapping[str, Measure], **options: Any
-) -> Totals:
-    """Return the measures of one episode on every row of an env; `options` as for `episodes`."""
-    totals = Totals(measures)
-    for after, running in episodes(env, policy, **options):
-        totals.add(after, running)
-    return totals
-
-
 def _flags(entry: Tensor) -> Tensor:
     """Return an entry as flags of the rows: a number is one if it is neither 0 nor NaN."""
     return entry.reshape(-1).nan_to_num() != 0
@@ -234,9 +219,8 @@ def episodes(
     sampled: bool = False,
     cases: int | None = None,
     tick: Callable[[], Any] | None = None,
-    seen: Callable[[TensorDictBase, TensorDictBase], Any] | None = None,
-) -> Iterator[tuple[TensorDictBase, Tensor]]:
-    """Yield the entries after each step of one episode on every row.
+) -> Iterator[tuple[TensorDictBase, TensorDictBase, Tensor]]:
+    """Yield the entries before, with the action, and after each step of one episode on every row.
 
     With them comes whether the row was still in its episode, [*B, 1].
 
@@ -247,7 +231,6 @@ def episodes(
         cases: number of different cases; row i has the random numbers of row `i % cases`. None: as
             many as rows.
         tick: as above.
-        seen: is called with the entries before and after each step.
     """
     with _drawn_by_case(env, cases):
         carrier = env.eval().reset()
@@ -262,9 +245,7 @@ def episodes(
             else:
                 after = lean.step(acted["action"], acted)
                 carrier = acted.exclude(*after.keys()).update(after)
-            if seen is not None:
-                seen(acted, after)
-            yield after, running
+            yield acted, after, running
             running = running & ~after["done"]
             # The test waits for the device.
             if count % 8 == 0 and not running.any():

@@ -48,9 +48,9 @@ class Experiment:
         watch: further entries to log, as means over finished episodes ("episode") or over all steps
             ("step"), without those that are NaN.
         checkpoint_every: updates between two checkpoints.
-        callbacks: called before the first update and between updates. One with `names` measures:
-            its numbers are columns of the log. One without acts after the row was logged.
-        curve: keeps policies and evaluates them; a callback that the log has columns of.
+        callbacks: called before the first update, and after each one before its row is logged. The
+            numbers that one returns are columns of the log.
+        curve: keeps policies and evaluates them, after the row of an update was logged.
         cases: in which callbacks compare policies; their steps are frames. None: there are none.
         reserve: returns the frames that are kept for a test at the end, once the tests before the
             first update are over. None: there is no such test.
@@ -83,12 +83,9 @@ class Experiment:
         self.metrics = Metrics(self.folder / "metrics.csv", self.logger)
         self.updates = 0  # so far
         self.calls_before = 0  # of the guides in the rollouts of earlier processes
-        self.frames_before = self.before  # taken before the first update
-        self.first: dict[str, float] = {}  # what was measured before the first update
+        self.first: dict[str, float] = {}  # the row of the log before the first update
         self.ends: dict[int, int] = {}  # frames of each length of the run to its number of updates
         self.returns: deque[float] = deque(maxlen=self.EPISODES)
-        self.measuring = [callback for callback in self.callbacks if callback.names]
-        self.acting = [callback for callback in self.callbacks if not callback.names]
 
     @property
     def all_updates(self) -> int:
@@ -122,7 +119,8 @@ class Experiment:
                 self.ends[frames] = max(updates, self.updates + 1)
         if self.curve is not None:
             known = [update for update in self.ends.values() if update <= self.all_updates]
-            self.curve.attach(self.metrics, known, self.rollout.frames, self.frames_before)
+            before = int(self.first["frames"])
+            self.curve.attach(self.metrics, known, self.rollout.frames, before)
 
     def resume(self) -> None:
         """Continue from the last intact checkpoint of the folder.
@@ -158,7 +156,6 @@ class Experiment:
             first = self._measure({})
             for sentence in start_test(first):
                 say(sentence, error=True)
-            self.frames_before = self.before + self.tested
             self.first = first | self._taken()
         self._plan()
         read = [unravel_key(tuple(key)) for group in self.watch.values() for key in group.values()]
@@ -216,10 +213,10 @@ class Experiment:
         return {**row, **learned}
 
     def _measure(self, row: Mapping[str, float]) -> dict[str, float]:
-        """Return the numbers of the callbacks that measure, NaN where they are not due."""
+        """Return the numbers of the callbacks, NaN where they are not due."""
         numbers: dict[str, float] = {}
         all_updates = self.ends.get(self.frames, -1)  # not known before the first update
-        for callback in self.measuring:
+        for callback in self.callbacks:
             if callback.due(self.updates, all_updates, row):
                 numbers |= callback.after_update(self.updates)
             else:
@@ -238,7 +235,7 @@ class Experiment:
         }
 
     def _act(self, row: Mapping[str, float]) -> None:
-        """Let the callbacks act after an update, write the checkpoint, and continue the curve.
+        """Write the checkpoint after an update, and continue the curve.
 
         A training that is asked to stop writes its checkpoint, and is interrupted.
 
@@ -246,14 +243,11 @@ class Experiment:
             row: of the log; empty before the first update.
         """
         update, updates = self.updates, self.all_updates
-        for callback in self.acting:
-            if callback.due(update, updates, row):
-                callback.after_update(update)
         if row and (update % self.checkpoint_every == 0 or update == updates or STOP.requested):
             self.save()
             if STOP.requested:
                 raise KeyboardInterrupt
-        if self.curve is not None and self.curve.due(update, updates, row):
+        if self.curve is not None and self.curve.due(update):
             self._evaluate(self.curve)
 
     def _evaluate(self, curve: EvaluationCurve) -> None:
@@ -337,7 +331,6 @@ class Experiment:
             "updates": self.updates,
             "first": self.first,
             "ends": self.ends,
-            "frames_before": self.frames_before,
             "calls": self.calls_before + guide_calls(self.rollout.env),
             "cases": None if self.cases is None else self.cases.state_dict(),
             "returns": list(self.returns),
@@ -351,7 +344,6 @@ class Experiment:
         self.rollout.load_state_dict(state["rollout"])
         self.updates, self.ends = state["updates"], dict(state["ends"])
         self.first = dict(state["first"])
-        self.frames_before = state["frames_before"]
         # What building this process's env has asked its guides for is no part of the run.
         self.calls_before = state["calls"] - guide_calls(self.rollout.env)
         if self.cases is not None:

@@ -4,7 +4,7 @@ Several act in one batch, and their operations are traced once and repeated.
 """
 
 import copy
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,9 +13,6 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torch._ops import OpOverload
-from torch.fx import GraphModule, Node
-from torch.fx.node import map_arg
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from coil_rl.compiled import record
@@ -112,61 +109,12 @@ class OnRows(TensorDictModuleBase):
         return tensordict
 
 
-@torch.no_grad()
-def compute_constants(graph: GraphModule) -> None:
-    """Compute the operations of a graph that depend on its constants only, once for all calls.
-
-    Their numbers are the same to the bit. A graph that changes a tensor in place stays as it is.
-
-    Args:
-        graph: as traced by `coil_rl.compiled.record`, whose weights do not change.
-    """
-    nodes: Any = graph.graph.nodes
-    if any(_is_operation(node) and node.target._schema.is_mutable for node in nodes):
-        return
-    known: dict[Node, Any] = {}
-    for node in nodes:
-        if node.op == "get_attr":
-            known[node] = getattr(graph, node.target)
-        elif _is_operation(node) and _is_constant(node, known):
-            args, kwargs = map_arg((node.args, node.kwargs), known.__getitem__)
-            known[node] = node.target(*args, **kwargs)
-    for node in list(known):
-        if node.op == "get_attr" or known.keys() >= node.users.keys():
-            continue
-        name = f"computed_{node.name}"
-        graph.register_buffer(name, known[node])
-        with graph.graph.inserting_before(node):
-            node.replace_all_uses_with(graph.graph.get_attr(name))
-    graph.graph.eliminate_dead_code()
-    graph.recompile()
-
-
-def _is_operation(node: Any) -> bool:
-    """Return whether a node of a graph calls an operation of PyTorch."""
-    return node.op == "call_function" and isinstance(node.target, OpOverload)
-
-
-def _is_constant(node: Any, known: Container[Node]) -> bool:
-    """Return whether an operation returns the same tensor in every call of the graph.
-
-    Its inputs are known tensors, and it draws no random numbers.
-    """
-    inputs, results = node.all_input_nodes, node.target._schema.returns
-    return (
-        bool(inputs)
-        and all(each in known for each in inputs)
-        and [str(result.type) for result in results] == ["Tensor"]
-        and torch.Tag.nondeterministic_seeded not in node.target.tags
-    )
-
-
 class TracedPolicy(TensorDictModuleBase):
     """A policy with fixed weights and no other state, see `is_tensors`.
 
     Its operations are traced at the first call for a number of rows, once for each type of
-    exploration, and repeated afterwards, which takes half of the time or less. What depends on the
-    weights only is computed once. Exploration noise that somebody has written is read.
+    exploration, and repeated afterwards, which takes half of the time or less. Exploration noise
+    that somebody has written is read.
     """
 
     def __init__(self, policy: TensorDictModuleBase) -> None:
@@ -182,9 +130,7 @@ class TracedPolicy(TensorDictModuleBase):
         entries = [tensordict[key].contiguous() for key in keys]
         kind = exploration_type(), len(entries[0]), len(keys)
         if kind not in self.traced:
-            graph = record(partial(self._actions, keys), entries)
-            compute_constants(graph)
-            self.traced[kind] = graph.forward
+            self.traced[kind] = record(partial(self._actions, keys), entries).forward
         return tensordict.set("action", self.traced[kind](*entries)[0])
 
     def _actions(self, keys: Sequence[NestedKey], *entries: Tensor) -> list[Tensor]:

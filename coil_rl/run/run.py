@@ -22,7 +22,6 @@ from coil_rl.errors import NO_SPACE, UserError, is_outside
 from coil_rl.foreign.batch import SeededRows
 from coil_rl.foreign.controllers import PerRow
 from coil_rl.learners.learner import Callback, Learner
-from coil_rl.measures import Measure
 from coil_rl.output import decoration, say
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.report.runs import EVALUATION, begun_with
@@ -46,7 +45,7 @@ from coil_rl.run.folder import (
     weights_file,
     write_config,
 )
-from coil_rl.run.judge import Trial, judge, report_outcome
+from coil_rl.run.judge import Judgement, Trial, judge, report_outcome
 from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, try_out
 from coil_rl.run.reasons import SENTENCES, handed_over, next_step, start_test
 from coil_rl.run.shown import line_of, page_of
@@ -114,7 +113,6 @@ class Run:
         label: name of the policy in tables and pictures; runs with one label differ by their seed.
         seed: of the learner's first weights, of the exploration and of sampled evaluations.
         watch: further entries to log, see `Experiment`.
-        failure: measure that is true for an episode that failed, if there is one.
         noise_correlation: of the exploration noise, see `Rollout`.
         logger: makes a TorchRL logger, in addition to the CSV file.
         callbacks: makes further callbacks for a learner; `GuideReturns` for one that trains guides.
@@ -152,7 +150,6 @@ class Run:
     label: str
     seed: int = 0
     watch: Watch = field(default_factory=dict)
-    failure: Measure | None = None
     noise_correlation: float = 0.0
     logger: Callable[[], Any] | None = None
     callbacks: Callable[[Learner], Sequence[Callback]] = lambda learner: ()
@@ -262,13 +259,17 @@ class Run:
         trial = self.trial
         if cases is not None:
             trial = trial_with_cases(trial, whole("cases", cases))
-        env = self.make_env(SOME_ROWS, TEST)
-        self.try_out(env)
-        policy = self.policy(env)
         with tempfile.TemporaryDirectory() as temporary:
             place = Path(temporary) if folder is None else Path(folder).expanduser()
-            judgement = judge(trial, policy, place, self.seed, self.drivers(policy))
+            judgement = self.judge(trial, place, self.seed)
         return pd.DataFrame(judgement.table)
+
+    def judge(self, trial: Trial, folder: Path, seed: int) -> Judgement:
+        """Evaluate the policy of a finished run and the guides; see `judge`."""
+        env = trial.env(SOME_ROWS)  # not of the training, whose env may be another
+        self.try_out(env)
+        policy = self.policy(env)
+        return judge(trial, policy, folder, seed, self.drivers(policy))
 
     def controller(self, which: str | None = None) -> Controller:
         """Return what a machine is sent: the policy with guide, normaliser and memory inside.
@@ -287,7 +288,7 @@ class Run:
             return Controller(env, policy, self.folder)
         env = self.make_env(1, TRAIN)
         self.try_out(env)
-        return Controller(env, self.load_policy(env, which), self.folder, which)
+        return Controller(env, self.policy(env, which), self.folder, which)
 
     def try_out(self, env: EnvBase) -> None:
         """Try what others wrote of the run, and warn of what is found; see `Trial`.
@@ -311,10 +312,14 @@ class Run:
         Args:
             env: of the run, such as `run.make_env(rows)`; by default a new one.
             which: policy, "handed_over" or "last"; by default the one that is evaluated.
+
+        Raises:
+            UserError: if the policy is missing, damaged, or does not fit the configuration.
         """
         if not self.has_agent:
             return None
-        return self.load_policy(self.make_env() if env is None else env, which or self.which)
+        env = self.make_env() if env is None else env
+        return self._loaded(self.new_policy(env), env, which or self.which)
 
     def begin(self) -> None:
         """Write the configuration of a new run; a `UserError` if the folder holds one already."""
@@ -466,7 +471,7 @@ class Run:
                 draw_learning_curves({self.label: [rows]}, path, guides=guide_returns, cases=cases)
         training.metrics.close()
         if learner is None:
-            return self.load_policy(self.make_env())
+            return self.policy()
         learner.export(self.folder)
         return self._loaded(learner.policy, training.rollout.env, self.which)
 
@@ -503,17 +508,9 @@ class Run:
             )
         return self.make_learner
 
-    def load_policy(self, env: EnvBase, which: str = HANDED_OVER) -> TensorDictModuleBase:
-        """Return the policy of the run for an env with its transforms.
-
-        Args:
-            env: with the transforms of the run.
-            which: "handed_over" or "last".
-
-        Raises:
-            UserError: if the policy is missing, damaged, or does not fit the configuration.
-        """
-        return self._loaded(self.require_agent()(env).policy, env, which)
+    def new_policy(self, env: EnvBase) -> TensorDictModuleBase:
+        """Return a policy as the run has, for an env with its transforms, with first weights."""
+        return self.require_agent()(env).policy
 
     def _loaded(
         self, policy: TensorDictModuleBase, env: EnvBase, which: str
@@ -552,12 +549,12 @@ class Run:
         """Return any env with the guides and transforms of the run, and the policy of the run.
 
         The own env and tracks of the run are not built. Arguments and errors are those of
-        `load_policy`; a policy that cannot act in this env is a `UserError` too.
+        `policy`; a policy that cannot act in this env is a `UserError` too.
         """
         self.require_agent()
         try:
             transformed = self.make_env.around(env)
-            return transformed, self.load_policy(transformed, which)
+            return transformed, self.policy(transformed, which)
         except UserError as error:
             raise UserError(f"run {self.folder}: {error}") from error
 

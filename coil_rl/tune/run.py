@@ -58,11 +58,8 @@ class TunedRun(Run):
         """Whether the run has a policy: the one that follows the tuned guide."""
         return True
 
-    def load_policy(self, env: EnvBase, which: str = HANDED_OVER) -> TensorDictModuleBase:
+    def new_policy(self, env: EnvBase) -> TensorDictModuleBase:
         """Return the policy that follows the tuned guide of an env.
-
-        Args:
-            which: "handed_over" or "last", which are the same here.
 
         Raises:
             UserError: if the run is not finished, or its files are damaged.
@@ -72,7 +69,7 @@ class TunedRun(Run):
                 f"{self.folder} has no {record.TUNED.name} yet; finish it with "
                 f"{self.resume_command}"
             )
-        return self._loaded(GuideActs(env), env, which)
+        return GuideActs(env)
 
     def training(self, before: int) -> Any:
         """Return the search, a `TunedTraining`."""

@@ -166,11 +166,9 @@ class Tuner:
             cases: C, number of new cases.
         """
         guides = [self.make_guide(each) for each in values]
-        if self.cases.can_copy():
-            self.cases.renew(cases, len(guides))
-            return list(self._act(guides).split(cases))
+        beside = [guides] if self.cases.can_copy() else [[guide] for guide in guides]
         self.cases.renew(cases)
-        return [self._act([guide]) for guide in guides]
+        return [part for each in beside for part in self._act(each).split(cases)]
 
     def test(self) -> dict[str, Tensor]:
         """Return the returns of `OWN`, `MEAN` and `BEST` in the same further new cases, [C]."""
@@ -229,10 +227,7 @@ class Tuner:
     def _act(self, guides: Sequence[TensorDictModuleBase]) -> Tensor:
         """Return the returns of guides in the present rows, [rows]."""
         self.candidates.replace(guides)
-        env = self.cases.env
-        if env is None:
-            raise RuntimeError("there are no cases yet")
-        return self.cases.returns(FollowAdvice(env))
+        return self.cases.returns(FollowAdvice(self.cases.env_of(len(guides))), len(guides))
 
 
 def chosen(returns: Mapping[str, Tensor]) -> str:

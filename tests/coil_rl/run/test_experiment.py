@@ -97,7 +97,7 @@ def test_same_seed_same_metrics(tmp_path):
 
 def test_tests_that_take_all_frames_leave_one_further_update(tmp_path):
     run = experiment(tmp_path / "run")
-    run.reserve, run.updates = lambda: 10**6, 3
+    run.reserve, run.updates, run.first = lambda: 10**6, 3, {"frames": 0}
     run._plan()
     assert run.all_updates == 4
 

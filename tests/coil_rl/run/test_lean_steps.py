@@ -119,7 +119,7 @@ def test_episodes_are_those_of_torchrl_to_the_bit(make_env, monkeypatch):
             if not lean:
                 patch.setattr(LeanEnv, "covers", lambda env: False)
             steps = itertools.islice(episodes(env, policy, sampled=True), 30)
-            kept.append([(after.copy(), running) for after, running in steps])
+            kept.append([(after.copy(), running) for _, after, running in steps])
     assert len(kept[0]) == len(kept[1])
     for (one, running), (other, theirs) in zip(*kept, strict=True):
         assert torch.equal(running, theirs)

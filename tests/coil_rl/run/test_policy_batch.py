@@ -7,7 +7,6 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from worlds import cones, perturbed
 
-from coil_rl.compiled import record
 from coil_rl.imitation import ForestRegressor, Imitation, LinearRegressor
 from coil_rl.learners import DQN, PPO, SAC, Anchor
 from coil_rl.run.policy_batch import (
@@ -15,7 +14,6 @@ from coil_rl.run.policy_batch import (
     OnRows,
     StackedPolicies,
     TracedPolicy,
-    compute_constants,
     is_tensors,
     policy_batch,
 )
@@ -71,34 +69,6 @@ def test_recorded_policy_acts_and_draws_like_the_policy_on_any_number_of_rows(le
                     actions.append([each(observations(env)[:count])["action"] for _ in range(3)])
             torch.testing.assert_close(*actions)
     assert len(recorded.traced) == 4
-
-
-def test_what_depends_on_constants_only_is_computed_once():
-    weights, index = torch.rand(3, 5), torch.zeros(2, 3)
-
-    def function(rows):
-        scaled = (weights.t() ** 2 + 1).contiguous()
-        drawn = torch.rand_like(weights)
-        return [rows @ scaled, weights.t(), rows + drawn.sum()]
-
-    graph = record(function, [torch.rand(4, 5)])
-    rows, results = torch.rand(4, 5), []
-    for _ in range(2):
-        torch.manual_seed(0)
-        results.append(graph(rows))
-        compute_constants(graph)
-    for expected, result in zip(*results, strict=True):
-        assert torch.equal(result, expected)
-    called = [str(node.target) for node in graph.graph.nodes if node.op == "call_function"]
-    kept = ("add.Tensor", "mm.default", "rand_like.default", "sum.default")
-    assert sorted(called) == [f"aten.{name}" for name in kept]
-    torch.manual_seed(1)
-    assert not torch.equal(graph(rows)[2], results[0][2])
-
-    filled = record(lambda rows: [index.clone().add_(rows)], [torch.rand(2, 3)])
-    compute_constants(filled)
-    for _ in range(2):
-        assert torch.equal(filled(torch.ones(2, 3))[0], torch.ones(2, 3))
 
 
 @pytest.mark.parametrize("choices", [False, True])
