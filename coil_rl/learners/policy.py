@@ -8,7 +8,7 @@ updates use the latter.
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
-from tensordict import NestedKey
+from tensordict import NestedKey, unravel_key
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
@@ -47,7 +47,7 @@ def next_of(entries: Entries) -> Entries:
     """Return the entries after a step by the keys of those before it."""
     return Entries(
         {
-            key[1:] if len(key) > 2 else key[1]: value
+            unravel_key(key[1:]): value
             for key, value in entries.items()
             if isinstance(key, tuple) and key[0] == "next"
         }

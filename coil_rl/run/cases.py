@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
 from coil_rl.envs.seeded_env import SeededEnv
+from coil_rl.learners.learner import Stateful
 from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, episodes
@@ -26,7 +27,7 @@ MOST_CASES = 32  # of the test at the end
 
 
 @dataclass(eq=False)
-class TrainingCases:
+class TrainingCases(Stateful):
     """Cases of a training in which policies are compared, the `Cases` of its learner.
 
     They are drawn as the episodes of the training are. All policies act in them from the same seed,
@@ -48,6 +49,8 @@ class TrainingCases:
         guide_ahead: whether a guide that is not held was better in every case of the start test.
         taught: what learns from the steps of compared policies, and the entries that it needs.
     """
+
+    parts: ClassVar = ("generator", "steps", "episodes", "calls", "guide_ahead")
 
     build: Callable[[int], EnvBase]
     frames: int
@@ -138,7 +141,7 @@ class TrainingCases:
         if len(pairs) > 1 and self._can_act_beside(policies):
             env = self.env_of(len(pairs))
             beside = [
-                Acting(self._exploring(env, traced(policy), samples, len(pairs)), samples)
+                Acting(exploring(traced(policy), env, self._noise(samples), len(pairs)), samples)
                 for policy, samples in pairs
             ]
             totals = self._acted(env, OnRows(beside))
@@ -146,22 +149,15 @@ class TrainingCases:
             return list(totals.results()["return"].split(self.count))
         env = self.env_of(1)
         alone = [
-            self._acted(env, self._exploring(env, policy, samples), sampled=samples)
+            self._acted(env, exploring(policy, env, self._noise(samples)), sampled=samples)
             for policy, samples in pairs
         ]
         self.taken = [int(totals.steps.sum()) for totals in alone]
         return [totals.results()["return"] for totals in alone]
 
-    def _exploring(
-        self, env: EnvBase, policy: TensorDictModuleBase, samples: bool, parts: int = 1
-    ) -> TensorDictModuleBase:
-        """Return a policy with the exploration noise of the training, if it samples its actions.
-
-        Args:
-            samples: whether it samples its actions.
-            parts: number of equal parts of the rows, on one of which it acts.
-        """
-        return exploring(policy, env, self.noise_correlation, parts) if samples else policy
+    def _noise(self, samples: bool) -> float:
+        """Return the correlation of the noise of a policy that may sample its actions."""
+        return self.noise_correlation if samples else 0.0
 
     def _can_act_beside(self, policies: Sequence[TensorDictModuleBase]) -> bool:
         """Return whether policies can act side by side in one env."""
@@ -210,22 +206,6 @@ class TrainingCases:
         self.longest = max(self.longest, int(totals.steps.max()))
         self.calls += guide_calls(env) - calls
         return totals
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what later comparisons depend on."""
-        return {
-            "generator": self.generator.get_state(),
-            "steps": self.steps,
-            "episodes": self.episodes,
-            "calls": self.calls,
-            "guide_ahead": self.guide_ahead,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
-        self.generator.set_state(state["generator"])
-        self.steps, self.calls = state["steps"], state["calls"]
-        self.episodes, self.guide_ahead = state["episodes"], state["guide_ahead"]
 
 
 def further_cases(done: int, taken: int, frames: int) -> int:

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.errors import UserError, file_of_a_run, is_outside
 from coil_rl.learners.anchor import rest_guides
-from coil_rl.learners.learner import Callback, Learner
+from coil_rl.learners.learner import Callback, Learner, Stateful
 from coil_rl.output import decoration, progress, say
 from coil_rl.report.table import return_format
 from coil_rl.run import checkpoint
@@ -30,7 +30,7 @@ PUT_BACK = "put the files of the run back, or train again in another folder"
 
 
 @dataclass(eq=False)
-class Experiment:
+class Experiment(Stateful):
     """The training of one run in one folder.
 
     Files: `metrics.csv` (a row for the state before the first update and after each update),
@@ -61,6 +61,7 @@ class Experiment:
     """
 
     EPISODES: ClassVar[int] = 100  # the return is the mean over this many finished episodes
+    parts: ClassVar = ("learner", "rollout", "cases", "updates", "first", "ends")
 
     learner: Learner
     rollout: Rollout
@@ -324,15 +325,9 @@ class Experiment:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the rest of the run depends on."""
-        return {
-            "learner": self.learner.state_dict(),
-            "rollout": self.rollout.state_dict(),
+        return super().state_dict() | {
             "identity": self.identity,
-            "updates": self.updates,
-            "first": self.first,
-            "ends": self.ends,
             "calls": self.calls_before + guide_calls(self.rollout.env),
-            "cases": None if self.cases is None else self.cases.state_dict(),
             "returns": list(self.returns),
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
@@ -340,14 +335,9 @@ class Experiment:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state that `state_dict` returned."""
-        self.learner.load_state_dict(state["learner"])
-        self.rollout.load_state_dict(state["rollout"])
-        self.updates, self.ends = state["updates"], dict(state["ends"])
-        self.first = dict(state["first"])
+        super().load_state_dict(state)
         # What building this process's env has asked its guides for is no part of the run.
         self.calls_before = state["calls"] - guide_calls(self.rollout.env)
-        if self.cases is not None:
-            self.cases.load_state_dict(state["cases"])
         self.returns = deque(state["returns"], maxlen=self.EPISODES)
         torch.set_rng_state(state["torch_rng"])
         if state["cuda_rng"]:

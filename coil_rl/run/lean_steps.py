@@ -9,7 +9,7 @@ what is read. All others keep TorchRL's step, see `LeanSteps.covers`.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor, where
 from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
@@ -94,7 +94,7 @@ class LeanSteps:
     def __init__(self, env: EnvBase, policy: Any, keys: Sequence[NestedKey]) -> None:
         self.env = LeanEnv(env)
         self.before = [key for key in keys if not _is_next(key)]
-        self.after = {key: _in_next(key) for key in keys if _is_next(key)}
+        self.after = {key: unravel_key(key[1:]) for key in keys if _is_next(key)}
         self.carried = [*_observed(policy, keys), *self.env.sums]
 
     @staticmethod
@@ -176,8 +176,3 @@ def _observed(policy: Any, keys: Sequence[NestedKey]) -> list[NestedKey]:
 
 def _is_next(key: NestedKey) -> bool:
     return isinstance(key, tuple) and key[0] == "next"
-
-
-def _in_next(key: Any) -> NestedKey:
-    """Return the key of an entry after a step, without `next`."""
-    return key[1] if len(key) == 2 else key[1:]

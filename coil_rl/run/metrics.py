@@ -1,6 +1,5 @@
 """The log of a run: one row of numbers for each update, in a CSV file and in any TorchRL logger."""
 
-import csv
 import math
 import os
 from collections.abc import Callable, Mapping
@@ -85,12 +84,9 @@ class Metrics:
             )
         row = dict.fromkeys(columns, math.nan) | row
         self.rows.append(row)
-        first = not self.path.exists()
+        text, first = csv_text([row]), not self.path.exists()
         with self.path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, columns, lineterminator="\n")
-            if first:
-                writer.writeheader()
-            writer.writerow(row)
+            file.write(text if first else text.partition("\n")[2])
         self.log(row, int(row["frames"]))
 
     def log(self, values: Mapping[str, float], frames: int) -> None:
