@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any, TypeAlias
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor, nn
 from torchrl.envs import Compose, InitTracker, RewardSum, TensorDictPrimer, Transform
 from torchrl.envs import TransformedEnv as Env
@@ -150,6 +150,14 @@ class Other(Link):
         return {} if self.tensors else {BEFORE: data}
 
 
+def memory_keys(policy: Any) -> list[tuple[str, ...]]:
+    """Return the entries that a policy writes for its next step, `("next", ...)`.
+
+    There are none without a memory.
+    """
+    return [key for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
+
+
 class Remembered(Link):
     """What a policy remembers: what it reads as `k` and writes as `("next", k)`, and `is_init`.
 
@@ -160,8 +168,7 @@ class Remembered(Link):
 
     def __init__(self, env: Env, policy: Any) -> None:
         super().__init__(in_keys=[], out_keys=[])
-        written = [key for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
-        names = [key[1] if len(key) == 2 else key[1:] for key in written]
+        names = [unravel_key(key[1:]) for key in memory_keys(policy)]
         self.keys: list[NestedKey] = [key for key in names if key in policy.in_keys]
         own = env.base_env.observation_spec.keys(True, True)
         self.marks = "is_init" in policy.in_keys and "is_init" not in own

@@ -1,7 +1,7 @@
 """The cases of a training in which policies are compared; their steps are frames."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -17,8 +17,9 @@ from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, episodes
 from coil_rl.run.exploration import exploring
 from coil_rl.run.parts import SOME_ROWS
-from coil_rl.run.policy_batch import Acting, OnRows, memory_keys, traced
+from coil_rl.run.policy_batch import Acting, OnRows, traced
 from coil_rl.transforms import GuideActions
+from coil_rl.transforms.chain import memory_keys
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 SEEDS = 2**31  # seeds of cases are below
@@ -56,20 +57,15 @@ class TrainingCases(Stateful):
     frames: int
     seed: int = 0
     noise_correlation: float = 0.0
-    steps: int = field(default=0, init=False)
-    episodes: int = field(default=0, init=False)
-    calls: int = field(default=0, init=False)
-    guide_ahead: bool = field(default=False, init=False)
-    taught: tuple[Sequence[NestedKey], Callable[[TensorDictBase], Any]] | None = field(
-        default=None, init=False
-    )
 
     def __post_init__(self) -> None:
+        self.steps = self.episodes = self.longest = self.calls = 0
+        self.guide_ahead = False
+        self.taught: tuple[Sequence[NestedKey], Callable[[TensorDictBase], Any]] | None = None
         self.generator = torch.Generator().manual_seed(self.seed)
         self.env: EnvBase | None = None
         self.env_seed, self.count = 0, 0
         self.taken: list[int] = []
-        self.longest = 0
 
     def teach(self, keys: Sequence[NestedKey], learn: Callable[[TensorDictBase], Any]) -> None:
         """Let something learn from the steps of compared policies."""

@@ -77,10 +77,6 @@ class EvaluationCurve:
         self.metrics, self.stages = metrics, list(stages)
         self.frames_of_update, self.frames_before = frames, before
 
-    def due(self, update: int) -> bool:
-        """Return whether a policy is to be kept, or the kept ones to be evaluated."""
-        return update in self.kept() or bool(self.batch(update))
-
     def after_update(self, update: int) -> None:
         """Keep the policy, and evaluate the kept ones, if it is time and it is not done.
 

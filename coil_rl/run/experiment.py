@@ -248,7 +248,7 @@ class Experiment(Stateful):
             self.save()
             if STOP.requested:
                 raise KeyboardInterrupt
-        if self.curve is not None and self.curve.due(update):
+        if self.curve is not None:
             self._evaluate(self.curve)
 
     def _evaluate(self, curve: EvaluationCurve) -> None:

@@ -4,7 +4,7 @@ import errno
 import os
 import platform
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -17,7 +17,6 @@ from coil_rl.errors import RunningError, UserError
 from coil_rl.files import remove_unfinished, write_text
 from coil_rl.output import say
 from coil_rl.plain_yaml import read_yaml, yaml_of
-from coil_rl.run.stopping import resume_command
 
 CONFIG = "config.yaml"
 CODE, CODE_BEFORE = "code", "code_before"  # keys of it, see `code_of`
@@ -57,35 +56,8 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
         ) from None
 
 
-def begin(
-    folder: Path,
-    saved: Mapping[str, Any],
-    command: Sequence[str] = (),
-    trust: Sequence[str] = (),
-) -> None:
-    """Write the versions, the configuration and the command of a new run.
-
-    Args:
-        saved: the configuration, plain values only; written as `config.yaml`.
-        command: what was typed; written as `command.txt`, if there is any.
-        trust: packages that a command which goes on with the run must trust.
-
-    Raises:
-        UserError: if there is a run already.
-    """
-    if (folder / CONFIG).exists():
-        raise UserError(
-            f"{folder} already holds a run; resume it with {resume_command(folder, trust)}, or "
-            "choose another folder with hydra.run.dir=FOLDER"
-        )
-    record.VERSIONS.write(folder, versions())
-    if command:
-        record.COMMAND.write(folder, list(command))
-    write_config(folder, saved)
-
-
 def write_config(folder: Path, saved: Mapping[str, Any]) -> None:
-    """Write the configuration of a run."""
+    """Write the configuration of a run: plain values only."""
     write_text(folder / CONFIG, yaml_of(saved))
 
 

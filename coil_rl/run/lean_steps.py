@@ -71,15 +71,15 @@ class LeanEnv:
 
     def reset(self, rows: Tensor) -> TensorDictBase:
         """Return the entries after a reset of some rows, [B, 1]."""
-        mask = self.few(_reset=rows)
+        mask = self.data({"_reset": rows})
         first = self.base._reset(mask)
         for link in self.links:
             first = link._reset(mask, first)
         return first
 
-    def few(self, **entries: Tensor) -> TensorDict:
-        """Return a few entries as data of the env."""
-        return TensorDict(entries, self.batch_size, device=self.device)
+    def data(self, entries: Mapping[NestedKey, Tensor]) -> TensorDict:
+        """Return entries as data of the env."""
+        return TensorDict(dict(entries), self.batch_size, device=self.device)
 
 
 class LeanSteps:
@@ -142,13 +142,6 @@ class LeanSteps:
             rows = done.view(-1, *(1,) * (value.ndim - 1))
             carried[key] = where(rows, first[key], value)
         return carried
-
-    def data(self, entries: Entries) -> TensorDict:
-        """Return entries as data of the env."""
-        data = self.env.few()
-        for key, value in entries.items():
-            data[key] = value
-        return data
 
 
 def _transforms(env: EnvBase) -> list[Transform]:

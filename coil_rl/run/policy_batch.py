@@ -17,6 +17,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type, set_exploratio
 
 from coil_rl.compiled import record
 from coil_rl.learners.policy import NOISE
+from coil_rl.transforms.chain import memory_keys
 
 
 def policy_batch(
@@ -39,14 +40,6 @@ def is_tensors(policy: TensorDictModuleBase) -> bool:
     buffers = policy.named_buffers(remove_duplicate=False)
     tensors = {name for name, _ in [*parameters, *buffers]}
     return tensors == set(policy.state_dict()) and not memory_keys(policy)
-
-
-def memory_keys(policy: TensorDictModuleBase) -> list[NestedKey]:
-    """Return the entries that a policy writes for its next step, `("next", ...)`.
-
-    There are none without a memory.
-    """
-    return [key for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
 
 
 def traced(policy: TensorDictModuleBase) -> TensorDictModuleBase:

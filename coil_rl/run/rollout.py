@@ -109,9 +109,9 @@ class Rollout:
                 for key in self.keys or step.keys(True, True):
                     columns.setdefault(key, []).append(step[key])
         except Exception:
-            self.acting = acting if lean is None else lean.data(acting)
+            self.acting = acting if lean is None else lean.env.data(acting)
             raise
-        return carrier if lean is None else lean.data(carrier)
+        return carrier if lean is None else lean.env.data(carrier)
 
     def _stacked(self, columns: Mapping[NestedKey, list[Tensor]]) -> TensorDictBase:
         time = len(self.env.batch_size)

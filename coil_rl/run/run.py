@@ -35,13 +35,13 @@ from coil_rl.run.folder import (
     CODE,
     CODE_BEFORE,
     HANDED_OVER,
-    begin,
     changed_code,
     code_of,
     is_begun,
     is_evaluated,
     locked,
     report_changed_versions,
+    versions,
     weights_file,
     write_config,
 )
@@ -322,10 +322,22 @@ class Run:
         return self._loaded(self.new_policy(env), env, which or self.which)
 
     def begin(self) -> None:
-        """Write the configuration of a new run; a `UserError` if the folder holds one already."""
+        """Write the versions, the command and the configuration of a new run.
+
+        Raises:
+            UserError: if the folder holds one already.
+        """
+        if is_begun(self.folder):
+            raise UserError(
+                f"{self.folder} already holds a run; resume it with "
+                f"{resume_command(self.folder, self.trust)}, or choose another folder with "
+                "hydra.run.dir=FOLDER"
+            )
+        record.VERSIONS.write(self.folder, versions())
+        if self.command:
+            record.COMMAND.write(self.folder, list(self.command))
         code = dict(self.code())
-        settings = {**self.settings, **({CODE: code} if code else {})}
-        begin(self.folder, settings, self.command, self.trust)
+        write_config(self.folder, {**self.settings, **({CODE: code} if code else {})})
 
     def lengthen(self, frames: int, changed: str = "") -> None:
         """Set a new length, before the run goes on.
