@@ -42,7 +42,8 @@ class EvaluationCurve:
     Args:
         folder: of the run.
         policy: of the learner; copies of it act.
-        envs: for each set of cases, makes an env with all of them for a number of policies.
+        make_env: makes the envs.
+        sets: names of the sets of cases.
         watch: further measures, "episode" at the end of an episode, "step" as the mean over its
             steps.
         points: number of policies that are kept, besides the first one.
@@ -55,14 +56,15 @@ class EvaluationCurve:
 
     folder: Path
     policy: TensorDictModuleBase
-    envs: Mapping[str, Callable[[int], EnvBase]]
+    make_env: EnvMaker
+    sets: Iterable[str]
     _: KW_ONLY
     watch: Watch = field(default_factory=dict)
     points: int = 16
     batches: int = 1
 
     def __post_init__(self) -> None:
-        self.columns = columns_of(self.envs, self.watch)
+        self.columns = columns_of(self.sets, self.watch)
 
     def attach(self, metrics: Metrics, stages: Sequence[int], frames: int, before: int) -> None:
         """Tell the curve about the run.
@@ -122,9 +124,9 @@ class EvaluationCurve:
             torch.random.fork_rng(),
             progress(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar,
         ):
-            for cases, make_env in self.envs.items():
-                env = make_env(len(updates))
-                count = env.batch_size.numel() // len(updates)
+            for cases in self.sets:
+                count = self.make_env.sizes[cases]
+                env = self.make_env(len(updates) * count, cases)
                 results = measures(env, policies, cases=count, watch=self.watch, tick=bar.update)
                 for row, means in zip(rows, means_of(results, cases, len(rows)), strict=True):
                     row |= means

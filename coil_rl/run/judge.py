@@ -195,7 +195,11 @@ def judge(
     torch.manual_seed(seed)
     with progress(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
         if policy is not None:
-            _evaluate(trial, policy, judgement, bar)
+            samples = isinstance(policy, ProbabilisticTensorDictSequential)
+            acting, repeats = traced(policy), trial.repeats if samples else 0
+            for advice in ("", *trial.advice):
+                bar.set_postfix_str(", ".join(filter(None, (trial.label, advice))))
+                _evaluate(trial, acting, judgement, bar, advice, 0 if advice else repeats)
         for driver in drivers:
             result = trial.evaluation.run(trial.env(len(trial.evaluation.cases)), driver.policy)
             judgement.add(result, f"{trial.label} {driver.name}")
@@ -211,31 +215,24 @@ def judge(
     return judgement
 
 
-def _evaluate(trial: Trial, policy: TensorDictModuleBase, judgement: Judgement, bar: Any) -> None:
-    """Add the episodes of a policy with each kind of advice, and of the guides beside it."""
-    samples = isinstance(policy, ProbabilisticTensorDictSequential)
-    policy = traced(policy)
-    for advice in ("", *trial.advice):
-        bar.set_postfix_str(", ".join(filter(None, (trial.label, advice))))
-        beside = trial.guides if trial.together and not advice else ()
-        repeats = trial.repeats if samples and not advice else 0
-        _evaluate_with(trial, policy, judgement, bar, advice, beside, repeats)
-
-
-def _evaluate_with(
+def _evaluate(
     trial: Trial,
     policy: TensorDictModuleBase,
     judgement: Judgement,
     bar: Any,
     advice: str,
-    beside: Sequence[str],
     repeats: int,
 ) -> None:
     """Add the episodes of a policy with one kind of advice, and of the guides beside it.
 
     All episodes run in one batch: the time of a step hardly depends on its size.
+
+    Args:
+        advice: empty for the policy's own, beside which the guides act.
+        repeats: episodes a case with sampled actions.
     """
     count = len(trial.evaluation.cases)
+    beside = trial.guides if trial.together and not advice else ()
     own = (1 + repeats) * count
     guides = {name: slice(own + n * count, own + (n + 1) * count) for n, name in enumerate(beside)}
     env = trial.env(own + len(guides) * count, advice)

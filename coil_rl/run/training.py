@@ -18,7 +18,7 @@ from coil_rl.run.curve import EvaluationCurve
 from coil_rl.run.delivery import Delivery
 from coil_rl.run.experiment import Experiment, watched_keys
 from coil_rl.run.folder import weights_file
-from coil_rl.run.parts import TESTS, EnvMaker
+from coil_rl.run.parts import TESTS
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms.normalised_action import given_units, units_of
 
@@ -91,20 +91,15 @@ def _curve_of(run: Run, policy: TensorDictModuleBase) -> EvaluationCurve | None:
         return None
     # An earlier policy is chosen by the test at the end, if there is one.
     sets = [EVALUATION] if run.delivery == "tested" else sizes
-    envs = {cases: partial(_rows_of_policies, run.make_env, cases) for cases in sets}
     return EvaluationCurve(
         run.folder,
         policy,
-        envs,
+        run.make_env,
+        sets,
         watch=run.watch,
         points=run.budget.points,
         batches=run.budget.batches,
     )
-
-
-def _rows_of_policies(make_env: EnvMaker, cases: str, policies: int) -> EnvBase:
-    """Return an env with all cases of a set for each of some policies."""
-    return make_env(policies * make_env.sizes[cases], cases)
 
 
 def _say_units(env: EnvBase) -> None:

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from torchrl.envs import Compose, RewardSum, TransformedEnv
+from torchrl.envs import RewardSum, TransformedEnv
 from worlds import driving_measures, perturbed
 
 from coil_rl import GymnasiumEnv
@@ -13,6 +13,7 @@ from coil_rl.learners import PPO
 from coil_rl.run.curve import EvaluationCurve, measures
 from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.run.metrics import Metrics
+from coil_rl.run.parts import EnvMaker
 from coil_rl.transforms import GuideActions
 
 CASES = 5
@@ -22,16 +23,22 @@ WATCH = {
 }
 
 
-def world(tracks, drivers=1, *transforms):
+def maker(tracks):
     options = {"starts": CASES, "assignment": "cyclic", "rate": 6, "time_limit": 4}
-    env = ConeTrackEnv(tracks, drivers * CASES, **options)
-    guided = GuideActions({"spline": SplineGuide()})
-    return TransformedEnv(env, Compose(RewardSum(), guided, *transforms))
+    return EnvMaker(
+        lambda rows, cases, count: ConeTrackEnv(tracks, rows, **options),
+        transforms=lambda advice: [GuideActions({"spline": SplineGuide()})],
+        sizes=dict.fromkeys(("evaluation", "selection"), CASES),
+    )
+
+
+def world(tracks):
+    return maker(tracks)(CASES)
 
 
 def curve(folder, tracks, policy, stages=(1,), **options):
-    envs = dict.fromkeys(("evaluation", "selection"), lambda policies: world(tracks, policies))
-    line = EvaluationCurve(folder, policy, envs, watch=WATCH, **options)
+    make_env = maker(tracks)
+    line = EvaluationCurve(folder, policy, make_env, make_env.sizes, watch=WATCH, **options)
     line.attach(Metrics(folder / "metrics.csv"), stages, frames=100, before=28)
     return line
 

@@ -18,6 +18,7 @@ from coil_rl.run.cases import TrainingCases
 from coil_rl.run.curve import EvaluationCurve
 from coil_rl.run.experiment import Experiment, watched_keys
 from coil_rl.run.metrics import Metrics
+from coil_rl.run.parts import EnvMaker
 from coil_rl.run.rollout import Rollout
 from coil_rl.run.stopping import STOP, resume_command
 from coil_rl.transforms import GuideActions
@@ -35,8 +36,11 @@ def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=(), anchor=N
     learner = PPO(env, ["observation", "guide_action"], **options)
     rollout = Rollout(env, learner.policy, 8, [*learner.keys, *watched_keys(env, WATCH)])
     folder.mkdir(exist_ok=True)
-    envs = dict.fromkeys(("evaluation", "selection"), cases)
-    curve = EvaluationCurve(folder, learner.policy, envs, points=4, batches=2)
+    sizes = {"evaluation": 3, "selection": 3}
+    make_env = EnvMaker(
+        cases, transforms=lambda advice: [GuideActions({"guide": SplineGuide()})], sizes=sizes
+    )
+    curve = EvaluationCurve(folder, learner.policy, make_env, sizes, points=4, batches=2)
     return Experiment(
         learner,
         rollout,
@@ -56,11 +60,8 @@ def of_tests(rows):
     return TransformedEnv(env, Compose(GuideActions({"guide": SplineGuide()}), RewardSum()))
 
 
-def cases(drivers):
-    env = ConeTrackEnv(
-        shipped_tracks("test"), 3 * drivers, assignment="cyclic", rate=6, time_limit=1
-    )
-    return TransformedEnv(env, Compose(GuideActions({"guide": SplineGuide()}), RewardSum()))
+def cases(rows, cases, count):
+    return ConeTrackEnv(shipped_tracks("test"), rows, assignment="cyclic", rate=6, time_limit=1)
 
 
 def contents(folder):
