@@ -16,11 +16,11 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.measures import Measure, in_info
 from coil_rl.run.lean_steps import LeanEnv
+from coil_rl.run.policy_batch import acted
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 
@@ -237,15 +237,15 @@ def episodes(
         lean = LeanEnv(env) if LeanEnv.covers(env) else None
         running = torch.ones_like(env.full_done_spec["done"].zero())
         for count in itertools.count(1):
-            acted = _act(policy, carrier, sampled)
+            before = acted(policy, carrier, sampled)
             # Entries of a policy for the next step, `("next", KEY)`, are left to TorchRL.
-            if lean is None or "next" in acted:
-                step = env.step(acted)
+            if lean is None or "next" in before:
+                step = env.step(before)
                 after, carrier = step["next"], env.step_mdp(step)
             else:
-                after = lean.step(acted["action"], acted)
-                carrier = acted.exclude(*after.keys()).update(after)
-            yield acted, after, running
+                after = lean.step(before["action"], before)
+                carrier = before.exclude(*after.keys()).update(after)
+            yield before, after, running
             running = running & ~after["done"]
             # The test waits for the device.
             if count % 8 == 0 and not running.any():
@@ -267,8 +267,3 @@ def _drawn_by_case(env: EnvBase, cases: int | None) -> Iterator[None]:
     finally:  # a guide may be a part of another env too
         for part, different in zip(parts, before, strict=True):
             part.different = different
-
-
-def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool) -> TensorDictBase:
-    with set_exploration_type(ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC):
-        return policy(carrier)

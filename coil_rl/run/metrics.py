@@ -120,10 +120,10 @@ class Metrics:
             rows[number] |= values
         write_text(self.path, csv_text(rows))
 
-    def newest(self, name: str = RETURN) -> float | None:
-        """Return the newest number in a column; None if there is none yet."""
+    def newest(self) -> float | None:
+        """Return the newest mean return of the curve; None if there is none yet."""
         for row in reversed(self.rows):
-            value = row.get(name, math.nan)
+            value = row.get(RETURN, math.nan)
             if not math.isnan(value):
                 return value
         return None

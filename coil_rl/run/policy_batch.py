@@ -47,6 +47,12 @@ def traced(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     return TracedPolicy(policy) if is_tensors(policy) else policy
 
 
+def acted(policy: TensorDictModuleBase, entries: TensorDictBase, sampled: bool) -> TensorDictBase:
+    """Return what a policy writes, with sampled or with deterministic actions."""
+    with set_exploration_type(ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC):
+        return policy(entries)
+
+
 @dataclass(frozen=True, eq=False)
 class Acting:
     """A policy in an env, and the rows on which it acts.
@@ -66,11 +72,9 @@ class Acting:
 
     def act(self, entries: TensorDictBase, rows: slice) -> TensorDictBase:
         """Return what the policy writes for some rows of the entries of an env."""
-        kind = ExplorationType.RANDOM if self.sampled else ExplorationType.DETERMINISTIC
-        with set_exploration_type(kind):
-            if self.whole:
-                return self.policy(entries.copy())[rows]
-            return self.policy(entries[rows])
+        if self.whole:
+            return acted(self.policy, entries.copy(), self.sampled)[rows]
+        return acted(self.policy, entries[rows], self.sampled)
 
 
 class OnRows(TensorDictModuleBase):
@@ -92,12 +96,13 @@ class OnRows(TensorDictModuleBase):
         """Write the `action` of the policy of each row, and what policies remember."""
         entries = tensordict.select(*self.in_keys)
         size = len(entries) // len(self.parts)
-        acted = []
+        written = []
         for number, part in enumerate(self.parts):
-            acted.append(part.act(entries, part.rows or slice(number * size, (number + 1) * size)))
+            rows = part.rows or slice(number * size, (number + 1) * size)
+            written.append(part.act(entries, rows))
         for key in self.out_keys:
             # What a policy remembers stays as it is on the rows of the others.
-            own = [each[key] if key in each.keys(True) else each[key[1:]] for each in acted]
+            own = [each[key] if key in each.keys(True) else each[key[1:]] for each in written]
             tensordict.set(key, torch.cat(own))
         return tensordict
 

@@ -437,7 +437,7 @@ class Run:
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"continue with: {self.resume_command}") from None
         except ValueError as error:  # of env or controller, before or after the training
-            if isinstance(error, UserError) or not is_outside(error):
+            if not is_outside(error):
                 raise
             raise UserError(
                 f"{error}; what is finished is kept: correct the cause and continue with "
