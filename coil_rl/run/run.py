@@ -368,9 +368,10 @@ class Run:
         self.identity = dict(self.identity) | {"budget.frames": frames, "budget.stages": stages}
         if not begun:
             return
-        write_config(self.folder, {**self.settings, **code_of(self.folder)})
+        # With a new length and an evaluation it would be a finished run.
         for file in (record.EVALUATION, record.PAGE, record.SECONDS, record.DELIVERY):
             (self.folder / file.name).unlink(missing_ok=True)
+        write_config(self.folder, {**self.settings, **code_of(self.folder)})
         say(
             f"{self.folder} goes on from {budget.frames:,} to {frames:,} frames; schedules over "
             f"the run, such as a learning rate, go on at {budget.frames / frames:.0%} of their way",
