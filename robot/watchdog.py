@@ -110,10 +110,8 @@ class Watchdog:
         self.ordered: deque[bool] = deque(maxlen=ORDERED)  # whether the left cones lay left
         self.seen = -math.inf  # when both boundaries were seen last
         self.last: NDArray[np.float32] | None = None  # ranges of the last scan
-        self.beams = 0
         self.stood = 0.0  # s for which the scans have not changed although the car should move
         self.motions: deque[tuple[float, float, float]] = deque()  # time and differences
-        self.measured = math.nan  # when the motion was measured last
 
     def of_scan(self, scan: Scan, now: float) -> str | None:
         """Return why a scan cannot be driven by: its content, its stamp, or when it came.
@@ -142,6 +140,7 @@ class Watchdog:
         if np.ndim(scan.ranges) != 1 or not np.size(scan.ranges):
             return "invalid scan: it has no ranges"
         beams, angles = np.size(scan.ranges), np.asarray(scan.angles, np.float64)
+        before = beams if self.last is None else len(self.last)
         if angles.shape != (beams,):
             return f"invalid scan: {angles.size} bearings for {beams} ranges"
         limits_known = math.isfinite(scan.range_min) and math.isfinite(scan.range_max)
@@ -149,8 +148,8 @@ class Watchdog:
             return "invalid scan: its angles or its range are not finite"
         if abs(angles[-1] - angles[0]) > 2 * math.pi + 1e-3 or not _one_way(angles):
             return "invalid scan: its bearings do not go around once"
-        if self.beams and abs(beams - self.beams) > 0.1 * self.beams:
-            return f"invalid scan: {beams} beams instead of {self.beams}"
+        if abs(beams - before) > 0.1 * before:
+            return f"invalid scan: {beams} beams instead of {before}"
         returns = scan.returns()
         share = float(np.isfinite(returns).mean())
         if share < self.limits.fewest_returns:
@@ -226,7 +225,7 @@ class Watchdog:
             way: m that the car was sent since the last one.
         """
         ranges = scan.returns()
-        last, self.last, self.beams = self.last, ranges, len(ranges)
+        last, self.last = self.last, ranges
         if last is None or len(last) != len(ranges) or len(self.stamps) < 2:
             return None
         near = (ranges < NEAR) & (last < NEAR)
@@ -251,7 +250,6 @@ class Watchdog:
         """
         if not all(map(math.isfinite, measured)):
             return "odometry that is not finite"
-        self.measured = now
         self.motions.append((now, measured[0] - commanded[0], measured[1] - commanded[1]))
         window, limits = self.limits.window, self.limits
         if now - self.motions[0][0] < window:
@@ -271,8 +269,8 @@ class Watchdog:
         Args:
             now: s.
         """
-        if now - self.measured > self.limits.window:
-            return f"no odometry for {now - self.measured:.1f} s"
+        if self.motions and now - self.motions[-1][0] > self.limits.window:
+            return f"no odometry for {now - self.motions[-1][0]:.1f} s"
         return None
 
 
