@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -19,6 +19,7 @@ import coil_robot as cones
 from coil_paper.reproduce.result import NO_RUNS, PAGES, Result, Runs
 from coil_rl.envs import read_recording
 from coil_rl.envs.robot import FEATURES, labelled_drive, record_labelling_drives
+from coil_rl.ranges import Count, Ge, checked
 from coil_rl.report import markdown_table, style, write_csv
 
 Array = NDArray[np.float64]
@@ -30,6 +31,7 @@ DRAW_EVERY = 4  # scans
 ARROW_LENGTH = 2.2  # of a standard deviation of a feature, on the axes of the plot
 
 
+@checked
 @dataclass(eq=False)
 class Figure25(Result):
     """Classifier of cones: its accuracy, and the features that it sees.
@@ -43,8 +45,8 @@ class Figure25(Result):
         right: recordings past thick cones only, on the right; at least two.
         both: recordings past both sides with the cones' positions in their notes, for testing;
             without any, there is only the cross-validation.
-        pairs: number of left and right drives to simulate, at least 2.
-        tests: number of drives past both sides to simulate, at least 1.
+        pairs: number of left and right drives to simulate.
+        tests: number of drives past both sides to simulate.
         scan: topic of the LiDAR.
         odometry: topic of the odometry.
 
@@ -57,16 +59,12 @@ class Figure25(Result):
     right: Sequence[str] = ()
     both: Sequence[str] = ()
     _: KW_ONLY
-    pairs: int = 5
-    tests: int = 3
+    pairs: Annotated[int, Ge(2)] = 5
+    tests: Count = 3
     scan: str = "/scan"
     odometry: str | None = "/odom"
 
     def __post_init__(self) -> None:
-        if self.pairs < 2 or self.tests < 1:
-            raise ValueError(
-                f"pairs={self.pairs} must be at least 2 and tests={self.tests} at least 1"
-            )
         if bool(self.left) != bool(self.right) or (self.both and not self.left):
             raise ValueError(
                 f"left={list(self.left)} and right={list(self.right)} must both be given, "

@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -25,7 +25,7 @@ from coil_paper.reproduce.result import NO_RUNS, PAGES, Result, Runs, runs_by_la
 from coil_rl import SimulatedRobotEnv, UserError, guide_titles, open_run
 from coil_rl.envs import Recording, Track, read_recording, robot_tracks
 from coil_rl.envs.robot import track_notes
-from coil_rl.ranges import Count, checked
+from coil_rl.ranges import Count, Len, checked
 from coil_rl.report import Run, count_of_seeds, estimate, markdown_table, read_runs, write_csv
 
 PAGE = PAGES["table_6"]
@@ -48,7 +48,7 @@ class Table6(Result):
             name of the policy.
         runs: folders of runs whose agents drive if there are no recordings.
         worlds: further tracks to drive on, by what differs.
-        labels: of the runs of the experiments that drive, at least one.
+        labels: of the runs of the experiments that drive.
         repeats: number of drives of each policy, which differ by the LiDAR noise.
         laps: number of laps of a drive.
         scan: topic of the LiDAR.
@@ -68,7 +68,7 @@ class Table6(Result):
     _: KW_ONLY
     runs: Sequence[str] = ()
     worlds: Mapping[str, Sequence[Track]] = field(default_factory=dict)
-    labels: Sequence[str] = ("oil", "ppo", "coil")
+    labels: Annotated[Sequence[str], Len(1)] = ("oil", "ppo", "coil")
     repeats: Count = 3
     laps: Count = 3
     scan: str = "/scan"
@@ -79,8 +79,6 @@ class Table6(Result):
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not self.labels:
-            raise ValueError("labels=[] leaves the guide alone; give at least one")
         files = self._named_files()
         self.read = [
             read_recording(file, self.scan, self.odometry, self.command) for _, file in files

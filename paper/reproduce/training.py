@@ -4,13 +4,14 @@ import math
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
 
 from coil_paper.reproduce import pages
 from coil_paper.reproduce.result import NO_RUNS, PAGES, Runs, WorldsResult, runs_by_label
+from coil_rl.ranges import Len, checked
 from coil_rl.report import (
     GUIDE,
     RETURN,
@@ -102,6 +103,7 @@ def _returns(experiments: Sequence[str], runs: Runs) -> list[Row]:
     return [{"label": run.label, "seed": run.seed} | learning(run) for run in own if run.curve]
 
 
+@checked
 class Figure22(WorldsResult):
     """Learning curves of the runs with some labels.
 
@@ -110,18 +112,16 @@ class Figure22(WorldsResult):
     on.
 
     Args:
-        labels: of the runs to draw, at least one.
+        labels: of the runs to draw.
     """
 
     def __init__(
         self,
         experiments: Sequence[str],
-        labels: Sequence[str] = ("coil", "ppo"),
+        labels: Annotated[Sequence[str], Len(1)] = ("coil", "ppo"),
         worlds: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         super().__init__(experiments, worlds)
-        if not labels:
-            raise ValueError("labels=[] draws nothing; give at least one")
         self.labels = list(labels)
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:

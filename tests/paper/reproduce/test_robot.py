@@ -248,7 +248,7 @@ def test_an_agent_without_seed_leaves_claims_undecided_and_other_drivers_have_no
     [
         ({}, "give no driver"),
         ({"experiments": ["mine"], "repeats": 0}, "repeats=0 must be at least 1"),
-        ({"experiments": ["mine"], "labels": []}, "labels=.. leaves the guide alone"),
+        ({"experiments": ["mine"], "labels": []}, "labels=.. must be at least 1 long"),
         ({"runs": ["empty"]}, "holds no run of coil-train"),
         ({"recordings": ["empty"]}, "has no MCAP file"),
         ({"recordings": ["none.mcap"]}, "is not an MCAP file"),
