@@ -47,8 +47,11 @@ for each in (_Loader, _Dumper):
     each.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, list("-+0123456789."))
 
 
-def read_yaml(path: Path) -> Any:
+def read_yaml(path: Path, largest: int = LARGEST_FILE) -> Any:
     """Return the values of a file.
+
+    Args:
+        largest: allowed size, in bytes.
 
     Raises:
         UserError: for a file that cannot be read, is larger or deeper than any configuration of a
@@ -57,7 +60,7 @@ def read_yaml(path: Path) -> Any:
         OSError: for a folder, or without the right to read.
     """
     try:
-        text, depth = read_text(path, LARGEST_FILE), 0
+        text, depth = read_text(path, largest), 0
     except OSError as error:
         if error.errno in IN_THE_WAY:
             raise

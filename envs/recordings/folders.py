@@ -12,6 +12,7 @@ from coil_rl.files import open_regular
 from coil_rl.plain_yaml import read_yaml
 
 MAGIC = b"\x89MCAP0\r\n"
+LARGEST_METADATA = 1_000_000  # bytes; a day in files of a minute has 300,000
 CONVERT = "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap"
 
 
@@ -47,7 +48,7 @@ def files_of(path: Path) -> Folder:
         return Folder([path])
     metadata = path / "metadata.yaml"
     try:
-        said = read_yaml(metadata)["rosbag2_bagfile_information"]
+        said = read_yaml(metadata, LARGEST_METADATA)["rosbag2_bagfile_information"]
         # Older versions of ROS put the folder's own name before the file's.
         names = [Path(name).name for name in said["relative_file_paths"] or ()]
         topics = said.get("topics_with_message_count") or ()
