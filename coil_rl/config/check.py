@@ -6,7 +6,7 @@ to them.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -203,7 +203,7 @@ def _check_guides(
         its_env = make_env.bare(1, TRAIN, None) if name in demonstrations else env
         check_guide_in_env(guide, its_env, f"guide.{name}")
     build_all(config.degrade, "degrade")
-    if parts.build_disturbances(config, TEST):
+    if parts.disturbances(config, TEST):
         transformed(env, make_env.disturb(TEST), "disturb")
     if config.degrade:
         _check_cases(cases, partial(make_env.guided, cases, TEST, guides))
@@ -339,7 +339,7 @@ def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
             raise UserError(f"proxy of guide.{name}: {error}") from error
 
 
-def _check_frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> None:
+def _check_frames_of_proxies(config: DictConfig, guides: Collection[str]) -> None:
     """Raise a `UserError` if the proxies of guides take all frames of a run."""
     taken, budget = parts.frames_of_proxies(config, guides), config.budget
     if taken >= budget.frames:

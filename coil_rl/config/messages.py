@@ -20,7 +20,6 @@ from omegaconf.errors import (
 )
 from yaml.error import MarkedYAMLError
 
-from coil_rl import conf
 from coil_rl.config import schema
 from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean, is_outside, lacks_memory
 from coil_rl.output import printable
@@ -269,7 +268,7 @@ def _own_file(error: OmegaConfBaseException, key: str) -> str:
     if root is None and error.parent_node is not None:
         root = error.parent_node._get_root()
     name = OmegaConf.select(root, f"hydra.runtime.choices.{group}") if root and group else None
-    if name is None or Path(conf.__file__).with_name(group).joinpath(f"{name}.yaml").is_file():
+    if name is None or name in schema.shipped(group):
         return ""
     return f", or {last} into {group}/{name}.yaml"
 
@@ -324,9 +323,7 @@ def unchosen(key: str, typed: str) -> str:
     if env is not None:
         return f"; it belongs to env={env}: write env={env} {typed}=VALUE"
     group, _, name = key.partition(".")
-    if not re.fullmatch(r"\w+\.\w+", key) or group not in SEVERAL:
-        return ""
-    if not Path(conf.__file__).with_name(group).joinpath(f"{name}.yaml").is_file():
+    if group not in SEVERAL or name not in schema.shipped(group):
         return ""
     chosen = name if group == "guide" else f"[{name}]"
     return f"; it belongs to {group}={name}: write {group}={chosen} {typed}=VALUE"

@@ -12,7 +12,7 @@ import math
 import re
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -154,7 +154,7 @@ def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
         made,
         of_agent=of_agent,
         alone=alone,
-        disturb=partial(build_disturbances, config),
+        disturb=lambda cases: build_all(disturbances(config, cases), "disturb"),
         transforms=transforms,
         guides=lambda: build_nodes_of_guides(driving_guides(config)),
         degrade=partial(build_all, config.degrade, "degrade"),
@@ -217,11 +217,6 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
 def _resolved(value: Any) -> Any:
     """Return a value of a configuration with all references resolved."""
     return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-
-
-def build_disturbances(config: DictConfig, cases: str) -> list[Transform]:
-    """Return the transforms that disturb the env of a configuration in a set of cases."""
-    return build_all(disturbances(config, cases), "disturb")
 
 
 def disturbances(config: DictConfig, cases: str) -> dict[str, Any]:
@@ -477,23 +472,15 @@ def distil(config: DictConfig, folder: Path, run: Callable[[DictConfig], float])
     return frames_of_proxies(config, names)
 
 
-def frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> int:
-    """Return the frames that the proxies of the guides of a run take.
+def frames_of_proxies(config: DictConfig, guides: Collection[str]) -> int:
+    """Return the frames that the proxies of the guides of a run take: whole batches.
 
     Args:
         guides: names of the guides that get a proxy.
     """
-    return sum(frames_of(config.proxy.budget) for _ in guides)
-
-
-def frames_of(budget: DictConfig) -> int:
-    """Return the frames that a training without tests takes: whole batches.
-
-    Args:
-        budget: of the training, with `frames`, `num_envs` and `steps`.
-    """
+    budget = config.proxy.budget
     batch = int(budget.num_envs) * int(budget.steps)
-    return math.ceil(budget.frames / batch) * batch
+    return len(guides) * math.ceil(budget.frames / batch) * batch
 
 
 def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from coil_rl.config.compose import Composed, compose_with_files, default_learner
 from coil_rl.config.folder import PREFIX, make_folder, read_config, run_folder
 from coil_rl.config.messages import naming_files
 from coil_rl.config.nodes import give, import_path, keep
-from coil_rl.config.schema import method_for, packages
+from coil_rl.config.schema import method_for, shipped
 from coil_rl.config.trust import trust_own, trust_packages
 from coil_rl.errors import UserError
 from coil_rl.foreign.faults import foreign
@@ -207,17 +206,10 @@ def new_folder(program: str) -> Path:
     return Path("outputs", program, f"{now}_{os.getpid()}")
 
 
-def _shipped(group: str) -> set[str]:
-    """Return the names of the files of coil-rl and of its guests in a group."""
-    folders = [resources.files(package) / group for package in packages()]
-    files = [file for folder in folders if folder.is_dir() for file in folder.iterdir()]
-    return {file.name.removesuffix(".yaml") for file in files}
-
-
 def _env(env: Any, name: str) -> Words:
     """Return what chooses an env; an object is kept under a name."""
     if isinstance(env, str):
-        return ([f"env={env}"] if env in _shipped("env") else _gym_words(env)), {}
+        return ([f"env={env}"] if env in shipped("env") else _gym_words(env)), {}
     if not callable(env):
         raise UserError(
             f"env is {type(env).__name__}; give the id of a Gymnasium env, the name of a file in "

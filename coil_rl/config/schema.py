@@ -8,9 +8,11 @@ import hashlib
 import json
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from importlib import metadata
+from importlib import metadata, resources
+from importlib.resources.abc import Traversable
 from importlib.util import find_spec
 from typing import Annotated, Any
 
@@ -46,6 +48,14 @@ IGNORED_KEYS = (
 def packages() -> tuple[str, ...]:
     """Return the packages with YAML files, coil-rl's own first."""
     return (CORE, *sorted(entry.value for entry in metadata.entry_points(group=CORE)))
+
+
+@cache
+def shipped(group: str) -> Mapping[str, Traversable]:
+    """Return the YAML files of coil-rl and of its guests in a group, by the name of a choice."""
+    folders = [resources.files(package) / group for package in reversed(packages())]
+    files = [file for folder in folders if folder.is_dir() for file in folder.iterdir()]
+    return {file.name.removesuffix(".yaml"): file for file in files if file.name.endswith(".yaml")}
 
 
 @cache

@@ -29,7 +29,7 @@ import hydra.utils
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from coil_rl.config.schema import packages
+from coil_rl.config.schema import packages, shipped
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.plain_yaml import entries
 
@@ -247,10 +247,11 @@ def shipped_logger(node: Any) -> dict[str, Any] | None:
         node: what a folder has as its `logger`.
     """
     target = node.get("_target_") if isinstance(node, Mapping) else None
-    for shipped in _shipped_loggers():
-        if shipped["_target_"] == target:
-            plain = {key: node[key] for key in shipped if _fits(shipped[key], node.get(key))}
-            return shipped | plain
+    for file in shipped("logger").values():
+        ours = yaml.safe_load(file.read_text("utf-8"))
+        if ours and ours["_target_"] == target:
+            plain = {key: node[key] for key in ours if _fits(ours[key], node.get(key))}
+            return dict(ours | plain)
     return None
 
 
@@ -260,11 +261,3 @@ def _fits(shipped: Any, given: Any) -> bool:
         return isinstance(given, bool)
     names = isinstance(shipped, str) and isinstance(given, str)
     return names and all(re.fullmatch(PLAIN, text) for text in (shipped, given))
-
-
-@cache
-def _shipped_loggers() -> list[dict[str, Any]]:
-    """Return the loggers in `conf/logger`."""
-    files = (resources.files("coil_rl.conf") / "logger").iterdir()
-    texts = [file.read_text("utf-8") for file in files if file.name.endswith(".yaml")]
-    return [node for node in map(yaml.safe_load, texts) if node]
