@@ -28,13 +28,10 @@ def reproduce(config: DictConfig) -> None:
 
     Their pages are printed, and written with RESULTS.md.
     """
-    import torch
-
     from coil_paper.reproduce import pages
     from coil_paper.reproduce.result import Result, check_pools
     from coil_rl import build, versions, write_text
 
-    torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
     folder.mkdir(parents=True, exist_ok=True)
     # Build all results before the first run, so that mistakes cost seconds.
@@ -144,9 +141,6 @@ def command(config: DictConfig, key: str, name: str = "") -> str:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration."""
-    from coil_rl import check_values
-
-    check_values(config)
     if config.budget not in config.budgets:
         names = list(config.budgets)
         raise UserError(

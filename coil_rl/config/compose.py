@@ -238,9 +238,11 @@ def check_values(config: DictConfig) -> None:
 
 def _check_device(config: DictConfig, name: str, device: str) -> None:
     """Raise a `UserError` for a device that is unknown, is not there or cannot do what is asked."""
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+    if device == "cpu":
+        return
+    if not re.fullmatch(r"cuda(:\d+)?", device):
         raise UserError(f"{name}={device} must be cpu, cuda, or one GPU such as cuda:0")
-    if device != "cpu" and OmegaConf.select(config, "compile"):
+    if OmegaConf.select(config, "compile"):
         raise UserError(
             f"compile=true is for the CPU only, not for {name}={device}; take compile=false"
         )

@@ -13,12 +13,9 @@ from coil_rl.programs import app
 
 def export(config: DictConfig) -> None:
     """Export the policy of a run, and print what to type next."""
-    import torch
-
     from coil_rl.config.python import open_run
     from coil_rl.export import export_policy
 
-    torch.set_num_threads(config.threads)
     meanings: Any = OmegaConf.to_container(config.meanings, resolve=True)
     exported = export_policy(
         open_run(config.run, device=config.device),
@@ -53,11 +50,9 @@ def next_step(config: DictConfig, guide: str) -> str:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration."""
-    from coil_rl.config.compose import check_values
     from coil_rl.envs.meanings import meaning
     from coil_rl.errors import UserError
 
-    check_values(config)
     values: Any = OmegaConf.to_container(config.meanings, resolve=True)
     try:
         for name, value in values.items():

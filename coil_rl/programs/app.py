@@ -35,7 +35,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import coil_rl.config  # noqa: F401  registers the root configurations
 from coil_rl import programs
-from coil_rl.config.compose import keep_written, key_of, typed
+from coil_rl.config.compose import check_values, keep_written, key_of, typed
 from coil_rl.config.folder import make_folder
 from coil_rl.config.messages import is_no_bug, naming_files, refuse
 from coil_rl.config.trust import trust_own, trust_packages
@@ -173,9 +173,10 @@ def run_program(
     A mistake of the user ends the process with one sentence and exit code 2.
 
     Args:
-        task: what the program does with its configuration.
+        task: what the program does with its configuration, with the number of threads of that.
         config_name: of the YAML file; also the name of the program.
-        check: raises a `UserError` for a mistake in the configuration, before anything is done.
+        check: raises a `UserError` for a mistake in the configuration, before anything is done. Its
+            values are those of the schema.
         config_path: where the YAML file is. One of another package, such as "pkg://my_package.conf",
             finds the files of coil-rl by an entry point, see `coil_rl.config.schema`, and
             gets the help and the clean-up of these programs by the schema `ProgramConfig`.
@@ -242,11 +243,16 @@ def _do(
     made = _missing(Path(config.run_dir).absolute()) if has_folder else []
     try:
         with naming_files(files):
+            check_values(config)
             check(config)
             if has_folder:
                 make_folder(Path(config.run_dir))
             if STOP.received:
                 raise KeyboardInterrupt
+            if "threads" in config:
+                import torch
+
+                torch.set_num_threads(config.threads)
             return task(config)
     except Exception:
         for folder in made:

@@ -54,13 +54,11 @@ def check(config: DictConfig) -> None:
     Otherwise make their folder.
     """
     from coil_rl.config.check import check_proxies
-    from coil_rl.config.compose import check_values
     from coil_rl.config.folder import make_folder
 
     used = ("preset", "track", "env", "disturb", "guide", "evaluation", "proxy")
     app.check_used(used, "a proxy is trained as the key proxy says")
     app.check_folder("proxy.folder")
-    check_values(config)
     check_proxies(config, config.guide)
     make_folder(Path(config.proxy.folder))
 

@@ -29,14 +29,11 @@ OF_AN_AGENT = tuple(f"evaluation.{key}" for key in OWN)
 
 def evaluate(config: DictConfig) -> float:
     """Evaluate a run or guides; return the mean reward of the deterministic policy."""
-    import torch
-
     from coil_rl.config.assemble import assemble, trial
     from coil_rl.config.folder import run_folder
     from coil_rl.config.parts import env_maker
     from coil_rl.run.judge import judge, report_outcome
 
-    torch.set_num_threads(config.threads)
     results = Path(config.run_dir)
     alone = config
     if config.run is not None:

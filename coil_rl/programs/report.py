@@ -256,9 +256,6 @@ def _folders(config: DictConfig) -> list[Path]:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration."""
-    from coil_rl.config.compose import check_values
-
-    check_values(config)
     app.check_folder("folder")
     first = _folders(config)[0]
     if first.is_dir() and not os.access(first, os.W_OK):

@@ -30,12 +30,9 @@ OF_PLACES = {
 
 def drive(config: DictConfig) -> None:
     """Drive, and write `drive.mcap` and `drive.md`."""
-    import torch
-
     from coil_rl import write_text
     from coil_robot.drive_log import DriveLog
 
-    torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
     epoch = time.time() - time.monotonic() if config.where == "ros" else 0.0
     about = {"where": config.where, "run": str(config.run)}
@@ -203,10 +200,8 @@ def described(result: Drive) -> list[str]:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration."""
-    from coil_rl import check_values
     from coil_rl.for_guests import check_used
 
-    check_values(config)
     if (config.run is None) == (not config.controller):
         raise UserError(
             "give what drives: run=FOLDER, or +controller._target_=PACKAGE.NAME; and not both"

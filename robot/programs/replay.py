@@ -32,15 +32,12 @@ def replay(config: DictConfig) -> None:
 
     The results of each recording are written, then `replay.md`.
     """
-    import torch
-
     from coil_rl import build, write_text
     from coil_rl.envs import McapReplayEnv
     from coil_rl.for_guests import progress
     from coil_robot.replay.open_loop import open_loop
     from coil_robot.replay.report import NOTES, describe, outcome
 
-    torch.set_num_threads(config.threads)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # the report has the remarks on the recordings
         env = build(config.env, "env", McapReplayEnv)
@@ -172,10 +169,8 @@ def _check_unique(key: str, paths: Sequence[Path]) -> None:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration."""
-    from coil_rl import check_values
     from coil_rl.for_guests import check_unused, check_used
 
-    check_values(config)
     if config.recording is None:
         raise UserError(
             "recording must be an MCAP file or a rosbag2 folder, or a list of them: recording=FILE"

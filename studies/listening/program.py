@@ -39,7 +39,6 @@ def listen(config: DictConfig) -> None:
     from coil_studies.listening import WholeEpisode
     from coil_studies.listening.survey import table_by_section
 
-    torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
     source = run_folder(config.run)
     of_run = configured(source, config)
