@@ -15,8 +15,8 @@ docs/compare.md.
 
 import logging
 import shlex
-import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -106,15 +106,7 @@ def _value(key: str, text: str) -> Any:
         raise UserError(f"{key}={text}: {sentence(error)}") from error
 
 
-def main() -> None:
-    """Entry point."""
-    arguments = sys.argv[1:]
-    if any(argument in ("-h", "--help") for argument in arguments):
-        print(__doc__.rstrip())
-        return
-    with app.program("compare"):
-        compare(arguments)
-
+main = partial(app.plain_program, "compare", __doc__.rstrip(), compare)
 
 if __name__ == "__main__":
     main()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,14 +89,7 @@ def target(arguments: Sequence[str]) -> Path:
     return Path(arguments[0]).expanduser()
 
 
-def main() -> None:
-    """Entry point."""
-    if sys.argv[1:] in (["--help"], ["-h"]):
-        print(HELP)
-        return
-    with app.program("demo"):
-        demo(target(sys.argv[1:]))
-
+main = partial(app.plain_program, "demo", HELP, lambda arguments: demo(target(arguments)))
 
 if __name__ == "__main__":
     main()

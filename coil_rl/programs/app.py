@@ -308,6 +308,22 @@ def program(name: str) -> Iterator[None]:
         sys.stdout, sys.stderr = _end(sys.stdout), _end(sys.stderr)
 
 
+def plain_program(name: str, usage: str, task: Callable[[list[str]], None]) -> None:
+    """Run a task as a console program that takes its arguments as they are, without Hydra.
+
+    Args:
+        name: of the program.
+        usage: what is printed where help is asked for.
+        task: what the program does with its arguments.
+    """
+    arguments = sys.argv[1:]
+    if any(argument in ("-h", "--help") for argument in arguments):
+        print(usage)
+        return
+    with program(name):
+        task(arguments)
+
+
 def _check_written(name: str, out: SafeStream) -> None:
     """End the program with an error code if its text met a full disk."""
     out.flush()

@@ -2,8 +2,8 @@
 
 import json
 import shlex
-import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -68,25 +68,22 @@ def _parts(name: str, value: Any) -> Iterator[tuple[str, str]]:
         yield name, value if isinstance(value, str) else json.dumps(value)
 
 
-def main() -> None:
+def info(arguments: Sequence[str]) -> None:
     """Print one name and its value a line."""
-    arguments = sys.argv[1:]
-    if arguments in (["--help"], ["-h"]):
-        print(HELP)
-        return
-    with app.program("info"):
-        if not arguments:
-            result = versions()
-        elif len(arguments) == 1 and arguments[0].startswith("run="):
-            path = Path(arguments[0].removeprefix("run=")).expanduser()
-            result = explain(path) if path.suffix == ".onnx" else describe(path)
-        else:
-            raise UserError(f"{' '.join(arguments)}: coil-info takes nothing, or run=FOLDER")
-        result = {printable(name): printable(value) for name, value in result.items()}
-        width = max(map(len, result))
-        for name, value in result.items():
-            print(f"{name:{width}}  {value}")
+    if not arguments:
+        result = versions()
+    elif len(arguments) == 1 and arguments[0].startswith("run="):
+        path = Path(arguments[0].removeprefix("run=")).expanduser()
+        result = explain(path) if path.suffix == ".onnx" else describe(path)
+    else:
+        raise UserError(f"{' '.join(arguments)}: coil-info takes nothing, or run=FOLDER")
+    result = {printable(name): printable(value) for name, value in result.items()}
+    width = max(map(len, result))
+    for name, value in result.items():
+        print(f"{name:{width}}  {value}")
 
+
+main = partial(app.plain_program, "info", HELP, info)
 
 if __name__ == "__main__":
     main()
