@@ -82,10 +82,8 @@ def read_config(
         raise UserError(f"{key}={folder} is not the folder of a run: it has no config.yaml")
     try:
         values = read_yaml(path)
-        if values is None:
-            raise UserError(f"{path} is not the configuration of a run (it is empty)")
         if not isinstance(values, dict):
-            raise UserError(f"{path} is not the configuration of a run, but a list")
+            raise UserError(f"{path} is not the configuration of a run (it holds no keys)")
         if values.get("made_from_parts"):
             raise UserError(
                 f"{key}={folder} was made in Python from parts, which no file names; "

@@ -9,13 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
-    InterpolationKeyError,
     OmegaConfBaseException,
 )
 from yaml.error import MarkedYAMLError
@@ -35,7 +33,6 @@ LAUNCHERS = {
 TYPED = re.compile(r"Could not override '([^']+)'")
 MERGED = re.compile(r"Error merging override (.+)")
 LACKED = re.compile(r"Missing mandatory value: ([\w.]+)")
-NO_CHOICE = "Config group override must be a string or a list"
 NO_INTEGER = re.compile(
     r"override ([\w.]+)=.*Value '([\d.eE+]+)' of type 'float' could not be converted to Integer",
     re.DOTALL,
@@ -139,11 +136,6 @@ def _message(error: BaseException) -> str:
     if isinstance(error, (AssertionError, TypeError)):
         return (
             "the command line cannot be composed; give each group a name, GROUP=CHOICE (see --help)"
-        )
-    if str(error).startswith(NO_CHOICE):  # it does not say which group
-        return (
-            "a group takes the name of a file, not null or a number; write GROUP=NAME, "
-            "logger=none, disturb=[] or degrade=[], or leave it out"
         )
     if isinstance(error, OverrideParseException):
         return (
@@ -251,26 +243,8 @@ def _wrong_value(error: OmegaConfBaseException, key: str) -> str:
     lacked = LACKED.search(str(error))
     if lacked is not None:
         key = key if isinstance(error, MissingMandatoryValue) else lacked[1]
-        return f"{key} must be given: write {key}=VALUE{_own_file(error, key)}"
-    if isinstance(error, InterpolationKeyError):
-        missing, group = str(error).split("'")[1], key.partition(".")[0]
-        return (
-            f"{key} refers to {missing}, which does not exist; "
-            f"choose another {group}, or give {key}=VALUE"
-        )
+        return f"{key} must be given: write {key}=VALUE"
     return f"{key}: {_first_paragraph(error)}"
-
-
-def _own_file(error: OmegaConfBaseException, key: str) -> str:
-    """Return `, or KEY into FILE` for a key of a file of the user; else an empty string."""
-    group, _, last = key.rpartition(".")
-    root: Any = HydraConfig.instance().cfg  # none before the folder of a run has its name
-    if root is None and error.parent_node is not None:
-        root = error.parent_node._get_root()
-    name = OmegaConf.select(root, f"hydra.runtime.choices.{group}") if root and group else None
-    if name is None or name in schema.shipped(group):
-        return ""
-    return f", or {last} into {group}/{name}.yaml"
 
 
 def _first_paragraph(error: BaseException) -> str:

