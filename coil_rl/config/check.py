@@ -50,7 +50,8 @@ KINDS = {
 }
 WATCHED = ("episode", "step")  # groups of `watch`
 EPISODE_REWARD = "episode_reward"  # written by a transform of every env
-# Nodes that other values refer to, and that nothing else reads.
+# Nodes that other values refer to, and that nothing else reads; and a fact about the method, which
+# is no choice.
 REFERRED = (
     "preset",
     "track",
@@ -58,9 +59,9 @@ REFERRED = (
     "training.learning_rate",
     "training.imitation_env",
     "budget.minibatches",
+    "method.needs_guide",
 )
 NOISE = "training.noise_correlation"
-NEEDS_GUIDE = "method.needs_guide"  # a fact about the method, not a choice
 OF_A_LEARNER = (
     *("learner", "network", "checkpoint_every", "evaluation.repeats"),
     *("budget.num_envs", "budget.steps", "training.normalise", "training.scale_rewards"),
@@ -291,16 +292,13 @@ def _check_validation(config: DictConfig, learner: Learner) -> None:
         return
     kind = passive(config)
     if kind is not None:
-        if kind.whole_pass(config.env)[0] == 1:
-            raise UserError(
-                "there is one episode, which cannot be left out to validate; give several, or set "
-                "learner.group_key=null"
-            )
-        return
-    if len(build(config.track.train, "track.train")) == 1:
+        groups = kind.whole_pass(config.env)[0]
+    else:
+        groups = len(build(config.track.train, "track.train"))
+    if groups == 1:
         raise UserError(
-            "track.train gives one track, which cannot be left out to validate; set "
-            "learner.group_key=null, or learner.validate=false"
+            "there is one track or episode, which cannot be left out to validate; give several, or "
+            "set learner.group_key=null"
         )
 
 
@@ -532,11 +530,6 @@ def unread(config: DictConfig, task: Iterable[str]) -> Iterator[str]:
     references = set(_references(config, closed))
     for text in task:
         key = key_of(text)
-        if key == NEEDS_GUIDE:
-            yield (
-                f"{text} has no effect: the file of method={config.method.name} says whether its "
-                "policy needs a guide; leave it out"
-            )
         is_read = not is_part(key, (*closed, *REFERRED))
         if key == NOISE:
             is_read = is_read and _adds_noise(config)

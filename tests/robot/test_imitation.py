@@ -149,7 +149,7 @@ def test_imitated_policy_is_a_controller_a_guide_an_export_and_drives(learner, f
         (["recording=nothing.mcap"], "env: nothing.mcap cannot be read"),
         (["budget.num_envs=1"], "env.num_envs=1 leaves out episodes, of which there are 2"),
         (["budget.frames=20", "budget.steps=10"], "longest has 33, so the others would be"),
-        (["recording=a.mcap"], "there is one episode, which cannot be left out to validate"),
+        (["recording=a.mcap"], "one track or episode, which cannot be left out to validate"),
         (["method=ppo", "learner=ppo"], "method=ppo cannot learn there"),
         (["method=dagger"], "method=dagger cannot learn there"),
         (

@@ -67,7 +67,7 @@ def unread(*words):
         ("training.imitation_env.assignment=random", "reads training.imitation_env.assignment"),
         ("training.tests.starts=5", "reads training.tests.starts (method=coil)"),
         ("recording=drive.mcap", "nothing in this run reads recording (method=coil)"),
-        ("method.needs_guide=false", "the file of method=coil says whether its policy needs a"),
+        ("method.needs_guide=false", "nothing in this run reads method.needs_guide (method=coil)"),
         ("method=guide learner.gamma=0.9", "(method=guide); leave it out"),
         ("method=guide training.noise_correlation=0.5", "(method=guide)"),
         ("method=guide budget.num_envs=3", "(method=guide)"),

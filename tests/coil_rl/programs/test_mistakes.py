@@ -98,7 +98,7 @@ def refusal(name, *arguments):
         # combinations
         ("guide=linear_feedback", "it cannot act on the observations of this env (The size of"),
         ("degrade=[shuffled] track.train.count=2", "each case of the evaluation has one row, 1 in"),
-        ("method=oil", "track.train gives one track, which cannot be left out to validate; "),
+        ("method=oil", "there is one track or episode, which cannot be left out to validate; "),
         ("method=dynamic_coil_joint proxy.method.observes=null", "a proxy needs observations"),
         ("method=dynamic_coil_joint ~proxy.method.transforms.advice", "guide.spline: method."),
         ("observes=[] method=ppo", "observes=[]: the agent has no observations; give the entries"),
