@@ -10,8 +10,7 @@ import hashlib
 import platform
 import shutil
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -126,7 +125,8 @@ def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor
         return proxy
 
     without_shapes = patch.object(proxy_tensor, "set_meta", set_meta_without_shapes)
-    with compiling(), without_shapes, torch.random.fork_rng(), warnings.catch_warnings():
+    compiling = patch.object(torch.compiler, "_is_compiling_flag", True)
+    with compiling, without_shapes, torch.random.fork_rng(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # Checks of values, as in TorchRL's distributions, are Python's decisions.
         record_calls = proxy_tensor.make_fx(
@@ -173,16 +173,6 @@ def _is_mask(graph: GraphModule, index: Node) -> bool:
     if index.op == "get_attr":
         return getattr(graph, str(index.target)).dtype in MASKS
     return bool(index.meta.get(MASK, True))
-
-
-@contextmanager
-def compiling() -> Iterator[None]:
-    """Let `torch.compiler.is_compiling()` be true."""
-    torch.compiler._is_compiling_flag = True
-    try:
-        yield
-    finally:
-        torch.compiler._is_compiling_flag = False
 
 
 def fingerprint(graph: GraphModule, arguments: Sequence[Tensor]) -> str:

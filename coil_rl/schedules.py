@@ -6,10 +6,14 @@ number.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
+
+from coil_rl.ranges import Interval, checked
 
 Schedule = Callable[[float], float]
 
 
+@checked
 @dataclass(frozen=True)
 class Linear:
     """Linear interpolation between two values.
@@ -29,14 +33,10 @@ class Linear:
 
     start: float
     end: float
-    until: float = 1.0
+    until: Annotated[float, Interval(gt=0, le=1)] = 1.0
     since: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.until <= 1:
-            raise ValueError(
-                f"until={self.until} must be more than 0 and at most 1: it is a share of the run"
-            )
         if not 0 <= self.since <= self.until:
             raise ValueError(
                 f"since={self.since} must be at least 0 and at most until={self.until}"

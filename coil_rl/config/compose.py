@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -108,15 +109,12 @@ def key_of(text: str) -> str:
 def quoted(text: str) -> str:
     """Return a text as a value in a word of the command line: in quotes unless it is a plain name.
 
-    In quotes Hydra reads a backslash as special before a quote only.
-
     Args:
         text: a value for an override on the command line.
     """
     if re.fullmatch(r"(?ai)(?!(null|true|false|nan|inf)$)[a-z][\w.:/-]*", text):
         return text
-    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), text)
-    return f"'{escaped}'"
+    return QuotedString(text, Quote.single).with_quotes()
 
 
 def covers(one: str, other: str) -> bool:
