@@ -65,7 +65,8 @@ def read_config(
 ) -> DictConfig:
     """Return the configuration of the run in a folder.
 
-    The folder may come from anybody; `trust_packages` names packages that it may use.
+    The folder may come from anybody; `trust_packages` names packages that it may use. What the run
+    writes when it goes on is written there.
 
     Args:
         key: of the calling program that names the folder, for the message.
@@ -100,6 +101,10 @@ def read_config(
         for name, value in (changes or {}).items():
             saved[name] = value
         config: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), saved)
+        # Not the folders that the file names.
+        config.run_dir = str(folder.absolute())
+        if config.proxy:
+            config.proxy.folder = str(folder.absolute() / "distilled")
         measures_of(config.evaluation.measures)
         OmegaConf.to_container(config, throw_on_missing=True)
     except (OmegaConfBaseException, yaml.YAMLError, ValueError, OSError) as error:

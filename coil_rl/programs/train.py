@@ -1,6 +1,5 @@
 """`coil-train`: train a method, evaluate the policy beside its guides and draw the results."""
 
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -73,14 +72,10 @@ def resume(folder: Path, frames: int | None = None, workers: Any = None, changed
 
     config = read_config(folder, "resume", goes_on=True)
     folder = folder.absolute()
-    _refuse_links(folder)
-    config.run_dir = str(folder)
     if workers is not None:
         if "workers" not in config.env:
             raise UserError(f"env.workers={workers} has no effect on the env of {folder}")
         config.env.workers = workers
-    if config.proxy:
-        config.proxy["folder"] = str(folder / "distilled")  # not the folder that the file names
     run = assemble(config, folder)
     try:
         if frames is not None or not is_evaluated(folder):
@@ -88,22 +83,6 @@ def resume(folder: Path, frames: int | None = None, workers: Any = None, changed
     except UserError as error:
         raise UserError(f"{folder / 'config.yaml'}: {error}") from error
     run.train(frames, changed=changed)
-
-
-def _refuse_links(folder: Path) -> None:
-    """Raise a `UserError` for a link through which a run could write outside of its folder."""
-    inside = os.path.realpath(folder)
-    for path in folder.rglob("*"):
-        if not path.is_symlink() or Path(os.path.realpath(path)).is_relative_to(inside):
-            continue
-        # W&B leaves links to its logs in the folders of its earlier records, which are finished.
-        parts = path.relative_to(folder).parts
-        if parts[0] == "wandb" and len(parts) > 2:
-            continue
-        raise UserError(
-            f"{path} is a link out of the folder of the run, so that it could write there; put the "
-            "file in its place"
-        )
 
 
 def resume_from_command_line(resumed: str, others: Sequence[str]) -> None:

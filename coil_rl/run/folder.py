@@ -101,6 +101,22 @@ def check_same(
             )
 
 
+def refuse_links(folder: Path) -> None:
+    """Raise a `UserError` for a link through which a run could write outside of its folder."""
+    inside = os.path.realpath(folder)
+    for path in folder.rglob("*"):
+        if not path.is_symlink() or Path(os.path.realpath(path)).is_relative_to(inside):
+            continue
+        # W&B leaves links to its logs in the folders of its earlier records, which are finished.
+        parts = path.relative_to(folder).parts
+        if parts[0] == "wandb" and len(parts) > 2:
+            continue
+        raise UserError(
+            f"{path} is a link out of the folder of the run, so that it could write there; put the "
+            "file in its place"
+        )
+
+
 def is_begun(folder: Path) -> bool:
     """Return whether a folder holds a run, finished or not."""
     try:

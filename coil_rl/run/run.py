@@ -40,6 +40,7 @@ from coil_rl.run.folder import (
     is_begun,
     is_evaluated,
     locked,
+    refuse_links,
     report_changed_versions,
     versions,
     weights_file,
@@ -228,9 +229,12 @@ class Run:
                 since the run began.
 
         Raises:
-            UserError: if another process uses the folder, if it holds another run or its code was
-                changed, if the run is longer than `frames`, or if that is no whole number.
+            UserError: if another process uses the folder, if it holds another run, its code was
+                changed or a link leads out of it, if the run is longer than `frames`, or if that is
+                no whole number.
         """
+        if is_begun(self.folder):
+            refuse_links(self.folder)
         with locked(self.folder):
             if frames is not None:
                 self.lengthen(whole("frames", frames), changed)

@@ -4,6 +4,7 @@ import copy
 import importlib.resources
 import json
 import sys
+from functools import partial
 from itertools import zip_longest
 
 import hydra.utils
@@ -18,6 +19,7 @@ from coil_rl.config.assemble import make_logger
 from coil_rl.config.check import check_logger
 from coil_rl.config.folder import read_config, settings
 from coil_rl.config.parts import proxy_config
+from coil_rl.config.python import open_run
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import shipped_logger
 from coil_rl.errors import UserError
@@ -353,8 +355,11 @@ def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatc
     (folder / "latest.log").symlink_to("config.yaml")
     train.resume(folder)
     (folder / "metrics.csv").symlink_to(tmp_path / "outside.csv")
-    with pytest.raises(UserError, match=r"metrics\.csv is a link out of the folder"):
-        train.resume(folder)
+    opened = open_run(folder)
+    assert opened.settings["run_dir"] == str(folder)
+    for go_on in (opened.train, partial(train.resume, folder)):
+        with pytest.raises(UserError, match=r"metrics\.csv is a link out of the folder"):
+            go_on()
 
 
 @pytest.mark.parametrize("name", NAMES)
