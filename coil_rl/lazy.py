@@ -16,16 +16,15 @@ from typing import Any
 
 
 def lazy_names(
-    package: str, file: str, **others: str
+    package: str, file: str
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` of a package.
 
     Args:
         package: its name.
         file: its `__init__.py`, whose `from MODULE import NAME as NAME` are read.
-        others: modules by name that it may not import, not even for type checkers.
     """
-    modules = dict(others)
+    modules: dict[str, str] = {}
     for node in ast.walk(ast.parse(Path(file).read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module:
             names = {alias.name for alias in node.names if alias.name == alias.asname}

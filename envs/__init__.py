@@ -45,8 +45,4 @@ if TYPE_CHECKING:
     from coil_rl.envs.track_generator import random_track as random_track
     from coil_rl.envs.track_generator import random_tracks as random_tracks
 else:
-    __getattr__, __dir__, __all__ = lazy_names(
-        __name__,
-        __file__,
-        EnvBatch="coil_rl.foreign.torchrl_env",  # its package imports this one
-    )
+    __getattr__, __dir__, __all__ = lazy_names(__name__, __file__)
