@@ -6,7 +6,7 @@ to them.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -337,7 +337,7 @@ def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
             raise UserError(f"proxy of guide.{name}: {error}") from error
 
 
-def _check_frames_of_proxies(config: DictConfig, guides: Collection[str]) -> None:
+def _check_frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> None:
     """Raise a `UserError` if the proxies of guides take all frames of a run."""
     taken, budget = parts.frames_of_proxies(config, guides), config.budget
     if taken >= budget.frames:

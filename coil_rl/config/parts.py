@@ -12,7 +12,7 @@ import math
 import re
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -472,15 +472,23 @@ def distil(config: DictConfig, folder: Path, run: Callable[[DictConfig], float])
     return frames_of_proxies(config, names)
 
 
-def frames_of_proxies(config: DictConfig, guides: Collection[str]) -> int:
-    """Return the frames that the proxies of the guides of a run take: whole batches.
+def frames_of_proxies(config: DictConfig, guides: Iterable[str]) -> int:
+    """Return the frames that the proxies of the guides of a run take.
 
     Args:
         guides: names of the guides that get a proxy.
     """
-    budget = config.proxy.budget
+    return sum(frames_of(config.proxy.budget) for _ in guides)
+
+
+def frames_of(budget: DictConfig) -> int:
+    """Return the frames that a training without tests takes: whole batches.
+
+    Args:
+        budget: of the training, with `frames`, `num_envs` and `steps`.
+    """
     batch = int(budget.num_envs) * int(budget.steps)
-    return len(guides) * math.ceil(budget.frames / batch) * batch
+    return math.ceil(budget.frames / batch) * batch
 
 
 def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:

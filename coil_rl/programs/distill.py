@@ -49,18 +49,13 @@ def distill(config: DictConfig) -> float:
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in the configuration of the proxies.
-
-    Otherwise make their folder.
-    """
+    """Raise a `UserError` for the first mistake in the configuration of the proxies."""
     from coil_rl.config.check import check_proxies
-    from coil_rl.config.folder import make_folder
 
     used = ("preset", "track", "env", "disturb", "guide", "evaluation", "proxy")
     app.check_used(used, "a proxy is trained as the key proxy says")
     app.check_folder("proxy.folder")
     check_proxies(config, config.guide)
-    make_folder(Path(config.proxy.folder))
 
 
 main = partial(app.run_program, distill, "distill", check)

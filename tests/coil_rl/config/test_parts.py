@@ -26,7 +26,7 @@ from coil_rl.config.parts import (
     copy_proxies,
     disturbances,
     env_maker,
-    frames_of_proxies,
+    frames_of,
     guides_with_untrained_proxies,
     proxy_config,
     trains_guides,
@@ -426,8 +426,8 @@ def test_proxy_that_was_killed_goes_on_to_the_same_weights(proxies, tmp_path, ca
 @pytest.mark.parametrize(("asked", "taken"), [(1, 64), (64, 64), (65, 128)])
 def test_frames_of_a_proxy_are_whole_batches(asked, taken):
     words = ["guide=spline", "method=dynamic_coil_sequential", f"proxy.budget.frames={asked}"]
-    config = composed_of_proxy(*words, "run_dir=unused")
-    assert frames_of_proxies(config, ["spline"]) == taken
+    proxy = proxy_config(composed_of_proxy(*words, "run_dir=unused"), "spline")
+    assert frames_of(proxy.budget) == taken
 
 
 @pytest.mark.slow
