@@ -99,14 +99,14 @@ class PerRow(HostedGuide):
             columns.append(entry.cpu().numpy().copy())
         observations = zip(*columns, strict=True)
         actions: list[NDArray[Any]] = []
-        with self.guard.whole() if any(starts) else self.guard:
+        with self.guard:
             for row, start, observed in zip(rows, starts, observations, strict=True):
-                host = self._host(row, start)
-                actions.append(host.act(*observed))
+                actions.append(self._asked(row, start, observed))
                 if actions[-1].shape != actions[0].shape:
                     raise ForeignError(
-                        f"{host.place}: the action has the shape {list(actions[-1].shape)}, but "
-                        f"that of row {rows[0]} has {list(actions[0].shape)}"
+                        f"{self.hosts[row].place}: the action has the shape "
+                        f"{list(actions[-1].shape)}, but that of row {rows[0]} has "
+                        f"{list(actions[0].shape)}"
                     )
         if self.guard.touched:
             for row, host in self.hosts.items():
@@ -115,16 +115,17 @@ class PerRow(HostedGuide):
         shape = (*tensordict.batch_size, *action.shape[1:])
         return tensordict.set(self.out_keys[0], action.reshape(shape))
 
-    def _host(self, row: int, start: bool) -> Host:
-        """Return the controller of a row, which begins an episode at a `start`."""
+    def _asked(self, row: int, start: bool, observed: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """Return the action of the controller of a row, which begins an episode at a `start`."""
         if row not in self.hosts:
             self.hosts[row] = Host(self.make, self.title, row)
         host = self.hosts[row]
-        if start:
-            host.begin()
-        elif host.steps is not None:
-            host.steps += 1
-        return host
+        with host.numbers:
+            if start:
+                host.begin()
+            elif host.steps is not None:
+                host.steps += 1
+            return host.act(*observed)
 
     def unfit(
         self, action: torch.Tensor, batch: torch.Size, space: ActionSpace, problem: str
@@ -172,7 +173,7 @@ class PerRow(HostedGuide):
         numbers = state.pop(NUMBERS, {})
         self.hosts = {row: Host(self.make, self.title, row) for row in state}
         for row, host in self.hosts.items():
-            with self.guard.whole():
+            with self.guard, host.numbers:
                 host.open()
             host.numbers.load_state_dict(numbers.get(row, {}))
             with foreign(host.place, "load_state_dict"):
@@ -209,7 +210,7 @@ class ControllerGuide(HostedGuide):
         in_keys: Sequence[NestedKey] | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        with Guard().whole():
+        with Guard():
             thing = load(of) if isinstance(of, str) else of
         if isinstance(thing, partial):  # Hydra has its own kind, which it checks at every call
             thing = partial(thing.func, *thing.args, **thing.keywords)

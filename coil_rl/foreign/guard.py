@@ -5,6 +5,7 @@ the folder would break the paths of the run. So foreign code has its own: what i
 is called again, and what the process had is back after each call.
 """
 
+import _signal  # type: ignore[import-not-found]
 import ctypes
 import logging
 import os
@@ -14,7 +15,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -32,20 +33,32 @@ SEEDS = 2**32  # seeds of NumPy are below
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
 SIGNALS = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
 
-GlobalNumbers = tuple[Any, list[Tensor], bytes, float | None]  # of NumPy, torch and Python
+# The generator of NumPy in the process, the states of those of NumPy in foreign code and of Python,
+# and of torch.
+GlobalNumbers = tuple[Any, list[bytes], float | None, list[Tensor]]
 
 
-def _state_of(generator: Any) -> Any:
-    """Return the state of a generator of Python in place: 624 numbers of four bytes, and an index.
+def _in_place(address: int) -> Any:
+    """Return the state of a generator in its own memory: 624 numbers of four bytes, and an index.
 
-    It is the generator's own memory, so it is valid as long as the generator lives. `getstate`
-    takes fifty times as long, because it makes an object of each number.
+    It is valid as long as the generator lives. What NumPy and Python give takes a hundred times as
+    long, because they make an object of each number.
     """
-    return (ctypes.c_char * (4 * 625)).from_address(id(generator) + object.__basicsize__)
+    return (ctypes.c_char * (4 * 625)).from_address(address)
 
 
-_PYTHON: Any = random._inst  # the global one
-_STATE = _state_of(_PYTHON)
+def _of_numpy(bits: np.random.MT19937) -> Any:
+    return _in_place(bits.ctypes.state_address)
+
+
+def _of_python(generator: random.Random) -> Any:
+    return _in_place(id(generator) + object.__basicsize__)
+
+
+_FOREIGN = np.random.MT19937(0)  # that of NumPy in foreign code
+_BEGINNING = _of_numpy(_FOREIGN).raw
+_PYTHON: Any = random._inst  # that of the process
+_STATES = [_of_numpy(_FOREIGN), _of_python(_PYTHON)]
 
 
 def _folder() -> str | None:
@@ -76,18 +89,13 @@ def _set_path(folders: list[str]) -> None:
     sys.path[:] = folders
 
 
-def _set_recursion(limit: int) -> None:
-    with suppress(RecursionError):  # one that is reached already
-        sys.setrecursionlimit(limit)
-
-
 def _set_handler(number: int, handler: Any) -> None:
     # None is one that C code has set; other threads cannot set any.
     if handler is not None and threading.current_thread() is threading.main_thread():
         signal.signal(number, handler)
 
 
-# What reads a setting of the process, and what sets it. The first ones take a microsecond.
+# What reads a setting of the process, and what sets it.
 SETTINGS: list[tuple[Callable[[], Any], Callable[[Any], Any]]] = [
     (_folder, _go_to),
     (torch.get_default_dtype, torch.set_default_dtype),
@@ -108,21 +116,19 @@ SETTINGS: list[tuple[Callable[[], Any], Callable[[Any], Any]]] = [
     # `torch.get_default_device` takes eighty times as long.
     (lambda: _torch_device.CURRENT_DEVICE, torch.set_default_device),
     (lambda: sys.path[:], _set_path),
-    (sys.getrecursionlimit, _set_recursion),
-]
-QUICK = len(SETTINGS)
-SETTINGS += [
+    (sys.getrecursionlimit, sys.setrecursionlimit),
     (torch.are_deterministic_algorithms_enabled, torch.use_deterministic_algorithms),
     (torch.get_float32_matmul_precision, torch.set_float32_matmul_precision),
 ]
 KEPT = len(SETTINGS)  # but of handlers: without ours a Ctrl-C would be missed
+# `signal.getsignal` takes a hundred times as long.
 SETTINGS += [
-    (partial(signal.getsignal, number), partial(_set_handler, number)) for number in SIGNALS
+    (partial(_signal.getsignal, number), partial(_set_handler, number)) for number in SIGNALS
 ]
 
 
 class Numbers:
-    """The global random numbers of torch, NumPy and Python, as foreign code sees them.
+    """The global random numbers of torch, NumPy and Python, as foreign code sees them in a block.
 
     They belong to a row, or to a controller, and are seeded. So rows are separate in any number of
     processes, also if they seed the process, and one that draws without a seed can be repeated.
@@ -135,16 +141,13 @@ class Numbers:
 
     def __init__(self, seed: int = 0) -> None:
         self.watched, self.used = WATCHED, False
+        self.before: GlobalNumbers | None = None
         self.seed(seed)
 
     @property
     def active(self) -> bool:
         """Whether a call needs these numbers, or it is not known yet."""
         return self.used or self.watched > 0
-
-    def of_call(self) -> AbstractContextManager[None]:
-        """Return what is around a call of the code."""
-        return self if self.active else nullcontext()
 
     def use(self, seed: int) -> None:
         """Use these numbers from here on: the code was seen to use global ones."""
@@ -157,76 +160,66 @@ class Numbers:
         if not self.active:
             return
         seed %= SEEDS
-        states = [torch.Generator().manual_seed(seed).get_state()]
-        python = random.Random(seed)  # it must live while its state is read in place
-        self.own: GlobalNumbers = np.random.MT19937(seed), states, _state_of(python).raw, None
+        numpy, python = np.random.MT19937(seed), random.Random(seed)
+        states = [_of_numpy(numpy).raw, _of_python(python).raw]
+        self.own: GlobalNumbers = (
+            _FOREIGN,
+            states,
+            None,
+            [torch.Generator().manual_seed(seed).get_state()],
+        )
 
     def __enter__(self) -> None:
-        self.first = [] if self.used else _plain(self.own)
-        self.before = _numbers()
-        _set_numbers(self.own)
+        if self.active:
+            self.before = _numbers()
+            _set_numbers(self.own)
 
     def __exit__(self, *_: object) -> None:
-        self.own = self.own[0], *_numbers()[1:]
+        if self.before is None:
+            return
+        first, self.own = self.own, _numbers()
         _set_numbers(self.before)
+        self.before = None
         if not self.used:
             self.watched -= 1
-            self.used = _plain(self.own) != self.first
+            self.used = _content(self.own) != _content(first)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the generators as plain values; empty if they are not used."""
-        if not self.used:
-            return {}
-        bits, states, raw, gauss = self.own
-        python, numpy = random.Random(), bits.state["state"]
-        _state_of(python).raw, python.gauss_next = raw, gauss  # type: ignore[attr-defined]
-        key, pos = numpy["key"].tolist(), int(numpy["pos"])
-        return {"torch": states, "python": python.getstate(), "numpy": [key, pos]}
+        _, states, gauss, of_torch = self.own
+        return {"states": states, "gauss": gauss, "torch": of_torch} if self.used else {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
-        if not state:
-            return
-        self.used = True
-        version, numbers, gauss = state["python"]
-        python, bits = random.Random(), self.own[0]
-        python.setstate((version, tuple(numbers), gauss))
-        key, pos = state["numpy"]
-        inner = {"key": np.array(key, np.uint32), "pos": pos}
-        bits.state = {"bit_generator": "MT19937", "state": inner}
-        self.own = bits, list(state["torch"]), _state_of(python).raw, gauss
+        if state:
+            self.used = True
+            self.own = _FOREIGN, state["states"], state["gauss"], state["torch"]
 
 
 def _numbers() -> GlobalNumbers:
-    """Return the generator of NumPy, and the states of those of torch and Python."""
-    return np.random.mtrand.get_bit_generator(), _of_torch(), _STATE.raw, _PYTHON.gauss_next
-
-
-def _set_numbers(numbers: GlobalNumbers) -> None:
-    bits, states, _STATE.raw, _PYTHON.gauss_next = numbers
-    np.random.mtrand.set_bit_generator(bits)
-    torch.default_generator.set_state(states[0])
-    for generator, state in zip(torch.cuda.default_generators, states[1:], strict=False):
-        generator.set_state(state)
-
-
-def _plain(numbers: GlobalNumbers) -> list[Any]:
-    """Return what tells states of generators apart."""
-    bits, states, *python = numbers
-    numpy = bits.state["state"]
-    return [numpy["key"].tobytes(), numpy["pos"], *map(_bytes, states), *python]
-
-
-def _of_torch() -> list[Tensor]:
-    """Return the states of torch's random generators, that of the CPU first."""
+    """Return the present states of the generators."""
     states = [torch.default_generator.get_state()]
     if torch.cuda.is_initialized():
         states += [generator.get_state() for generator in torch.cuda.default_generators]
-    return states
+    bits = np.random.mtrand.get_bit_generator()
+    return bits, [each.raw for each in _STATES], _PYTHON.gauss_next, states
 
 
-def _bytes(state: Tensor) -> bytes:
-    return ctypes.string_at(state.data_ptr(), state.numel())  # sooner than by NumPy
+def _set_numbers(numbers: GlobalNumbers) -> None:
+    bits, states, _PYTHON.gauss_next, of_torch = numbers
+    np.random.mtrand.set_bit_generator(bits)
+    for place, raw in zip(_STATES, states, strict=True):
+        place.raw = raw
+    torch.default_generator.set_state(of_torch[0])
+    for generator, state in zip(torch.cuda.default_generators, of_torch[1:], strict=False):
+        generator.set_state(state)
+
+
+def _content(numbers: GlobalNumbers) -> list[Any]:
+    """Return what tells states of generators apart."""
+    _, states, gauss, of_torch = numbers
+    # Sooner than by NumPy.
+    return [*states, gauss, *(ctypes.string_at(each.data_ptr(), each.numel()) for each in of_torch)]
 
 
 class Guard:
@@ -238,8 +231,7 @@ class Guard:
 
     def __init__(self) -> None:
         self.theirs: dict[int, Any] = {}  # what the foreign code has set, by its place in SETTINGS
-        self.bits, self.same_bits = np.random.MT19937(0), np.random.MT19937(0)
-        self.touched, self.count = False, QUICK
+        self.touched = False
 
     def __deepcopy__(self, memo: Any) -> "Guard":
         """Return a guard with what foreign code has set; what the process has is not copied."""
@@ -247,42 +239,24 @@ class Guard:
         other.theirs = dict(self.theirs)
         return other
 
-    def whole(self) -> "Guard":
-        """Keep in the next block what takes longer, too: where an env or a controller is made."""
-        self.count = len(SETTINGS)
-        return self
-
     def __enter__(self) -> None:
-        self.settings = [get() for get, _ in SETTINGS[: self.count]]
+        self.settings = [get() for get, _ in SETTINGS]
         for place, value in self.theirs.items():
             SETTINGS[place][1](value)
         self.numbers = _numbers()
-        np.random.mtrand.set_bit_generator(self.bits)
+        np.random.mtrand.set_bit_generator(_FOREIGN)
+        _STATES[0].raw = _BEGINNING
 
     def __exit__(self, *_: object) -> None:
-        bits, states, *python = self.numbers
-        # A number that is drawn shows whether others were, in less time than a comparison.
-        self.touched = (
-            self.bits.random_raw() != self.same_bits.random_raw()
-            or [_STATE.raw, _PYTHON.gauss_next] != python
-            or list(map(_bytes, _of_torch())) != list(map(_bytes, states))
-        )
-        np.random.mtrand.set_bit_generator(bits)
-        if self.touched:
-            _set_numbers(self.numbers)
-            self.bits, self.same_bits = np.random.MT19937(0), np.random.MT19937(0)
-        now = [get() for get, _ in SETTINGS[: len(self.settings)]]
-        if now != self.settings:
-            self._restore(now)
-        self.count = QUICK if not self.theirs else len(SETTINGS)
-
-    def _restore(self, now: list[Any]) -> None:
-        for place, (before, after) in enumerate(zip(self.settings, now, strict=True)):
-            if after == before:
-                continue
-            SETTINGS[place][1](before)
-            if place < KEPT:
-                self.theirs[place] = after
+        _, *python = _content(self.numbers)
+        self.touched = _content(_numbers()) != [_BEGINNING, *python]
+        _set_numbers(self.numbers)
+        now = [get() for get, _ in SETTINGS]
+        places = range(len(now)) if now != self.settings else ()
+        changed = {place: now[place] for place in places if now[place] != self.settings[place]}
+        for place in changed:
+            SETTINGS[place][1](self.settings[place])
+        self.theirs = {place: changed[place] for place in changed if place < KEPT}
 
 
 class Held:

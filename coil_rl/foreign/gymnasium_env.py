@@ -132,7 +132,7 @@ class GymnasiumEnv(SeededRows):
         if max_steps is not None:
             settings["max_episode_steps"] = max_steps
         guard = Guard()
-        with guard.whole():
+        with guard:
             maker = maker_of(id)
             make = partial(make_env, maker, wrappers, settings)
             self.shown = render and "rgb_array" in metadata_of(make(), "render_modes", ())
@@ -150,7 +150,7 @@ class GymnasiumEnv(SeededRows):
         self.seconds: dict[str, float | None] = {}
         self.workers: Workers | None = None
         self.info, self.optional = tuple(info), [("info", name) for name in info]
-        with guard.whole():
+        with guard:
             first = make_plant(0)
         self.codec = Codec(name, first.env, dtype)
         # With processes, row 0 of this one only says what the spaces are.
@@ -271,7 +271,7 @@ class GymnasiumEnv(SeededRows):
             first: whether it is the first one of an episode.
         """
         (plant,) = self.held.plants
-        with self.held.guard.whole():
+        with self.held.guard:
             plant.observe(observation, first=first)
         self.parts[:] = [self.held.entries()]
         return self._output(stepped=not first)

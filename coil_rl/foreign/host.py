@@ -7,7 +7,6 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -179,6 +178,9 @@ class Host:
         title: name of the controller, for messages.
         row: number of its row, for messages.
         beside: where the env is beside which it acts; None for a guide, which counts its own steps.
+
+    Attributes:
+        numbers: global random numbers as it sees them; those of its env, where it is beside one.
     """
 
     def __init__(
@@ -191,7 +193,7 @@ class Host:
         self.make, self.title, self.row, self.beside = make, title, row, beside
         self.thing: Any = None
         self.steps: int | None = None  # of the episode; unknown after a resume
-        self.numbers = Numbers(torch.initial_seed() + row)  # those of its env, where it is beside
+        self.numbers = Numbers(torch.initial_seed() + row)
 
     @property
     def place(self) -> str:
@@ -201,22 +203,18 @@ class Host:
         step = "" if self.steps is None else f", step {self.steps}"
         return f"the controller {self.title} (row {self.row}{step})"
 
-    def of_call(self) -> AbstractContextManager[None]:
-        """Return what is around a call."""
-        return self.numbers.of_call() if self.beside is None else nullcontext()
-
     def begin(self) -> None:
         """Begin an episode."""
         self.steps = 0
         if not hasattr(self.thing, "reset"):
             self.open()
         if hasattr(self.thing, "reset"):
-            with self.of_call(), foreign(self.place, "reset"):
+            with foreign(self.place, "reset"):
                 self.thing.reset()
 
     def open(self) -> None:
         """Make the object."""
-        with self.of_call(), foreign(self.place, "the constructor"):
+        with foreign(self.place, "the constructor"):
             self.thing = self.make()
 
     def act(self, *observed: Any) -> NDArray[Any]:
@@ -230,7 +228,7 @@ class Host:
         """
         if self.thing is None:
             self.open()
-        with self.of_call(), foreign(self.place, "act"):
+        with foreign(self.place, "act"):
             return action_array(self.thing.act(*observed))
 
 

@@ -64,7 +64,7 @@ class Plant(ABC):
         """Begin an episode; a `ForeignError` for what the env raises, or returns that is none."""
         self.seed, self.steps = seed, 0
         self.numbers.seed(seed)
-        with self.numbers.of_call():
+        with self.numbers:
             self._begin()
 
     def step(self, action: Any) -> None:
@@ -72,9 +72,6 @@ class Plant(ABC):
 
         Errors are those of `begin`.
         """
-        if not self.numbers.active:  # which takes less time
-            self._step(action)
-            return
         with self.numbers:
             self._step(action)
 
@@ -234,7 +231,7 @@ class GymnasiumPlant(Plant):
             self.values = self.codec.read(observation)
         except ForeignError as error:
             raise ValueError(f"it does not fit the env {self.name}: {error}") from error
-        with self.numbers.of_call():
+        with self.numbers:
             if first:
                 self._begin_controllers()
             self._advise()

@@ -51,7 +51,7 @@ class Rows(Generic[AnyPlant]):
         self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]
     ) -> list[Entries]:
         """Begin episodes, see `Shard`."""
-        with self.guard.whole():
+        with self.guard:
             for row, seed in seeds.items():
                 self.plants[row].begin(seed)
                 for action in actions.get(row, ()):
@@ -91,7 +91,7 @@ class GymnasiumRows(Rows[GymnasiumPlant]):
 
     def extend(self, plants: Iterable[GymnasiumPlant]) -> "GymnasiumRows":
         """Take further plants, and return all; a `ValueError` for one with other spaces."""
-        with self.guard.whole():
+        with self.guard:
             made = list(plants)
         for plant in made:
             self.codec.check_same(plant.env, plant.row)
@@ -144,6 +144,6 @@ class GymnasiumRows(Rows[GymnasiumPlant]):
 
     def close(self) -> None:
         """Close all envs."""
-        with self.guard.whole():
+        with self.guard:
             for plant in self.plants:
                 plant.close()

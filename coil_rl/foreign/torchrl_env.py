@@ -50,7 +50,7 @@ class EnvBatch(SeededRows):
         cases: Count | None = None,
     ) -> None:
         guard = Guard()
-        with guard.whole():
+        with guard:
             envs = [of() for _ in range(num_envs)]
         if max_steps is not None and isinstance(envs[0], EnvBase):
             envs = [TransformedEnv(env, StepCounter(max_steps)) for env in envs]

@@ -93,7 +93,8 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
             options: of the env.
         """
         observation, info = self.env.reset(seed=seed, options=options)
-        self.host.begin()
+        with self.host.numbers:
+            self.host.begin()
         self._advise(observation)
         return self._observed(observation), info
 
@@ -109,7 +110,8 @@ class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._observed(observation), reward, terminated, truncated, info
 
     def _advise(self, observation: Any) -> None:
-        given = self.host.act(copy.deepcopy(observation))
+        with self.host.numbers:
+            given = self.host.act(copy.deepcopy(observation))
         action = torch.as_tensor(self.actions.fitted(given, self.host.place))
         shape = self.space.event or action.shape
         vectors = self.space.advice(action.reshape(shape), torch.Size())
