@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv, check_env_specs
 
 from coil_rl.foreign.faults import shortened
-from coil_rl.foreign.trial import Finding, Recorded, Trial, same
+from coil_rl.foreign.trial import Finding, Trial, same
 from coil_rl.transforms import set_progress
 from coil_rl.transforms.action_space import ActionSpace, nested_key, space_of
 from coil_rl.transforms.guide_actions import unfit_action
@@ -81,7 +81,7 @@ def check_guide(
         raise ValueError(f"the guide writes {guide.out_keys}, not {action_key!r}")
     trial = Trial(env, steps)
     recorded = trial.recorded()
-    space = space_of(Recorded(env, recorded), action_key)
+    space = space_of(trial.base, action_key)
 
     def check(guide: nn.Module, _: object, written: TensorDictBase) -> None:
         _check_action(guide, written[action_key], written.batch_size, space)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
+from tensordict import unravel_key
 from torchrl.data import (
     Binary,
     Bounded,
@@ -114,7 +115,8 @@ class Entry:
         # Not the entry of a Dict space: the observation itself, or within a Tuple.
         whole = not path or isinstance(path[0], int)
         names = [str(part) for part in path]
-        self.key: tuple[str, ...] = ("observation", *names) if whole else tuple(names)
+        key = ("observation", *names) if whole else tuple(names)
+        self.name, self.key = key[0], unravel_key(key)
         self.title = ".".join(["the observation", *names])
         self.choices = _choices(space)
         dtype = torch.from_numpy(np.empty(0, floats)).dtype
@@ -176,36 +178,16 @@ class Entry:
         return converted
 
     @property
-    def bounds(self) -> list[NDArray[Any]]:
-        """Declared bounds, of the shape and dtype of `spec`; empty for choices.
+    def bounds(self) -> tuple[NDArray[Any], NDArray[Any]] | None:
+        """Declared bounds, of the shape and dtype of `spec`; None for choices.
 
         They are not those of `spec`, as some published envs leave them.
         """
         if not isinstance(self.space, spaces.Box):
-            return []
+            return None
         sides = self.space.low, self.space.high
-        return [bound.astype(self.dtype).reshape(self.given) for bound in sides]
-
-    def outside(self, values: NDArray[Any]) -> tuple[int, float, float, float] | None:
-        """Return where numbers are farthest outside the bounds of the space; None if nowhere.
-
-        Bounds are rounded as the numbers were.
-
-        Args:
-            values: of this entry, [n, *shape].
-
-        Returns:
-            The index of the number in the entry, its value, and its bounds.
-        """
-        if not (bounds := self.bounds):
-            return None
-        low, high = (bound.ravel().astype(np.float64) for bound in bounds)
-        numbers = values.reshape(len(values), -1).astype(np.float64)
-        excess = np.maximum(low - numbers, numbers - high)
-        if not excess.size or excess.max() <= 0:
-            return None
-        row, index = np.unravel_index(excess.argmax(), excess.shape)
-        return int(index), float(numbers[row, index]), float(low[index]), float(high[index])
+        low, high = (side.astype(self.dtype).reshape(self.given) for side in sides)
+        return low, high
 
     def _is_single(self, value: NDArray[Any]) -> bool:
         """Return whether a value is one number, which may have a dimension of its own."""

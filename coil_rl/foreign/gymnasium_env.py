@@ -169,18 +169,16 @@ class GymnasiumEnv(SeededRows):
         self.observation_bounds: dict[Any, tuple[torch.Tensor, torch.Tensor]] = {}
         self.observed_choices: dict[Any, Choices] = {}
         for entry in self.codec.entries:
-            name = entry.key[0]
-            if name in RESERVED:
+            if entry.name in RESERVED:
                 raise ValueError(
-                    f"the observation of {id} has an entry {name!r}: rename it with a wrapper"
+                    f"the observation of {id} has an entry {entry.name!r}: rename it with a wrapper"
                 )
             observation[entry.key] = entry.spec
-            key = entry.key if len(entry.key) > 1 else name
             if entry.choices:
-                self.observed_choices[key] = Choices(entry.space)
-            if entry.bounds and entry.spec.dtype.is_floating_point:
+                self.observed_choices[entry.key] = Choices(entry.space)
+            if entry.bounds is not None and entry.spec.dtype.is_floating_point:
                 low, high = (torch.from_numpy(bound).to(self.device) for bound in entry.bounds)
-                self.observation_bounds[key] = low, high
+                self.observation_bounds[entry.key] = low, high
         for name in self.info:
             observation["info", name] = number.clone()
         for name in controllers:

@@ -112,8 +112,7 @@ class GymnasiumRows(Rows[GymnasiumPlant]):
         }
         for index, entry in enumerate(self.codec.entries):
             joined = np.concatenate([plant.values[index] for plant in plants])
-            key = entry.key if len(entry.key) > 1 else entry.key[0]
-            found[key] = joined.reshape(len(plants), *entry.given)
+            found[entry.key] = joined.reshape(len(plants), *entry.given)
         if self.unseen:
             self._look_for_info()
         for name in self.info:

@@ -33,14 +33,9 @@ from coil_rl.foreign.host import called, is_of_user
 from coil_rl.foreign.limit import layers
 from coil_rl.foreign.remembered import pickled
 from coil_rl.transforms import GuideActions
-from coil_rl.transforms.action_space import (
-    first_choices,
-    observed_choices,
-    own_shape,
-    random_action,
-    written_key,
-)
+from coil_rl.transforms.action_space import random_action, written_key
 from coil_rl.transforms.guide_actions import UnfitActionError
+from coil_rl.transforms.link import State
 
 STEPS, FEWEST = 10, 3
 PATIENCE = 0.02  # s, of a rollout; a slower env takes fewer steps
@@ -117,7 +112,8 @@ class Trial:
             elif isinstance(self.base, SeededRows):
                 changed = difference(first, self._rollout(0, state, pause=True))
                 if changed is not None:
-                    self.find("clock", f"{_title(changed)} differs when time passes {CLOCK}")
+                    key = written_key(changed)
+                    self.find("clock", f"{key} of the env differs when time passes {CLOCK}")
             self._look_at_bounds(first)
             self._step_leaves_its_input()
             if changed is None and self.env.batch_size and self.env.batch_size[0] > 1:
@@ -179,16 +175,20 @@ class Trial:
             act = _random(self.base)
             rollout = self.base.rollout(self.steps, act, break_when_any_done=False)
         for entry in self.base.codec.entries:
-            parts = [rollout[entry.key], rollout["next", *entry.key]]
-            values = torch.cat([part.reshape(-1, *entry.given) for part in parts])
-            found = entry.outside(values.cpu().numpy())
-            if found is not None:
-                index, value, low, high = found
+            if entry.bounds is None:
+                continue
+            low, high = (np.ravel(bound).astype(np.float64) for bound in entry.bounds)
+            parts = [rollout[entry.key], rollout["next"][entry.key]]
+            rows = [part.reshape(part.shape[:2].numel(), low.size) for part in parts]
+            values = torch.cat(rows).double().cpu().numpy()
+            excess = np.maximum(low - values, values - high)
+            if excess.size and excess.max() > 0:
+                row, index = np.unravel_index(excess.argmax(), excess.shape)
                 self.find(
                     "bounds",
-                    f"number {index} of {entry.title} is {value:g}, but the observation_space of "
-                    f"{entry.id} has it from {low:g} to {high:g}; correct its bounds, or the "
-                    "number",
+                    f"number {index} of {entry.title} is {values[row, index]:g}, but the "
+                    f"observation_space of {entry.id} has it from {low[index]:g} to "
+                    f"{high[index]:g}; correct its bounds, or the number",
                 )
 
     def _step_leaves_its_input(self) -> None:
@@ -324,19 +324,25 @@ class Trial:
             reset_at: step at which an episode of row 0 begins anew; None for no reset.
             pause: whether time passes before each of the first steps.
         """
-        env = TransformedEnv(Recorded(self.env, data), GuideActions({"guide": guide}, action_key))
+        env = TransformedEnv(self.base, GuideActions({"guide": guide}, action_key))
+        link, observed = env.transform, list(self.env.observation_spec.keys(True, True))
+        row = torch.arange(len(data), device=data.device)[:, None]
+        state: State = {}
         taken = []
         with self.clock:
-            present = env.reset()
             for step in range(data.shape[1]):
-                if step:
-                    if pause and step <= PAUSED:
-                        self.clock.pause()
-                    present.set(action_key, data[action_key][:, step - 1])
-                    present = env.step(present)["next"]
+                if pause and 0 < step <= PAUSED:
+                    self.clock.pause()
+                present = data[:, step].select(*observed).clone()
+                state = link.sent(data[:, step - 1], state) if step else link.first(present)
+                state = link.observe(present, state | {"row": row})
+                advice = present["guide_action"]
                 if step == reset_at:
-                    present = _with_new_row(env, present)
-                taken.append(present["guide_action"])
+                    new = present[:1].clone()
+                    begun = link.observe(new, link.first(new) | {"row": row[:1]})
+                    state = {key: torch.cat([begun[key], state[key][1:]]) for key in begun}
+                    advice = torch.cat([new["guide_action"], advice[1:]])
+                taken.append(advice)
         return torch.stack(taken, 1)
 
     def ask_controller(self, guide: TensorDictModuleBase) -> None:
@@ -408,12 +414,6 @@ UNREPEATED = (
 
 def _shares(names: str) -> str:
     return f"all rows share {names}; make it in __init__, for each object its own"
-
-
-def _title(key: NestedKey) -> str:
-    if isinstance(key, tuple) and key[-2:-1] == ("controller",):
-        return f"the action of the controller {key[-1]}"
-    return f"{written_key(key)} of the env"
 
 
 class Clock:
@@ -547,45 +547,6 @@ def _with_new_row(env: EnvBase, present: TensorDictBase) -> TensorDictBase:
     mask = torch.zeros_like(present.get("done", done))
     mask[0] = True
     return env.reset(present.set("_reset", mask))
-
-
-class Recorded(EnvBase):
-    """Recorded data as an env.
-
-    A reset of all rows begins the data anew; after a reset of some rows they go on in the data.
-
-    Args:
-        env: of which the data is.
-        data: [B, T].
-    """
-
-    def __init__(self, env: EnvBase, data: TensorDictBase) -> None:
-        super().__init__(device=env.device, batch_size=data.batch_size[:1])
-        rows = data.batch_size[0]
-        for name in ("observation_spec", "full_action_spec", "full_reward_spec", "full_done_spec"):
-            spec = getattr(env, name).clone()
-            own = spec[:rows] if env.batch_size else spec.expand(rows, *spec.shape)
-            setattr(self, name, own)
-        self.data, self.step_number = data, 0
-        plant = getattr(env, "base_env", env)
-        self.first_choices, self.own_shape = first_choices(plant), own_shape(plant)
-        self.observed_choices = observed_choices(plant)
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
-        if tensordict is None or "_reset" not in tensordict or tensordict["_reset"].all():
-            self.step_number = 0
-        return self._present()
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.step_number += 1
-        return self._present().update(self.full_reward_spec.zero())
-
-    def _present(self) -> TensorDictBase:
-        observed = self.data[:, self.step_number].select(*self.observation_spec.keys(True, True))
-        return observed.clone().update(self.full_done_spec.zero())
-
-    def _set_seed(self, seed: int | None) -> None:
-        pass
 
 
 def _reseeded(thing: Any, first: PerRow) -> Any:
