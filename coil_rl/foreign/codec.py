@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
-from tensordict import unravel_key
+from tensordict import NestedKey, unravel_key
 from torchrl.data import (
     Binary,
     Bounded,
@@ -382,7 +382,7 @@ class Actions:
         """
         if not self.real:
             numbered: NDArray[Any] = actions + self.lowest
-            return numbered.astype(self.space.dtype) if self.whole else numbered
+            return numbered.astype(self.space.dtype)
         if not np.isfinite(actions).all():
             raise ForeignError(
                 f"the action for the env {self.name} holds a number that is not finite: the policy "
@@ -403,13 +403,11 @@ class Actions:
         """
         if action.size == 1 and math.prod(self.space.shape or ()) == 1:
             action = action.reshape(self.space.shape)
-        if self.whole:
-            typed = action.astype(self.space.dtype)
-            fits = bool((typed == action).all()) and self.space.contains(typed)
-        elif self.real:
+        if self.real:
             fits = action.shape == self.space.shape
         else:
-            fits = bool(self.space.contains(action))
+            typed = action.astype(self.space.dtype)
+            fits = bool((typed == action).all()) and self.space.contains(typed)
         if not fits:
             raise ForeignError(f"{place}: act returned {shown(action)}, no action of {self.space}")
         return np.array(action)
@@ -451,13 +449,13 @@ class Codec:
         self.fineness = Fineness(f"the env {name}", "the reward", self.floats)
         self.largest = largest(self.floats)  # number of a reward
 
-    def read(self, observation: Any) -> list[NDArray[Any]]:
-        """Return copies of the entries of an observation.
+    def read(self, observation: Any) -> dict[NestedKey, NDArray[Any]]:
+        """Return copies of the entries of an observation, by their keys.
 
         Args:
             observation: as an env returned it; a `ForeignError` if it does not fit its space.
         """
-        return [entry(observation) for entry in self.entries]
+        return {entry.key: entry(observation) for entry in self.entries}
 
     def check_same(self, env: Env, row: int) -> None:
         """Raise a `ValueError` for an env whose spaces are others."""

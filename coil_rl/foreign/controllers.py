@@ -258,80 +258,52 @@ def _guide_of(
 ) -> TensorDictModuleBase:
     """Return the guide of a class, a partial of one, a function, or an object."""
     role, read, is_class = role_of(thing), keys or ["observation"], inspect.isclass(called(thing))
-    if not role and is_class:
-        raise ValueError(
-            f"of={title} is a class without act(observation); give it this method, or name a "
-            "function"
-        )
     if not role:
+        what = "a class without act(observation)" if is_class else type(thing).__name__
         raise ValueError(
-            f"of={title} is {type(thing).__name__}; name a class, a function, an object with "
-            "act(observation), or a model with predict(observation, deterministic=True)"
+            f"of={title} is {what}; name a class or an object with act(observation), a function, "
+            "or a model with predict(observation, deterministic=True)"
         )
     if role == "function":
         check_call(thing, title, read, options)
         return FunctionGuide(partial(thing, **options), read, title)
     if is_class:
-        return _of_class(thing, title, keys, options)
-    if options:
+        check_call(thing, title, [], options)
+        make, kind = partial(thing, **options), called(thing)
+        if role == "act" and not issubclass(kind, nn.Module):
+            bound = isinstance(inspect.getattr_static(kind, "act"), (staticmethod, classmethod))
+            check_call(kind.act, f"{title}.act", read if bound else ["self", *read], {})
+            return PerRow(make, read, title=title)
+        with foreign(f"the controller {title}", "the constructor"):
+            thing = make()
+    elif options:
         raise ValueError(f"of={title} is an object, which takes no options; leave options out")
-    if isinstance(thing, nn.Module) and role != "predict":
-        thing = _copy_of(thing, title)
+    elif isinstance(thing, nn.Module) and role != "predict" and [*thing.parameters()]:
+        with foreign(f"the controller {title}", "its copy"):
+            thing = copy.deepcopy(thing)  # some methods train their guides
     return _of_object(thing, title, keys)
 
 
-def _of_class(
-    kind: Callable[..., Any], title: str, keys: list[NestedKey] | None, options: dict[str, Any]
-) -> TensorDictModuleBase:
-    """Return the guide of a class, or of a partial of one, made with `options`."""
-    check_call(kind, title, [], options)
-    read, make = keys or ["observation"], partial(kind, **options)
-    act = called(kind).act if role_of(kind) == "act" else None
-    if act is None or issubclass(called(kind), nn.Module):
-        with foreign(f"the controller {title}", "the constructor"):
-            thing = make()
-        return _of_object(thing, title, keys)
-    bound = isinstance(inspect.getattr_static(called(kind), "act"), (staticmethod, classmethod))
-    check_call(act, f"{title}.act", read if bound else ["self", *read], {})
-    return PerRow(make, read, title=title)
-
-
 def _of_object(thing: Any, title: str, keys: list[NestedKey] | None) -> TensorDictModuleBase:
-    """Return the guide of an object; a method `act` is what acts, if its class has one."""
+    """Return the guide of an object; a method `act` is what acts, if its class has one.
+
+    Args:
+        keys: entries to read; None for `observation`, or those of a model's observation space.
+    """
     role, read = role_of(thing), keys or ["observation"]
-    if role == "predict":
-        return _of_model(thing, title, keys)
     if role == "guide":
         if keys is not None:
             raise ValueError(f"of={title} has its own in_keys={thing.in_keys}; leave in_keys out")
         return hold(thing)
     if role == "network":
         return NetworkGuide(thing, read, title)
-    check_call(thing.act, f"{title}.act", read, {})
-    return PerRow(maker_of_rows(thing), read, title=title)
-
-
-def _of_model(model: Any, title: str, keys: list[NestedKey] | None) -> PerRow:
-    """Return the guide of a trained model with `predict`, which has no state of its own.
-
-    Args:
-        keys: entries to read; None for those of the model's observation space.
-    """
-    parts = getattr(getattr(model, "observation_space", None), "spaces", None)
-    if keys is None:
-        keys = [nested_key(key) for key in parts] if isinstance(parts, Mapping) else ["observation"]
-    return PerRow(partial(Predictor, model, keys), keys, title=title)
-
-
-def _copy_of(module: nn.Module, title: str) -> nn.Module:
-    """Return a copy of a network, because some methods train their guides.
-
-    A module without parameters is returned itself: nothing of it is trained.
-    """
-    if not any(True for _ in module.parameters()):
-        return module
-    with foreign(f"the controller {title}", "its copy"):
-        return copy.deepcopy(module)
+    if role == "act":
+        check_call(thing.act, f"{title}.act", read, {})
+        return PerRow(maker_of_rows(thing), read, title=title)
+    parts = getattr(getattr(thing, "observation_space", None), "spaces", None)
+    if keys is None and isinstance(parts, Mapping):
+        read = [nested_key(key) for key in parts]
+    return PerRow(partial(Predictor, thing, read), read, title=title)
 
 
 def _parts_of(key: NestedKey, entry: TensorDictBase) -> str:

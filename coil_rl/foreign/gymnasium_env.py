@@ -193,6 +193,8 @@ class GymnasiumEnv(SeededRows):
         self.done_spec = self._of_all_rows(ends)
         self.action_spec = self._of_all_rows(action)
         self.reward_spec = self._of_all_rows(number)
+        written = self.full_observation_spec, self.full_done_spec, self.full_reward_spec
+        self.written = [entry for spec in written for entry in spec.items(True, True)]
 
     def _of_all_rows(self, spec: TensorSpec) -> TensorSpec:
         """Return the spec of a batch from that of one row."""
@@ -284,15 +286,11 @@ class GymnasiumEnv(SeededRows):
 
     def _output(self, *, stepped: bool) -> TensorDict:
         tensors: dict[Any, torch.Tensor] = {}
-        for key in self.parts[0]:
-            if key == "reward" and not stepped:
-                continue
-            parts = [part[key] for part in self.parts]
-            value = torch.from_numpy(np.concatenate(parts) if len(parts) > 1 else parts[0])
-            if key[0] == "controller":
-                spec = self.observation_spec[key]
-                value = value.to(spec.dtype).reshape(spec.shape)
-            tensors[key] = value
+        for key, spec in self.written:
+            if stepped or key != "reward":
+                parts = [part[key] for part in self.parts]
+                value = torch.from_numpy(np.concatenate(parts) if len(parts) > 1 else parts[0])
+                tensors[key] = value.to(spec.dtype).reshape(spec.shape)
         data = TensorDict(tensors, self.batch_size)
         return data if self.device is None or self.device.type == "cpu" else data.to(self.device)
 

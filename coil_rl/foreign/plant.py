@@ -13,9 +13,8 @@ from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
+from tensordict import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
@@ -33,7 +32,7 @@ from coil_rl.foreign.faults import (
 )
 from coil_rl.foreign.guard import Numbers
 from coil_rl.foreign.host import Host
-from coil_rl.foreign.limit import limit_of, warn_of_limit
+from coil_rl.foreign.limit import limit_of, limits_of, warn_of_limit
 from coil_rl.foreign.makers import Env
 
 OLD_LIMIT = "TimeLimit.truncated"  # in info: how older envs say that the time was over
@@ -48,13 +47,10 @@ class Plant(ABC):
         row: its number in a batch, for messages.
 
     Attributes:
-        limit: steps after which an episode is truncated, with a warning; None for no limit.
         seed: of the running episode.
         steps: since its reset.
         numbers: global random numbers as the env and the controllers beside it see them.
     """
-
-    limit: int | None = None
 
     def __init__(self, name: str, row: int) -> None:
         self.name, self.row, self.seed, self.steps = name, row, 0, 0
@@ -88,13 +84,6 @@ class Plant(ABC):
         """Where the env is: its name, the row, the seed of the episode and the step."""
         return f"the env {self.name} (row {self.row}, seed {self.seed}, step {self.steps})"
 
-    def is_too_long(self, wrapper: str) -> bool:
-        """Return whether an episode has reached the limit that a wrapper could set, and say so."""
-        if self.limit is None or self.steps < self.limit:
-            return False
-        warn_of_limit(self.name, self.limit, wrapper)
-        return True
-
 
 class GymnasiumPlant(Plant):
     """One Gymnasium env and the controllers beside it.
@@ -108,9 +97,10 @@ class GymnasiumPlant(Plant):
 
     Attributes:
         env: the present env.
+        limit: steps after which an episode is truncated, with a warning; None for no limit.
         codec: of its spaces, which all rows share.
         observation: the last one, as the env returned it.
-        values: copies of its entries.
+        values: copies of its entries, by their keys.
         advice: of the controllers, by name.
     """
 
@@ -131,7 +121,7 @@ class GymnasiumPlant(Plant):
         self.make, self.makers, self.fresh = make, makers, fresh
         self.options = dict(options or {})
         self.size: tuple[int, ...] | None = None  # of the pictures
-        self.values: list[NDArray[Any]] = []
+        self.values: dict[NestedKey, NDArray[Any]] = {}
         self.advice: dict[str, NDArray[Any]] = {}
         with Numbers(row):
             self._open()
@@ -176,7 +166,7 @@ class GymnasiumPlant(Plant):
 
     def _step(self, action: Any) -> None:
         """Take a step; the answer must be five values: observation, reward, two flags and info."""
-        if self.terminated or self.truncated:
+        if self.is_over:
             self.reward = 0.0
             return
         self.steps += 1
@@ -188,8 +178,9 @@ class GymnasiumPlant(Plant):
                 raise error
         if self.codec.fineness.unseen:
             self.codec.fineness.see(np.asarray(self.reward))
-        if self.limit is not None and not self.terminated and not self.truncated:
-            self.truncated = self.is_too_long("TimeLimit")
+        if self.limit is not None and self.steps >= self.limit and not self.is_over:
+            warn_of_limit(self.name, self.limit, "TimeLimit")
+            self.truncated = True
         if self.controllers and not self.terminated:
             self._advise()
 
@@ -235,6 +226,11 @@ class GymnasiumPlant(Plant):
             if first:
                 self._begin_controllers()
             self._advise()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the episode has ended."""
+        return self.terminated or self.truncated
 
     def _look_for_masks(self) -> None:
         """Warn if info has a mask of the possible actions, which policies do not read."""
@@ -318,7 +314,9 @@ class TorchRLPlant(Plant):
     def __init__(self, env: EnvBase, row: int) -> None:
         own = env.base_env if isinstance(env, TransformedEnv) else env
         super().__init__(type(own).__name__, row)
-        self.env, self.limit = env, limit_of(env)
+        for limit in limits_of(env):
+            env = TransformedEnv(env, limit)
+        self.env = env
 
     def _begin(self) -> None:
         with foreign(self.place, "reset"):
@@ -334,13 +332,4 @@ class TorchRLPlant(Plant):
         given = self.state.copy().set(self.env.action_key, action.to(self.env.device))
         with foreign(self.place, "step"):
             step = self.env.step(given)
-            self._truncate(step["next"])
             self.after, self.state = step["next"], self.env.step_mdp(step)
-
-    def _truncate(self, after: TensorDictBase) -> None:
-        """End an episode that is too long."""
-        if not after["done"].any() and self.is_too_long("StepCounter"):
-            for name in ("done", "truncated"):
-                ends = after.get(name, None)
-                if ends is not None:
-                    after[name] = torch.ones_like(ends)

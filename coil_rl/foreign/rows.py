@@ -6,12 +6,13 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from tensordict import NestedKey
 
 from coil_rl.foreign.codec import Codec
 from coil_rl.foreign.guard import Guard
 from coil_rl.foreign.plant import GymnasiumPlant, Plant
 
-Entries = dict[str | tuple[str, ...], NDArray[Any]]
+Entries = dict[NestedKey, NDArray[Any]]
 AnyPlant = TypeVar("AnyPlant", bound=Plant)
 
 
@@ -101,23 +102,20 @@ class GymnasiumRows(Rows[GymnasiumPlant]):
 
     def entries(self) -> Entries:
         """Return the entries of all rows, [rows, ...], and their rewards."""
-        plants, floats = self.plants, self.codec.floats
-        terminated = np.array([[plant.terminated] for plant in plants])
-        truncated = np.array([[plant.truncated] for plant in plants])
+        plants = self.plants
         found: Entries = {
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated | truncated,
-            "reward": np.array([[plant.reward] for plant in plants], dtype=floats),
+            "terminated": np.array([plant.terminated for plant in plants]),
+            "truncated": np.array([plant.truncated for plant in plants]),
+            "reward": np.array([plant.reward for plant in plants], self.codec.floats),
         }
-        for index, entry in enumerate(self.codec.entries):
-            joined = np.concatenate([plant.values[index] for plant in plants])
-            found[entry.key] = joined.reshape(len(plants), *entry.given)
+        found["done"] = found["terminated"] | found["truncated"]
+        for entry in self.codec.entries:
+            found[entry.key] = np.array([plant.values[entry.key] for plant in plants])
         if self.unseen:
             self._look_for_info()
         for name in self.info:
-            numbers = np.array([plant.number_of(name) for plant in plants], dtype=floats)
-            found["info", name] = numbers.reshape(-1, 1)
+            numbers = [plant.number_of(name) for plant in plants]
+            found["info", name] = np.array(numbers, self.codec.floats)
         for name in plants[0].controllers:
             found["controller", name] = np.array([plant.advice[name] for plant in plants])
         return found
@@ -125,7 +123,7 @@ class GymnasiumRows(Rows[GymnasiumPlant]):
     def _look_for_info(self) -> None:
         """Warn of a name that no info has had when the first episode is over."""
         self.unseen.difference_update(*(plant.info for plant in self.plants))
-        if self.unseen and any(plant.terminated or plant.truncated for plant in self.plants):
+        if self.unseen and any(plant.is_over for plant in self.plants):
             missing = ", ".join(sorted(self.unseen))
             known = sorted({str(name) for plant in self.plants for name in plant.info})
             warnings.warn(

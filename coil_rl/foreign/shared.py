@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
 from coil_rl.foreign.faults import ForeignError, action_array, foreign, shown
@@ -140,14 +139,23 @@ def _near(one: Tensor, other: Tensor, tolerance: float, actions: Sequence[Tensor
 
 
 class _Shared(HostedGuide):
-    """Base of guides of one controller for all rows."""
+    """Base of guides of one controller for all rows.
 
-    title: str
-    guard: Guard
+    Args:
+        in_keys: entries to read, [*batch, ...].
+        title: name of the controller, for messages.
+    """
+
     space: ActionSpace | None = None  # unknown outside of an env
     choices: OwnChoices = {}  # noqa: RUF012  replaced, never changed
     for_batch: bool | None = None  # unknown before the first call
     each: Ask | None = None  # asks for one row after the other, if that is possible
+
+    def __init__(self, in_keys: Sequence[NestedKey], title: str) -> None:
+        self.in_keys: list[NestedKey] = [nested_key(key) for key in in_keys]
+        self.out_keys = ["action"]
+        super().__init__()
+        self.title, self.guard = title, Guard()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action, which may be one number for each row, as regressors predict it."""
@@ -161,8 +169,15 @@ class _Shared(HostedGuide):
         return tensordict.set("action", action)
 
     @abstractmethod
+    def _asked(self, entries: Sequence[Tensor]) -> Any:
+        """Return what the controller gives for all rows."""
+
     def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
         """Return the actions for all rows."""
+        action = self._asked(entries)
+        if isinstance(action, Tensor):
+            return action  # checked on its device by `GuideActions`
+        return torch.as_tensor(action_array(action), device=entries[0].device)
 
     def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Take the space of the actions, which decides what has the form of actions."""
@@ -212,7 +227,7 @@ class _Shared(HostedGuide):
         return self.space is not None and self.space.takes(together, torch.Size([count]))
 
 
-class NetworkGuide(_Shared, TensorDictModule):
+class NetworkGuide(_Shared):
     """A network as a guide: entries [B, N] to actions [B, A].
 
     Args:
@@ -226,16 +241,11 @@ class NetworkGuide(_Shared, TensorDictModule):
     """
 
     def __init__(self, network: nn.Module, in_keys: Sequence[NestedKey], title: str) -> None:
-        TensorDictModule.__init__(self, network, in_keys=list(in_keys), out_keys=["action"])
-        self.title, self.guard = title, Guard()
+        super().__init__(in_keys, title)
+        self.module = network
 
-    def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
-        """Return the actions for all rows."""
-        data = TensorDict({}, [], device=entries[0].device)
-        for key, entry in zip(self.in_keys, entries, strict=True):
-            data.set(key, entry)
-        action: Tensor = TensorDictModule.forward(self, data)["action"]
-        return action
+    def _asked(self, entries: Sequence[Tensor]) -> Any:
+        return self.module(*entries)
 
 
 class FunctionGuide(_Shared):
@@ -254,7 +264,7 @@ class FunctionGuide(_Shared):
         function: takes one value for each of `in_keys`; it must give the same action for the same
             observation.
         in_keys: entries to read, [*batch, ...].
-        title: name of the function for messages; by default its own.
+        title: name of the function, for messages.
 
     Raises:
         ForeignError: at a call, for what the function raises, for a batch if it can take neither,
@@ -262,29 +272,18 @@ class FunctionGuide(_Shared):
     """
 
     def __init__(
-        self,
-        function: Callable[..., Any],
-        in_keys: Sequence[NestedKey] = ("observation",),
-        title: str = "",
+        self, function: Callable[..., Any], in_keys: Sequence[NestedKey], title: str
     ) -> None:
-        self.in_keys: list[NestedKey] = [nested_key(key) for key in in_keys]
-        self.out_keys = ["action"]
-        super().__init__()
+        super().__init__(in_keys, title)
         self.function = function
-        self.title = title or getattr(function, "__name__", type(function).__name__)
-        self.guard = Guard()
 
     def _as_given(self, entries: Sequence[Tensor]) -> list[Tensor]:
         """Return entries as the env gives them, [*batch, ...]."""
         named = zip(self.in_keys, entries, strict=True)
         return [self.choices[key](entry) if key in self.choices else entry for key, entry in named]
 
-    def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
-        """Return the actions for all rows."""
-        action = self.function(*(entry.clone() for entry in self._as_given(entries)))
-        if isinstance(action, Tensor):
-            return action  # checked on its device by `GuideActions`
-        return torch.as_tensor(action_array(action), device=entries[0].device)
+    def _asked(self, entries: Sequence[Tensor]) -> Any:
+        return self.function(*(entry.clone() for entry in self._as_given(entries)))
 
     def each(self, entries: Sequence[Tensor]) -> Tensor:
         """Return the actions for one row after the other."""

@@ -82,15 +82,19 @@ class Trial:
         if isinstance(self.base, GymnasiumEnv):
             self.base.stay_in_process()
         if patience < math.inf:
-            self._take_fewer()
+            self.steps = min(steps, FEWEST)
+            self.steps = self._affordable(steps, partial(self._rollout, 0))
 
-    def _take_fewer(self) -> None:
-        """Shorten the rollouts of a slow env."""
-        most, self.steps = self.steps, min(self.steps, FEWEST)
+    def _affordable(self, most: int, take_few: Callable[[], object]) -> int:
+        """Return how many steps an env or a controller may take; of a slow one it is the fewest.
+
+        Args:
+            take_few: lets it take the fewest steps.
+        """
         start = time.perf_counter()
-        self._rollout(0)
-        each = (time.perf_counter() - start) / self.steps
-        self.steps = min(most, max(self.steps, int(self.patience / each)))
+        take_few()
+        each = (time.perf_counter() - start) / FEWEST
+        return int(min(most, max(FEWEST, self.patience / each)))
 
     def find(self, kind: Kind, text: str) -> None:
         """Take a finding."""
@@ -128,19 +132,17 @@ class Trial:
             state: of the transforms, which have no seed.
             pause: whether time passes before each of the first steps.
         """
-        act, left = _random(self.env), [PAUSED if pause else 0]
+        act = _random(self.env)
 
         def policy(data: TensorDictBase) -> TensorDictBase:
-            if left[0]:
-                left[0] -= 1
-                self.clock.pause()
+            self.clock.wait()
             return act(data)
 
         if state is not None:
             self.env.load_state_dict(state)
         self.env.set_seed(seed)
         torch.manual_seed(0)  # of the actions
-        with self.clock:
+        with self.clock.with_pauses(PAUSED if pause else 0):
             return self.env.rollout(self.steps, policy, break_when_any_done=False)
 
     def _look_at_numbers(self, rollout: TensorDictBase) -> None:
@@ -266,45 +268,68 @@ class Trial:
             action_key: of the action.
             tolerance: allowed effect of other rows.
         """
-        ask, middle = partial(self._advice, guide, action_key=action_key), recorded.shape[1] // 2
-        first, again, fresh = ask(recorded), ask(recorded), ask(recorded[:, middle:])
+        ask = partial(self._advice, guide, action_key=action_key)
+        equal = partial(torch.allclose, rtol=0, atol=tolerance)
+        self._ask("the guide", ask, recorded, equal, _Shared([type(guide)]), alone=False)
+        if self.findings:
+            return
+        middle = recorded.shape[1] // 2
+        fresh = ask(recorded[:, middle:])
+        if not equal(ask(recorded, reset_at=middle)[0, middle:], fresh[0]):
+            self.find(
+                "past",
+                "the guide's action after the reset of a row depends on what was before it, or on "
+                "the other rows",
+            )
+
+    def _ask(
+        self,
+        title: str,
+        ask: Callable[..., Tensor],
+        recorded: TensorDictBase,
+        equal: Callable[[Tensor, Tensor], bool],
+        shared: "_Shared",
+        *,
+        alone: bool,
+    ) -> None:
+        """Find the first of what makes advice another one for the same observations.
+
+        Args:
+            title: of what is asked.
+            ask: returns its advice along data, see `_advice`.
+            equal: whether advice is the same.
+            shared: of its class.
+            alone: whether a row without others must get the same.
+        """
+        first = ask(recorded)
+        if not equal(first, ask(recorded)):
+            text = f"{title} gives other actions for the same observations from the same start"
+            names = shared.changed()
+            shared.restore()
+            if names and equal(first, ask(recorded)):
+                self.find("rows", f"{text}: {_shares(names)}")
+            else:
+                self.find("draws", f"{text}: {UNREPEATED}")
+            return
+        # First, because the readings of one row pass the time of the others.
+        if not equal(first, ask(recorded, pause=True)):
+            self.find("clock", f"{title} gives other actions when time passes {CLOCK}")
+            return
         try:
-            interrupted = ask(recorded, reset_at=middle)
+            reset = ask(recorded, reset_at=recorded.shape[1] // 2)
         except (IndexError, RuntimeError) as error:
             self.find(
                 "past",
-                "the guide fails after a single row was reset, so it may remember in itself, not "
-                f"in entries: {error}",
+                f"{title} fails after a single row was reset, so it may remember in itself, not in "
+                f"entries: {error}",
             )
             return
-        equal = partial(torch.allclose, rtol=0, atol=tolerance)
-        found: list[tuple[Kind, bool, str]] = [
-            (
-                "draws",
-                torch.equal(first, again),
-                "the guide's action is another one for the same history; it draws, or remembers "
-                "earlier episodes",
-            ),
-            (
-                "rows",
-                equal(interrupted[1:], first[1:]),
-                "the guide's action for a row depends on the reset of another row",
-            ),
-            (
-                "past",
-                equal(interrupted[0, middle:], fresh[0]),
-                "the guide's action after the reset of a row depends on what was before it, or on "
-                "the other rows",
-            ),
-            (
-                "clock",
-                torch.equal(again, ask(recorded, pause=True)) or not torch.equal(first, again),
-                f"the guide's action is another one when time passes {CLOCK}",
-            ),
-        ]
-        for kind, is_right, text in found:
-            if not is_right:
-                self.find(kind, text)
+        others = equal(first[1:], reset[1:])
+        if not others or (alone and not equal(first[:1], ask(recorded[:1]))):
+            names = shared.changed() or SOMETHING
+            self.find(
+                "rows", f"{title} gives a row other actions beside other rows: {_shares(names)}"
+            )
 
     def _advice(
         self,
@@ -329,10 +354,10 @@ class Trial:
         row = torch.arange(len(data), device=data.device)[:, None]
         state: State = {}
         taken = []
-        with self.clock:
+        with self.clock.with_pauses(PAUSED if pause else 0):
             for step in range(data.shape[1]):
-                if pause and 0 < step <= PAUSED:
-                    self.clock.pause()
+                if step:
+                    self.clock.wait()
                 present = data[:, step].select(*observed).clone()
                 state = link.sent(data[:, step - 1], state) if step else link.first(present)
                 state = link.observe(present, state | {"row": row})
@@ -361,41 +386,17 @@ class Trial:
         shared = _Shared([_kind_of(own.make)])
         with suppress(ForeignError, UnfitActionError), torch.random.fork_rng():
             torch.manual_seed(0)
-            self._ask_objects(own, self.recorded(), shared)
+            recorded, first = self.recorded(), _new(own, own.make)
+            few = recorded[:, :FEWEST]
+            steps = self._affordable(recorded.shape[1], lambda: self._advice(first, few))
 
-    def _ask_objects(self, own: PerRow, recorded: TensorDictBase, shared: "_Shared") -> None:
-        first, start = _new(own, own.make), time.perf_counter()
-        advice = self._advice(first, recorded)
-        slow = math.ceil((time.perf_counter() - start) / self.patience)
-        if slow > 1:
-            recorded = recorded[:, : max(FEWEST, recorded.shape[1] // slow)]
-            advice = advice[:, : recorded.shape[1]]
+            def ask(data: TensorDictBase, **how: Any) -> Tensor:
+                again = _new(own, lambda: _reseeded(own.make(), first))
+                return self._advice(again, data, **how)
 
-        def ask(data: TensorDictBase, **how: Any) -> Tensor:
-            again = _new(own, lambda: _reseeded(own.make(), first))
-            return self._advice(again, data, **how)
-
-        title = f"the controller {own.title}"
-        if not torch.allclose(advice, ask(recorded)):
-            text = "gives other actions for the same observations from the same start"
-            names = shared.changed()
+            title = f"the controller {own.title}"
             shared.restore()
-            if names and torch.allclose(advice, ask(recorded)):
-                self.find("rows", f"{title} {text}: {_shares(names)}")
-            else:
-                self.find("draws", f"{title} {text}: {UNREPEATED}")
-            return
-        # First, because the readings of one row pass the time of the others.
-        if not torch.allclose(advice, ask(recorded, pause=True)):
-            self.find("clock", f"{title} gives other actions when time passes {CLOCK}")
-            return
-        alone, reset = ask(recorded[:1]), ask(recorded, reset_at=recorded.shape[1] // 2)
-        if not torch.allclose(advice[:1], alone) or not torch.allclose(advice[1:], reset[1:]):
-            self.find(
-                "rows",
-                f"{title} gives a row other actions beside other rows: "
-                f"{_shares(shared.changed() or SOMETHING)}",
-            )
+            self._ask(title, ask, recorded[:, :steps], torch.allclose, shared, alone=True)
 
 
 SOMETHING = "something, such as an attribute or a default argument of their class"
@@ -405,7 +406,7 @@ CLOCK = (
 )
 UNREPEATED = (
     "it draws random numbers that no seed of the run reaches, such as from a generator without a "
-    "seed, reads the clock, or keeps something outside of its object, so the run cannot be "
+    "seed, reads the clock, or keeps something that no reset reaches, so the run cannot be "
     "repeated or resumed to the bit; give it a generator of its own with a seed, such as "
     "np.random.default_rng(0), count time by steps, such as sample_time=None of a PID controller, "
     "and make in __init__ what it remembers"
@@ -450,11 +451,18 @@ class Clock:
         since = round(self.passed * 1e9) if name.endswith("_ns") else self.passed
         return self.start[name] + since
 
-    def pause(self) -> None:
-        """Let time pass: much of it by this clock, and some by every other one."""
-        self.passed += JUMP
-        self.tick = SLOW
-        time.sleep(PAUSE)
+    def with_pauses(self, number: int) -> "Clock":
+        """Make so many of the next calls of `wait` pauses."""
+        self.left = number
+        return self
+
+    def wait(self) -> None:
+        """Let time pass, if this is a pause: much by this clock, and some by every other one."""
+        if self.left:
+            self.left -= 1
+            self.passed += JUMP
+            self.tick = SLOW
+            time.sleep(PAUSE)
 
 
 class _Shared:

@@ -20,7 +20,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from itertools import pairwise
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize, register_after_fork
 from typing import Any
 
@@ -35,7 +35,7 @@ AUTO = "auto"
 SAVED = 2e-3  # seconds; a batched step of this length pays for the messages
 LEAST_STEPS, MOST_STEPS, LONGEST = 5, 30, 0.05  # of a timing, in steps and seconds
 FIRST = 10  # exit priority: from 0 on it is before multiprocessing waits for its processes
-PATIENCE = 5.0  # seconds until a start is reported as slow, and until a process must have ended
+PATIENCE = 5.0  # seconds until a process must have ended
 
 MakeRows = Callable[[range], GymnasiumRows]
 # What a process answers: a value, or an error in its place, and warnings.
@@ -85,20 +85,10 @@ class Workers:
         # do not end while their pipes are open.
         self._end = Finalize(self, _ended, (self.pipes, self.processes), exitpriority=FIRST)
         try:
-            self._wait_until_ready()
+            self._gather()  # they are ready
         except BaseException:
             self.close()
             raise
-
-    def _wait_until_ready(self) -> None:
-        missing, began = list(self.pipes), time.monotonic()
-        while missing:
-            ready = wait(missing, PATIENCE)
-            missing = [pipe for pipe in missing if pipe not in ready]
-            if missing and time.monotonic() - began > PATIENCE:
-                done = len(self.pipes) - len(missing)
-                _log.info("env.workers: %d of %d processes are ready", done, len(self.pipes))
-        self._gather()
 
     def begin(
         self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]

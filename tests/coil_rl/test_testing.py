@@ -110,6 +110,17 @@ class OfAllRows(TensorDictModuleBase):
         return tensordict.set("action", steering.mean(0).expand_as(steering))
 
 
+class FailsAlone(RowsInside):
+    """Forgets at the start of an episode of all rows, and cannot take some of them."""
+
+    in_keys, out_keys = ["steering", "is_init"], ["action"]
+
+    def forward(self, tensordict):
+        if tensordict["is_init"].all() and len(tensordict) == 3:
+            self.total = 0.0
+        return super().forward(tensordict)
+
+
 @pytest.mark.slow
 def test_guides_with_a_memory_pass():
     check_guide(Guide(), cones())
@@ -145,9 +156,10 @@ def test_guides_with_a_memory_pass():
             "holds a number that is not finite",
         ),
         (OfAllRows, "depends on what was before it, or on the other rows"),
-        (RandomGuide, "another one for the same history"),
-        (Hidden, "another one for the same history; it draws, or remembers earlier episodes"),
-        (RowsInside, "fails after a single row was reset, so it may remember in itself"),
+        (RandomGuide, "gives other actions for the same observations from the same start"),
+        (Hidden, "or keeps something that no reset reaches"),
+        (RowsInside, "or keeps something that no reset reaches"),
+        (FailsAlone, "fails after a single row was reset, so it may remember in itself"),
         (ForgetsAlone, "after the reset of a row depends on what was before it"),
     ],
 )
@@ -167,7 +179,7 @@ def test_reset_that_touches_other_rows_is_found():
             for other in everyone:
                 other.total = 0.0
 
-    with pytest.raises(ValueError, match="for a row depends on the reset of another row"):
+    with pytest.raises(ValueError, match="the guide gives a row other actions beside other rows"):
         check_guide(PerRow(Shared, ["steering"]), cones())
 
 

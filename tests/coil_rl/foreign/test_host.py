@@ -232,9 +232,13 @@ class Regressor:
         ("my_needy:Net", {}, "my_needy needs no_such_package, which is missing; install it"),
         ("my_broken:Net", {}, r"my_broken cannot be imported \(ZeroDivisionError: division by z"),
         ("my_control:Conter", {}, "my_control has no Conter; did you mean Counter"),
-        ("my_control:number", {}, "my_control:number is int; name a class, a function, an object"),
+        ("my_control:number", {}, "my_control:number is int; name a class or an object with act"),
         (Regressor(), {}, r"or a model with predict\(observation, deterministic=T"),
-        ("my_control:Other", {}, r"is a class without act\(observation\); give it this method, or"),
+        (
+            "my_control:Other",
+            {},
+            r"is a class without act\(observation\); name a class or an object",
+        ),
         (Static(), {"options": {"gain": 1}}, "is an object, which takes no options"),
         (
             "my_control:Counter",
