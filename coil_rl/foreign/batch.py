@@ -18,7 +18,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
 from coil_rl.envs.seeded_env import SeededEnv
-from coil_rl.foreign.rows import Entries, Shard
+from coil_rl.foreign.rows import Entries, Rows
+from coil_rl.foreign.workers import Workers
 
 SEEDS = 2**31  # seeds of drawn episodes are below
 REMEMBERED = 20_000  # steps; a longer episode is not repeated when a state is restored
@@ -50,7 +51,7 @@ class SeededRows(SeededEnv):
 
     def __init__(
         self,
-        shard: Shard,
+        shard: Rows[Any] | Workers,
         count: int,
         seed: int,
         first_seed: int | None,
@@ -60,7 +61,8 @@ class SeededRows(SeededEnv):
         if cases is not None and first_seed is None:
             raise ValueError(f"cases={cases} needs first_seed, the seed of the first case")
         super().__init__(device=torch.device(device), batch_size=torch.Size([count]))
-        self.shard, self.first_seed, self.cases = shard, first_seed, cases or count
+        self.shard: Rows[Any] | Workers = shard
+        self.first_seed, self.cases = first_seed, cases or count
         self.parts: list[Entries] = []  # of all rows, as the processes returned them
         self.generator = torch.Generator()
         self.seeds: list[int] = []  # of the running episodes; none before the first reset
@@ -80,7 +82,7 @@ class SeededRows(SeededEnv):
     def begin(
         self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]] | None = None
     ) -> None:
-        """Begin episodes, see `Shard`."""
+        """Begin episodes, see `Rows`."""
         self.parts[:] = self.shard.begin(seeds, actions or {})
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
@@ -116,10 +118,8 @@ class SeededRows(SeededEnv):
         state: dict[str, Any] = {"generator": self.generator.get_state(), "seeds": list(self.seeds)}
         if self.seeds:
             state["ages"] = self.ages.tolist()
-            if self.actions:
-                state["actions"] = torch.from_numpy(np.stack(self.actions))
-            else:
-                state["actions"] = torch.empty(0, *self.action_spec.shape)
+            shape = (len(self.actions), *self.action_spec.shape)
+            state["actions"] = torch.from_numpy(np.reshape(list(self.actions), shape))
             state["observed"] = self._observed().to_dict()
         return state
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from coil_rl.foreign.controllers import ControllerGuide, load
-from coil_rl.foreign.host import Predictor, asks_for_env, called, role_of
+from coil_rl.foreign.host import asks_for_env, called, role_of
 from coil_rl.foreign.remembered import maker_of_rows
 from coil_rl.transforms.guide_actions import Guides
 
@@ -80,8 +80,6 @@ def maker_beside(thing: Any, name: str, env: gymnasium.Env[Any, Any]) -> Callabl
     several = isinstance(env.observation_space, (spaces.Dict, spaces.Tuple))
     if role == "function" and (asks or several):  # it gets the observation as the env gives it
         return partial(SimpleNamespace, act=thing)
-    if role == "predict":
-        return lambda: Predictor(thing() if is_class else thing)
     if role == "act":
         return thing if is_class else maker_of_rows(thing)
     return partial(OneRow, thing() if is_class else thing)

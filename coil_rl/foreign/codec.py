@@ -24,7 +24,7 @@ from torchrl.data import (
     Unbounded,
 )
 
-from coil_rl.foreign.faults import FaultError, ForeignError, largest, plain_array, shown
+from coil_rl.foreign.faults import FaultError, ForeignError, plain_array, shown
 from coil_rl.foreign.makers import Env
 
 MOST_CHOICES = 32  # of a whole number that is an action
@@ -447,7 +447,7 @@ class Codec:
             )
         self.actions = Actions(name, env.action_space, dtype)
         self.fineness = Fineness(f"the env {name}", "the reward", self.floats)
-        self.largest = largest(self.floats)  # number of a reward
+        self.largest = float(np.finfo(self.floats).max)  # number of a reward
 
     def read(self, observation: Any) -> dict[NestedKey, NDArray[Any]]:
         """Return copies of the entries of an observation, by their keys.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -84,14 +83,6 @@ def plain_array(value: Any, what: str) -> NDArray[Any]:
     return array
 
 
-def number(value: Any, what: str, dtype: np.dtype[Any]) -> float:
-    """Return one number that is finite in a dtype, see `one_number`."""
-    result = one_number(value, what)
-    if not abs(result) <= largest(dtype):
-        raise FaultError(f"{what} is {result}, not a finite number of {dtype}")
-    return result
-
-
 def one_number(value: Any, what: str) -> float:
     """Return one number.
 
@@ -107,12 +98,6 @@ def one_number(value: Any, what: str) -> float:
     except Exception as error:
         raise FaultError(f"{what} is {shown(value)}, not one number") from error
     raise FaultError(f"{what} is {shown(value)}, not one number")
-
-
-@cache
-def largest(dtype: np.dtype[Any]) -> float:
-    """Return the largest number of a dtype."""
-    return float(np.finfo(dtype).max)
 
 
 def flag(value: Any, what: str) -> bool:

@@ -231,7 +231,7 @@ class GymnasiumEnv(SeededRows):
     def begin(
         self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]] | None = None
     ) -> None:
-        """Begin episodes, see `Shard`; the rows are made before the first one."""
+        """Begin episodes, see `Rows`; the rows are made before the first one."""
         if not self.parts:
             self._place_rows()
         super().begin(seeds, actions)

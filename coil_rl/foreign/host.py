@@ -100,11 +100,10 @@ class Predictor:
     Args:
         model: the model. `predict` must take `deterministic`; the others are given if it takes
             them.
-        keys: of the entries that it is given one by one, as its space has them; None for an
-            observation as its env returned it.
+        keys: of the entries that it is given one by one, as its space has them.
     """
 
-    def __init__(self, model: Any, keys: Sequence[NestedKey] | None = None) -> None:
+    def __init__(self, model: Any, keys: Sequence[NestedKey]) -> None:
         self.model, self.keys = model, keys
         self.space = getattr(model, "observation_space", None)
         parameters = inspect.signature(model.predict).parameters
@@ -116,11 +115,10 @@ class Predictor:
         self.state, self.first = None, True
 
     def act(self, *observed: Any) -> Any:
-        """Return the deterministic action for an observation, or for its entries."""
+        """Return the deterministic action for the entries of an observation."""
         given = {"state": self.state, "episode_start": np.array([self.first])}
         known = {name: given[name] for name in self.takes}
-        observation = observed[0] if self.keys is None else self._whole(observed)
-        answer = self.model.predict(observation, deterministic=True, **known)
+        answer = self.model.predict(self._whole(observed), deterministic=True, **known)
         self.first = False
         if isinstance(answer, tuple) and len(answer) == 2:
             answer, self.state = answer
@@ -131,7 +129,7 @@ class Predictor:
         parts = getattr(self.space, "spaces", None)
         if not isinstance(parts, Mapping):
             return _in_space(entries[0], self.space)
-        named = zip(self.keys or (), entries, strict=True)
+        named = zip(self.keys, entries, strict=True)
         return {key: _in_space(entry, parts.get(key)) for key, entry in named}
 
     def state_dict(self) -> dict[str, Any]:

@@ -25,7 +25,6 @@ from coil_rl.foreign.faults import (
     ForeignError,
     flag,
     foreign,
-    number,
     one_number,
     shortened,
     shown,
@@ -201,7 +200,10 @@ class GymnasiumPlant(Plant):
         ):
             if not isinstance(info, Mapping):
                 raise FaultError(f"info of step is {shown(info)}, not a dictionary")
-            reward = number(reward, "the reward", self.codec.floats)
+            reward = one_number(reward, "the reward")
+            if not abs(reward) <= self.codec.largest:
+                floats = self.codec.floats
+                raise FaultError(f"the reward is {reward}, not a finite number of {floats}")
             terminated, truncated = flag(terminated, "terminated"), flag(truncated, "truncated")
         if terminated and not truncated and info.get(OLD_LIMIT):
             warnings.warn(

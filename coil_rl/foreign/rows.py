@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,27 +14,6 @@ from coil_rl.foreign.plant import GymnasiumPlant, Plant
 
 Entries = dict[NestedKey, NDArray[Any]]
 AnyPlant = TypeVar("AnyPlant", bound=Plant)
-
-
-class Shard(Protocol):
-    """The rows of one process, or of several."""
-
-    def begin(
-        self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]
-    ) -> list[Entries]:
-        """Begin episodes, take some actions in each, and return the entries of each process.
-
-        Args:
-            seeds: by row.
-            actions: by row, as the env takes them; a row that is missing takes none.
-        """
-
-    def step(self, actions: Any) -> list[Entries]:
-        """Take a step in all rows, and return the entries of each process.
-
-        Args:
-            actions: of all rows, as the env takes them.
-        """
 
 
 class Rows(Generic[AnyPlant]):
@@ -51,7 +30,12 @@ class Rows(Generic[AnyPlant]):
     def begin(
         self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]
     ) -> list[Entries]:
-        """Begin episodes, see `Shard`."""
+        """Begin episodes, take some actions in each, and return the entries of each process.
+
+        Args:
+            seeds: by row.
+            actions: by row, as the env takes them; a row that is missing takes none.
+        """
         with self.guard:
             for row, seed in seeds.items():
                 self.plants[row].begin(seed)
@@ -60,7 +44,11 @@ class Rows(Generic[AnyPlant]):
         return self._done()
 
     def step(self, actions: Any) -> list[Entries]:
-        """Take a step in all rows, see `Shard`."""
+        """Take a step in all rows, and return the entries of each process.
+
+        Args:
+            actions: of all rows, as the env takes them.
+        """
         with self.guard:
             for plant, action in zip(self.plants, actions, strict=True):
                 plant.step(action)

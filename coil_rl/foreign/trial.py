@@ -102,10 +102,8 @@ class Trial:
 
     def ask_env(self) -> None:
         """Ask the env: finite numbers, its seed, the clock, its bounds and its rows."""
-        kinds: list[type] = []
-        if isinstance(self.base, GymnasiumEnv):
-            kinds = [type(layer) for layer in layers(self.base.held.plants[0].env)]
-        shared = _Shared(kinds)
+        single = self.base.held.plants[0].env if isinstance(self.base, SeededRows) else self.base
+        shared = _Shared([type(layer) for layer in layers(single)])
         state = self.env.state_dict() if self.env is not self.base else None
         with torch.random.fork_rng():
             first, _, again = (self._rollout(seed, state) for seed in (0, 1, 0))

@@ -93,7 +93,7 @@ class Workers:
     def begin(
         self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]
     ) -> list[Entries]:
-        """Begin episodes, see `Shard`."""
+        """Begin episodes, see `Rows`."""
         for pipe, own in zip(self.pipes, self.ranges, strict=True):
             mine = {row - own.start: seed for row, seed in seeds.items() if row in own}
             theirs = {row - own.start: actions[row] for row in actions if row in own}
@@ -101,7 +101,7 @@ class Workers:
         return [entries for part in self._gather() for entries in part]
 
     def step(self, actions: Sequence[Any]) -> list[Entries]:
-        """Take a step in all rows, see `Shard`."""
+        """Take a step in all rows, see `Rows`."""
         for pipe, own in zip(self.pipes, self.ranges, strict=True):
             self._send(pipe, ("step", actions[own.start : own.stop]))
         return [entries for part in self._gather() for entries in part]
