@@ -6,7 +6,7 @@ each in the same cases.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -43,7 +43,7 @@ class EvaluationCurve:
         folder: of the run.
         policy: of the learner; copies of it act.
         make_env: makes the envs.
-        sets: names of the sets of cases.
+        sets: names of the sets of cases. Without any, no policies are kept.
         watch: further measures, "episode" at the end of an episode, "step" as the mean over its
             steps.
         points: number of policies that are kept, besides the first one.
@@ -57,7 +57,7 @@ class EvaluationCurve:
     folder: Path
     policy: TensorDictModuleBase
     make_env: EnvMaker
-    sets: Iterable[str]
+    sets: Collection[str]
     _: KW_ONLY
     watch: Watch = field(default_factory=dict)
     points: int = 16
@@ -92,7 +92,7 @@ class EvaluationCurve:
 
     def kept(self) -> list[int]:
         """Return the updates of the run after which the policy is kept."""
-        return evenly([0, *self.stages], self.points)
+        return evenly([0, *self.stages], self.points) if self.sets else []
 
     def batch(self, update: int) -> list[int]:
         """Return the updates whose policies are evaluated after an update, if any."""

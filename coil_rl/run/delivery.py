@@ -83,14 +83,14 @@ class Delivery:
         learner: has the policy.
         env: of the training.
         cases: in which policies are compared.
-        curve: has kept policies; None: none are kept.
+        curve: may have kept policies.
         folder: of the run.
     """
 
     learner: Learner
     env: EnvBase
     cases: TrainingCases
-    curve: EvaluationCurve | None
+    curve: EvaluationCurve
     folder: Path
 
     names: Sequence[str] = ("delivery/last", "delivery/earlier", "delivery/guide", "delivery/cases")
@@ -128,7 +128,7 @@ class Delivery:
 
         If no episode has ended, they are the steps of a row in the whole training.
         """
-        rows = [] if self.curve is None else self.curve.metrics.rows
+        rows = self.curve.metrics.rows
         if not rows or FINISHED not in rows[-1]:
             return 0.0
         finished = sum(row[FINISHED] for row in rows if not math.isnan(row[FINISHED]))
@@ -190,8 +190,6 @@ class Delivery:
 
         The first one is left out, as no episode was finished with it.
         """
-        if self.curve is None:
-            return None
         rows = self.curve.metrics.rows
         returns = {
             each: rows[each][RETURN_IN_TRAINING] for each in self.curve.kept() if 0 < each < update
@@ -206,7 +204,7 @@ class Delivery:
 
         There is nothing in a run whose env has no guides.
         """
-        if self._holds() and self.curve is not None:
+        if self._holds() and self.curve.kept():
             return {"first": checkpoint.load(self.curve.file(0))}
         titles = self._guides_of_env()
         return {title: {GUIDE: torch.tensor(index)} for index, title in enumerate(titles)}

@@ -51,7 +51,7 @@ class Experiment(Stateful):
         callbacks: called before the first update, and after each one before its row is logged. The
             numbers that one returns are columns of the log.
         curve: keeps policies and evaluates them, after the row of an update was logged.
-        cases: in which callbacks compare policies; their steps are frames. None: there are none.
+        cases: in which callbacks compare policies; their steps are frames.
         reserve: returns the frames that are kept for a test at the end, once the tests before the
             first update are over. None: there is no such test.
         before: frames that were taken before the run, by what prepared it.
@@ -68,12 +68,12 @@ class Experiment(Stateful):
     frames: int
     folder: Path
     _: KW_ONLY
+    curve: EvaluationCurve
+    cases: TrainingCases
     logger: Any | None = None
     watch: Watch = field(default_factory=dict)
     checkpoint_every: int = 10
     callbacks: Sequence[Callback] = ()
-    curve: EvaluationCurve | None = None
-    cases: TrainingCases | None = None
     reserve: Callable[[], int] | None = None
     before: int = 0
     identity: Mapping[str, Any] = field(default_factory=dict)
@@ -96,13 +96,12 @@ class Experiment(Stateful):
     @property
     def tested(self) -> int:
         """Steps that tests have taken so far."""
-        return 0 if self.cases is None else self.cases.steps
+        return self.cases.steps
 
     @property
     def calls(self) -> int:
         """Number of actions that guides were asked for so far."""
-        of_tests = 0 if self.cases is None else self.cases.calls
-        return self.calls_before + guide_calls(self.rollout.env) + of_tests
+        return self.calls_before + guide_calls(self.rollout.env) + self.cases.calls
 
     def _plan(self) -> None:
         """Fix at how many updates the run ends, and what the curve keeps.
@@ -118,10 +117,8 @@ class Experiment(Stateful):
                 whole = math.ceil((frames - self.before) / batch) * batch
                 updates = (whole - self.tested - kept) // batch
                 self.ends[frames] = max(updates, self.updates + 1)
-        if self.curve is not None:
-            known = [update for update in self.ends.values() if update <= self.all_updates]
-            before = int(self.first["frames"])
-            self.curve.attach(self.metrics, known, self.rollout.frames, before)
+        known = [update for update in self.ends.values() if update <= self.all_updates]
+        self.curve.attach(self.metrics, known, self.rollout.frames, int(self.first["frames"]))
 
     def resume(self) -> None:
         """Continue from the last intact checkpoint of the folder.
@@ -134,8 +131,7 @@ class Experiment(Stateful):
         lengths = (self.frames, *self.stages)
         known = go_on(self.folder, self.identity, lengths, self.load_state_dict)
         self.metrics.truncate(self.updates + 1 if self.updates else 0)
-        if self.curve is not None:
-            self.metrics.check_columns(self.curve.columns)
+        self.metrics.check_columns(self.curve.columns)
         where = f"after update {self.updates}"
         if not known:
             where = "from the beginning: there is no checkpoint yet"
@@ -199,8 +195,7 @@ class Experiment(Stateful):
         """
         with self.resume_hint():
             batch = self.rollout.collect(progress)
-        columns = self.curve.columns if self.curve else []
-        row = dict.fromkeys(columns, math.nan) | self._describe(batch)
+        row = dict.fromkeys(self.curve.columns, math.nan) | self._describe(batch)
         learned = {
             f"learner/{name}": value for name, value in self.learner.update(batch, progress).items()
         }
@@ -238,7 +233,9 @@ class Experiment(Stateful):
     def _act(self, row: Mapping[str, float]) -> None:
         """Write the checkpoint after an update, and continue the curve.
 
-        A training that is asked to stop writes its checkpoint, and is interrupted.
+        A training that is asked to stop writes its checkpoint, and is interrupted. An evaluation
+        takes long and changes nothing of the state, so that it is interrupted at once, and done
+        again by the run that goes on.
 
         Args:
             row: of the log; empty before the first update.
@@ -248,20 +245,11 @@ class Experiment(Stateful):
             self.save()
             if STOP.requested:
                 raise KeyboardInterrupt
-        if self.curve is not None:
-            self._evaluate(self.curve)
-
-    def _evaluate(self, curve: EvaluationCurve) -> None:
-        """Evaluate the kept policies; a training that is stopped meanwhile saves its state first.
-
-        The evaluation takes long and changes nothing of the state, so that it is done again by the
-        run that goes on.
-        """
         try:
             with STOP.at_once():
-                curve.after_update(self.updates)
+                self.curve.after_update(update)
         except KeyboardInterrupt:
-            if self.updates:
+            if update:
                 self.save()
             raise
 

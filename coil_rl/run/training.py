@@ -84,13 +84,11 @@ def _copy_of_init(folder: Path, init: Path) -> Path:
     return copy
 
 
-def _curve_of(run: Run, policy: TensorDictModuleBase) -> EvaluationCurve | None:
-    """Return the evaluation curve of a run; None without cases."""
-    sizes = run.make_env.sizes
-    if EVALUATION not in sizes:
-        return None
-    # An earlier policy is chosen by the test at the end, if there is one.
-    sets = [EVALUATION] if run.delivery == "tested" else sizes
+def _curve_of(run: Run, policy: TensorDictModuleBase) -> EvaluationCurve:
+    """Return the evaluation curve of a run; it has no sets where there are no such cases."""
+    sets = [*run.make_env.sizes] if EVALUATION in run.make_env.sizes else []
+    if run.delivery == "tested":  # an earlier policy is chosen by the test at the end
+        sets = [each for each in sets if each == EVALUATION]
     return EvaluationCurve(
         run.folder,
         policy,

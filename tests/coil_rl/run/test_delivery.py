@@ -2,12 +2,14 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from programs import called, composed, read_csv
 
 from coil_rl import open_run
+from coil_rl.config.assemble import assemble
 from coil_rl.config.parts import env_maker
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.record import DELIVERY
@@ -107,6 +109,20 @@ def test_test_at_the_end_gets_what_the_start_test_leaves_of_a_tenth(taken, ahead
     cases.steps, cases.guide_ahead = taken, ahead
     delivery = Delivery(learner=None, env=None, cases=cases, curve=None, folder=tmp_path)
     assert delivery.reserve() == kept
+
+
+@pytest.mark.parametrize(("finished", "fits"), [(80.0, True), (4.0, False)])
+def test_long_episodes_of_a_training_without_a_curve_leave_no_test(finished, fits, tmp_path):
+    words = ["env=pendulum", "method=coil", "delivery=tested", "budget.num_envs=2"]
+    run = assemble(composed(*words, "budget.frames=6000", f"run_dir={tmp_path}"))
+    run.make_env = replace(run.make_env, sizes={})
+    training = run.training(0)
+    (delivery,) = (each for each in training.callbacks if isinstance(each, Delivery))
+    training.metrics.rows = [{"train/episodes": finished, "frames/rollout": 800}]
+    training.curve.attach(training.metrics, [1], frames=800, before=0)
+    # Two cases with policy and guide, in 300 frames.
+    assert delivery._fits() == fits
+    assert training.curve.kept() == []
 
 
 class CountedCases(TrainingCases):
