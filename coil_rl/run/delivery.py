@@ -124,12 +124,12 @@ class Delivery:
         return self._first_episodes() * self._length_in_training() <= self._affordable()
 
     def _length_in_training(self) -> float:
-        """Return the mean steps of an episode of the training, 0 where they are not logged.
+        """Return the mean steps of an episode of the training, 0 before the log has a row.
 
         If no episode has ended, they are the steps of a row in the whole training.
         """
         rows = self.curve.metrics.rows
-        if not rows or FINISHED not in rows[-1]:
+        if not rows:
             return 0.0
         finished = sum(row[FINISHED] for row in rows if not math.isnan(row[FINISHED]))
         return rows[-1]["frames/rollout"] / max(finished, self.env.batch_size.numel())

@@ -93,16 +93,6 @@ class Experiment(Stateful):
         """Number of updates of the whole run, once it is known."""
         return self.ends[self.frames]
 
-    @property
-    def tested(self) -> int:
-        """Steps that tests have taken so far."""
-        return self.cases.steps
-
-    @property
-    def calls(self) -> int:
-        """Number of actions that guides were asked for so far."""
-        return self.calls_before + guide_calls(self.rollout.env) + self.cases.calls
-
     def _plan(self) -> None:
         """Fix at how many updates the run ends, and what the curve keeps.
 
@@ -115,7 +105,7 @@ class Experiment(Stateful):
         for frames in (*self.stages, self.frames):
             if frames not in self.ends:
                 whole = math.ceil((frames - self.before) / batch) * batch
-                updates = (whole - self.tested - kept) // batch
+                updates = (whole - self.cases.steps - kept) // batch
                 self.ends[frames] = max(updates, self.updates + 1)
         known = [update for update in self.ends.values() if update <= self.all_updates]
         self.curve.attach(self.metrics, known, self.rollout.frames, int(self.first["frames"]))
@@ -167,12 +157,12 @@ class Experiment(Stateful):
             desc="train",
         ) as bar:
             self._act({})
-            if self.tested and not self.updates:
+            if self.cases.steps and not self.updates:
                 self.save()
             with STOP.after_update():
                 while self.updates < updates:
                     # The first update may learn from all steps of the tests, which takes long.
-                    kept = self.tested and not self.updates
+                    kept = self.cases.steps and not self.updates
                     with STOP.at_once() if kept else nullcontext():
                         row = self.update(self.updates / updates)
                     row |= self._measure(row)
@@ -223,11 +213,11 @@ class Experiment(Stateful):
         """Return the frames so far, their parts, and the number of calls of guides, by name."""
         rollout = self.updates * self.rollout.frames
         return {
-            "frames": self.before + self.tested + rollout,
+            "frames": self.before + self.cases.steps + rollout,
             "frames/before": self.before,
             "frames/rollout": rollout,
-            "frames/tests": self.tested,
-            "guide/calls": self.calls,
+            "frames/tests": self.cases.steps,
+            "guide/calls": self.calls_before + guide_calls(self.rollout.env) + self.cases.calls,
         }
 
     def _act(self, row: Mapping[str, float]) -> None:
