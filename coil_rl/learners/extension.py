@@ -21,11 +21,12 @@ class Extension:
         """Entries that `losses` reads, besides those that the policy observes."""
         return ()
 
-    def meet(self, critics: Any) -> None:
-        """Take the `Critics` of the learner, or raise a `ValueError` for those that do not fit.
+    def meet(self, policy: ProbabilisticTensorDictSequential, critics: Any) -> None:
+        """Take what the losses need, or raise a `ValueError` for what does not fit.
 
         Args:
-            critics: of actions; None: the learner has none.
+            policy: of the learner, that `losses` is called with.
+            critics: of actions, see `Critics`; None: the learner has none.
         """
 
     def prepare(self, batch: TensorDictBase) -> None:

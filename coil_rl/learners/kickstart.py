@@ -9,6 +9,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
+from coil_rl.learners.anchor import AnchoredSample
 from coil_rl.learners.critics import Critics
 from coil_rl.learners.density import Choices, Normal, SquashedNormal
 from coil_rl.learners.extension import Extension
@@ -32,8 +33,9 @@ class KickstartLoss(Extension):
         coefficient: weight of the loss, a number or a schedule.
         kind: "likelihood", behavioural cloning: -log pi(g | s); or "divergence": KL(N(g, scale) ||
             pi), which also trains the standard deviation of the policy. For bounded actions both
-            normal distributions are squashed, and g is at most 0.8 of the way to a bound.
-        scale: standard deviation of the guide for the divergence, before squashing.
+            normal distributions are squashed, and g is at most 0.8 of the way to a bound. For
+            choices both are the cross-entropy, because g is certain.
+        scale: standard deviation of the guide for the divergence of numbers, before squashing.
         guide: index of the guide in the advice.
         advice_key: entry with the advice, [N, n_guides, A].
 
@@ -55,6 +57,14 @@ class KickstartLoss(Extension):
         """Entries that it reads, besides those that the policy observes."""
         return [self.advice_key]
 
+    def meet(self, policy: ProbabilisticTensorDictSequential, critics: Critics | None) -> None:
+        """Refuse a policy whose distribution is not that of its action."""
+        if isinstance(policy.module[-1], AnchoredSample):
+            raise ValueError(
+                "an anchored policy adds numbers to its guide's, so none of them is to be drawn to "
+                "the guide's action; leave learner.anchor out, or learner.auxiliary"
+            )
+
     def losses(
         self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase
     ) -> dict[str, Tensor]:
@@ -70,7 +80,7 @@ class KickstartLoss(Extension):
         return {"guide_weight": self.coefficient_at(progress)}
 
     def each(self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase) -> Tensor:
-        """Return the loss of each row of a minibatch, [N]; for choices it is the cross-entropy."""
+        """Return the loss of each row of a minibatch, [N]."""
         advice = minibatch[self.advice_key][..., self.guide, :]
         density = policy.get_dist(minibatch.select(*policy.in_keys))
         if isinstance(density, Choices):
@@ -103,8 +113,9 @@ class FilteredKickstartLoss(KickstartLoss):
 
     soft: bool = field(default=False, kw_only=True)
 
-    def meet(self, critics: Critics | None) -> None:
+    def meet(self, policy: ProbabilisticTensorDictSequential, critics: Critics | None) -> None:
         """Take the critics; a learner without is a `ValueError`."""
+        super().meet(policy, critics)
         if critics is None:
             raise ValueError(
                 "FilteredKickstartLoss compares values of actions; take learner=sac, or "

@@ -301,14 +301,11 @@ class OffPolicy(Stateful, Learner):
             self._store(steps, self.buffer)
             return
         agent_acts = steps.pop(AGENT_ACTS).reshape(-1)
-        self._store(steps if self._together else steps[agent_acts], self.buffer)
         if self.prior:
+            self._store(steps[agent_acts], self.buffer)
             self._store(steps[~agent_acts], self.guide_buffer)
-
-    @property
-    def _together(self) -> bool:
-        """Whether steps of agent and guide are stored together."""
-        return not self.prior and self.of_guide != "nothing"
+        else:
+            self._store(steps if self.of_guide != "nothing" else steps[agent_acts], self.buffer)
 
     def _store(self, steps: TensorDictBase, buffer: ReplayBuffer) -> None:
         if len(steps) == 0:

@@ -163,7 +163,7 @@ class SAC(OffPolicy):
         if self.with_target:
             self.follow(self.critics, self.of_critics)
         for each in auxiliary:
-            each.meet(self.critics)
+            each.meet(self.actor, self.critics)
         log_alpha = torch.tensor(math.log(temperature), device=self.device)
         self.temperature = nn.ParameterDict({"log_alpha": log_alpha})
         size = networks.action_shape(env).numel()
@@ -171,7 +171,13 @@ class SAC(OffPolicy):
         self.target_entropy = torch.tensor(entropy, device=self.device)
         self.target_critics, self.writes_uncertainty = target_critics, uncertainty
         self.policy = self.build_policy()
-        self._set_weights()
+        self.of_actor = Weights(self.actor)
+        learned = [self.of_actor, self.of_critics, *self.further_weights()]
+        self.set_update(
+            [*(each.vector for each in learned), self.temperature["log_alpha"]],
+            [self.target_entropy, *self.policy.buffers(), *self.critics.buffers()],
+            betas=self.betas,
+        )
 
     def build_actor(self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp) -> Policy:
         """Return a policy that reads entries that have been normalised already.
@@ -200,15 +206,6 @@ class SAC(OffPolicy):
     def further_weights(self) -> list[Weights]:
         """Return the weights that are learned besides those of policy and critics."""
         return []
-
-    def _set_weights(self) -> None:
-        self.of_actor = Weights(self.actor)
-        learned = [self.of_actor, self.of_critics, *self.further_weights()]
-        self.set_update(
-            [*(each.vector for each in learned), self.temperature["log_alpha"]],
-            [self.target_entropy, *self.policy.buffers(), *self.critics.buffers()],
-            betas=self.betas,
-        )
 
     def losses(self, minibatch: Entries) -> dict[str, Tensor]:
         """Return the losses of a minibatch [N] by name, and other values, scalars."""

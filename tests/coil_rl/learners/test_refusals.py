@@ -17,10 +17,12 @@ from coil_rl.learners import (
     SAC,
     TQC,
     TRPO,
+    Anchor,
     CrossQ,
     DynamicCoil,
     FilteredKickstartLoss,
     Gru,
+    KickstartLoss,
     Reinforce,
 )
 from coil_rl.learners.encoders import Cnn, Mlp, ObservationNetwork
@@ -48,6 +50,10 @@ def driver():
 
 def dynamic(env=None, **options):
     return DynamicCoil(env or worlds.cones(), **{"guides": {"one": driver()}} | options)
+
+
+def imitating(kind):
+    return kind(worlds.cones(), anchor=Anchor(), auxiliary=[KickstartLoss()])
 
 
 def constant():
@@ -130,6 +136,8 @@ SIZES = "must have one number for each convolution"
         (lambda: dynamic(guides={"still": constant()}), "guide 'still' has no parameters"),
         (lambda: dynamic(guides=dict.fromkeys("ab", driver())), "two guides share parameters"),
         (lambda: PPO(AnyEnv(), auxiliary=[FilteredKickstartLoss()]), "take learner=sac"),
+        (lambda: imitating(PPO), "an anchored policy adds numbers to its guide's.* learner.anchor"),
+        (lambda: imitating(SAC), "an anchored policy adds numbers to its guide's.* learner.anchor"),
         (lambda: SAC(AnyEnv(), critics=1), "critics=1 must be"),
         (lambda: SAC(AnyEnv(), critics=4, target_critics=4), "at least 1 and less than critics=4"),
         (lambda: SAC(AnyEnv(), prior=0.5), r"prior=0\.5 needs steps in which a guide acts"),
