@@ -1,5 +1,6 @@
 """The weights of a network as one vector, so that an update takes one operation for all of them."""
 
+import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -32,8 +33,20 @@ class Weights:
         self.sizes = [parameter.numel() for parameter in parameters]
         flat = [parameter.detach().reshape(-1) for parameter in parameters]
         self.vector = nn.Parameter(torch.cat(flat))
-        for parameter, view in zip(parameters, self._views(self.vector.detach()), strict=True):
-            parameter.data = view
+        self._join()
+
+    def _join(self) -> None:
+        """Make the parameters views of the vector."""
+        views = self._views(self.vector.detach())
+        for (table, name), view in zip(self.places, views, strict=True):
+            table[name].data = view
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Weights":
+        """Return a copy whose vector is that of the copied module; PyTorch copies each alone."""
+        copied = object.__new__(Weights)
+        vars(copied).update(copy.deepcopy(vars(self), memo))
+        copied._join()
+        return copied
 
     def _views(self, vector: Tensor) -> list[Tensor]:
         parts = vector.split(self.sizes)

@@ -74,3 +74,15 @@ def test_restored_learner_goes_on_with_the_same_digits(kind, options, updates):
     check_same_update(first, second, rollout.collect())
     if replay:
         assert (first.buffer[:] == second.buffer[:]).all()
+
+
+@pytest.mark.parametrize("kind", [TRPO, SAC, DQN])
+def test_copied_learner_learns_as_the_first_does(kind):
+    torch.manual_seed(0)
+    first, rollout = learning(kind, InUnits(kind))
+    first.update(rollout.collect())
+    second = copy.deepcopy(first)
+    before = copy.deepcopy(second.policy.state_dict())
+    check_same_update(first, second, rollout.collect())
+    after = second.policy.state_dict()
+    assert any(not torch.equal(value, after[name]) for name, value in before.items())
