@@ -198,7 +198,7 @@ class PID(ToldGuide):
         for name in ("kp", "ki", "kd", "kf"):
             given, kps = arguments.get(name, float(name == "kp")), arguments.get("kp", 1.0)
             for index, own in enumerate(given if isinstance(given, Sequence) else [given]):
-                kp = kps[index] if isinstance(kps, Sequence) else kps
+                kp = kps[index % len(kps)] if isinstance(kps, Sequence) else kps
                 sizes = [abs(own) / WIDE, abs(own) * WIDE] if own else []
                 if name == "ki" and kp:
                     sizes += [abs(kp) / (SLOWEST * step), abs(kp) / (FASTEST * step)]

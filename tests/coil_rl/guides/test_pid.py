@@ -147,3 +147,6 @@ def test_it_knows_bounds_of_its_numbers() -> None:
     assert found["ki.0"] == [-0.5, -0.001]
     assert found["ki.1"] == [0.001, 100.0, "log"]
     assert "kd.0" not in found
+    found = PID.tunable({"kp": [2.0], "ki": [0.0, 5.0], "step": 0.1})  # one gain for both loops
+    assert found["ki.0"] == [0.02, 10.0, "log"]
+    assert found["ki.1"] == [0.02, 100.0, "log"]
