@@ -10,8 +10,8 @@ with D = -log pi_aux(g | s) for discrete actions, and for numbers the largest di
 mode of pi_aux.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Unpack
+from collections.abc import Sequence
+from typing import Any, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -57,15 +57,11 @@ class Advisor(PPO):
         self.minibatch_keys += self.imitation.keys
 
     def build_policy(
-        self,
-        env: EnvBase,
-        in_keys: Sequence[NestedKey],
-        network: Mlp,
-        make_actor: Callable[..., Policy],
+        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **options: Any
     ) -> Policy:
         """Return the policy, and make the auxiliary one."""
         self.imitator = networks.actor(env, in_keys, network, inputs=self.inputs)
-        return super().build_policy(env, in_keys, network, make_actor)
+        return super().build_policy(env, in_keys, network, **options)
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters that the optimiser updates."""

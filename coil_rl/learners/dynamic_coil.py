@@ -225,15 +225,12 @@ class DynamicCoil(PPO):
         super().__init__(env, in_keys, **settings)
 
     def build_policy(
-        self,
-        env: EnvBase,
-        in_keys: Sequence[NestedKey],
-        network: Mlp,
-        make_actor: Callable[..., Policy],
+        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **options: Any
     ) -> Policy:
         """Return the guides followed by the agent."""
         shapes = {"guide_action": torch.Size([len(self.guides), *env.action_spec_unbatched.shape])}
-        agent = make_actor(env, [*in_keys, *self.advice.out_keys], network, shapes=shapes)
+        observed = [*in_keys, *self.advice.out_keys]
+        agent = super().build_policy(env, observed, network, shapes=shapes, **options)
         self.agent_parameters = list(agent.parameters())
         return Policy(self.advice, *agent.module)
 

@@ -7,9 +7,8 @@ near the policy that collected the batch:
     loss = -mean(min(r A, clip(r, 1 - clip, 1 + clip) A)),  r = pi(a | s) / pi_old(a | s)
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import ClassVar, Literal, TypedDict
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Literal, TypedDict
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
@@ -167,15 +166,16 @@ class PPO(Stateful, Learner):
 
         self.anchor, self.normaliser = anchor, normaliser(env, in_keys, normalise)
         self.inputs = networks.inputs_of(env, self.normaliser, anchor)
-        make_actor = partial(
-            networks.actor,
+        self.policy = self.build_policy(
+            env,
+            in_keys,
+            network,
             scale=action_scale,
             gain=action_gain,
             squash=squash,
             inputs=self.inputs,
             anchor=anchor,
         )
-        self.policy = self.build_policy(env, in_keys, network, make_actor)
         self.critic = self.build_critic(env, in_keys, network)
         self.first_inputs, memory, self.head = networks.parts_of(self.policy)
         self.values = networks.values_of(self.critic, self.first_inputs)
@@ -203,14 +203,10 @@ class PPO(Stateful, Learner):
         self._set_keys(env, in_keys)
 
     def build_policy(
-        self,
-        env: EnvBase,
-        in_keys: Sequence[NestedKey],
-        network: Mlp,
-        make_actor: Callable[..., Policy],
+        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **options: Any
     ) -> Policy:
-        """Return the policy; `make_actor` is `networks.actor` with the other arguments set."""
-        return make_actor(env, in_keys, network)
+        """Return the policy; `options` are further arguments of `networks.actor`."""
+        return networks.actor(env, in_keys, network, **options)
 
     def build_critic(
         self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp
