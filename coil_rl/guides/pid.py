@@ -170,9 +170,15 @@ class PID(ToldGuide):
                 parts.append(self.numbers.new_full(batch, source.value))
                 continue
             value = tensordict[source.key]
-            if source.place is None and value.shape[-1] != 1:
+            size = value.shape[-1]
+            if source.place is not None and not -size <= source.place < size:
                 raise ValueError(
-                    f"{name}={written_key(source.key)} has {value.shape[-1]} numbers; give "
+                    f"{name}=[{written_key(source.key)},{source.place}] must be one of {size} "
+                    "numbers, counted from 0"
+                )
+            if source.place is None and size != 1:
+                raise ValueError(
+                    f"{name}={written_key(source.key)} has {size} numbers; give "
                     f"{name}=[{written_key(source.key)},INDEX] for one of them"
                 )
             parts.append(value[..., source.place or 0].double())

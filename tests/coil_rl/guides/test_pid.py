@@ -130,6 +130,7 @@ def used(measured: Any, env: str = "Pendulum-v1") -> None:
         (lambda: PID(["a", "b"], kp=[1.0, 2.0, 3.0]), "kp has 3 values.* 2 loops"),
         (lambda: PID([]), "measured names no entry"),
         (lambda: used("observation"), r"has 3 numbers; give .*\[observation,INDEX\]"),
+        (lambda: used(["observation", 3]), r"\[observation,3\] must be one of 3 numbers"),
         (lambda: used(["observation", 1], "CartPole-v1"), "actions of this env are choices"),
         (lambda: used([["observation", 0], ["observation", 1]]), "1 numbers, but the PID 2 loops"),
     ],
