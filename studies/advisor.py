@@ -52,7 +52,7 @@ class Advisor(PPO):
     ) -> None:
         self.alpha, self.imitation = alpha, KickstartLoss(guide=guide)
         super().__init__(env, in_keys, **settings)
-        self.imitation.meet(self.head, None)
+        self.imitation.meet(env, self.head, None)
         self.keys += self.imitation.keys
         self.minibatch_keys += self.imitation.keys
 

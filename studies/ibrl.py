@@ -31,6 +31,7 @@ from coil_rl.learners.sac import SAC, SACSettings
 from coil_rl.learners.weights import Weights
 from coil_rl.ranges import NonNegative, checked
 from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.transforms.guide_transform import check_advised
 
 ADVICE = "guide_action"
 
@@ -55,6 +56,7 @@ class IBRL(SAC):
     """
 
     reported = (*SAC.reported, "guide_share")
+    advice_key = ADVICE
 
     def __init__(
         self,
@@ -70,12 +72,8 @@ class IBRL(SAC):
             raise ValueError(
                 "IBRL compares all critics; leave target_critics, uncertainty and anchor out"
             )
-        if ADVICE not in env.observation_spec:
-            raise KeyError(
-                f"IBRL chooses between actions, but the env has no {ADVICE}; "
-                "put GuideActions before it"
-            )
         self.guide, self.sharpness, self.edit = guide, sharpness, edit
+        check_advised(env.observation_spec, self)
         super().__init__(env, in_keys, **settings)
         self.also_store(ADVICE)
 

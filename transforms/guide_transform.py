@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -102,18 +102,28 @@ class GuideTransform(ActionTransform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add what is written; raises a `KeyError` if the env does not write this advice."""
-        spec = observation_spec.get(self.advice_key, None)
-        if spec is None or self.guide >= spec.shape[-2]:
-            found = "no advice" if spec is None else f"advice of {spec.shape[-2]} guides"
-            raise KeyError(
-                f"{type(self).__name__} reads row {self.guide} of {self.advice_key}, but there is "
-                f"{found}; put GuideActions with enough guides before it"
-            )
+        check_advised(observation_spec, self)
         return super().transform_observation_spec(observation_spec)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return stored data unchanged."""
         return tensordict
+
+
+def check_advised(observation_spec: Composite, reader: Any) -> None:
+    """Raise a `KeyError` if an env does not write the advice that something reads.
+
+    Args:
+        observation_spec: of the env.
+        reader: has an `advice_key`, and a `guide`, its row of the advice.
+    """
+    spec = observation_spec.get(reader.advice_key, None)
+    if spec is None or reader.guide >= spec.shape[-2]:
+        found = "no advice" if spec is None else f"advice of {spec.shape[-2]} guides"
+        raise KeyError(
+            f"{type(reader).__name__} reads row {reader.guide} of {reader.advice_key}, but there "
+            f"is {found}; put GuideActions with enough guides before it"
+        )
 
 
 def set_progress(env: EnvBase, progress: float) -> None:

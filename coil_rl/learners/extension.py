@@ -6,6 +6,7 @@ from typing import Any
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 
 class Extension:
@@ -21,10 +22,11 @@ class Extension:
         """Entries that `losses` reads, besides those that the policy observes."""
         return ()
 
-    def meet(self, policy: ProbabilisticTensorDictSequential, critics: Any) -> None:
-        """Take what the losses need, or raise a `ValueError` for what does not fit.
+    def meet(self, env: EnvBase, policy: ProbabilisticTensorDictSequential, critics: Any) -> None:
+        """Take what the losses need, or refuse what does not fit.
 
         Args:
+            env: the env, for its specs.
             policy: of the learner, that `losses` is called with.
             critics: of actions, see `Critics`; None: the learner has none.
         """

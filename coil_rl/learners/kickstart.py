@@ -8,6 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from coil_rl.learners.anchor import AnchoredSample
 from coil_rl.learners.critics import Critics
@@ -15,6 +16,7 @@ from coil_rl.learners.density import Choices, Normal, SquashedNormal
 from coil_rl.learners.extension import Extension
 from coil_rl.ranges import Positive, checked
 from coil_rl.schedules import Linear, Schedule, schedule
+from coil_rl.transforms.guide_transform import check_advised
 
 # Minimum distance of a guide's action from the bounds, as a fraction of half the range. To imitate
 # a bound saturates the squashing: noise then has no effect, and gradients are almost zero.
@@ -57,8 +59,17 @@ class KickstartLoss(Extension):
         """Entries that it reads, besides those that the policy observes."""
         return [self.advice_key]
 
-    def meet(self, policy: ProbabilisticTensorDictSequential, critics: Critics | None) -> None:
-        """Refuse a policy whose distribution is not that of its action."""
+    def meet(
+        self, env: EnvBase, policy: ProbabilisticTensorDictSequential, critics: Critics | None
+    ) -> None:
+        """Refuse an env without the advice, and a policy whose density is not that of its action.
+
+        Raises:
+            KeyError: for the env.
+            ValueError: for the policy.
+        """
+        if self.advice_key not in policy.out_keys:  # that of Dynamic COIL has its guides inside
+            check_advised(env.observation_spec, self)
         if isinstance(policy.module[-1], AnchoredSample):
             raise ValueError(
                 "an anchored policy adds numbers to its guide's, so none of them is to be drawn to "
@@ -113,14 +124,16 @@ class FilteredKickstartLoss(KickstartLoss):
 
     soft: bool = field(default=False, kw_only=True)
 
-    def meet(self, policy: ProbabilisticTensorDictSequential, critics: Critics | None) -> None:
+    def meet(
+        self, env: EnvBase, policy: ProbabilisticTensorDictSequential, critics: Critics | None
+    ) -> None:
         """Take the critics; a learner without is a `ValueError`."""
-        super().meet(policy, critics)
         if critics is None:
             raise ValueError(
                 "FilteredKickstartLoss compares values of actions; take learner=sac, or "
                 "KickstartLoss"
             )
+        super().meet(env, policy, critics)
         self.critics = critics
 
     def each(self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase) -> Tensor:

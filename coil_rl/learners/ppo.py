@@ -223,7 +223,7 @@ class PPO(Stateful, Learner):
     ) -> Extensions:
         """Return what is added to the algorithm, in the order in which it acts."""
         for own in auxiliary:
-            own.meet(self.head, None)
+            own.meet(env, self.head, None)
         each = [*of_rewards]
         if (reward_key := unravel_key(("next", env.reward_key))) != ("next", "reward"):
             each.insert(0, SummedRewards(reward_key))

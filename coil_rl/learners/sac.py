@@ -163,7 +163,7 @@ class SAC(OffPolicy):
         if self.with_target:
             self.follow(self.critics, self.of_critics)
         for each in auxiliary:
-            each.meet(self.actor, self.critics)
+            each.meet(env, self.actor, self.critics)
         log_alpha = torch.tensor(math.log(temperature), device=self.device)
         self.temperature = nn.ParameterDict({"log_alpha": log_alpha})
         size = networks.action_shape(env).numel()

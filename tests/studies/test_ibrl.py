@@ -143,5 +143,5 @@ def test_invalid_options_are_refused(options, message):
 
 
 def test_env_without_advice_is_refused():
-    with pytest.raises(KeyError, match="the env has no guide_action"):
+    with pytest.raises(KeyError, match="IBRL reads row 0 of guide_action, but there is no advice"):
         IBRL(PendulumEnv(), ["th"])

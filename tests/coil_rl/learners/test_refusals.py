@@ -52,8 +52,8 @@ def dynamic(env=None, **options):
     return DynamicCoil(env or worlds.cones(), **{"guides": {"one": driver()}} | options)
 
 
-def imitating(kind):
-    return kind(worlds.cones(), anchor=Anchor(), auxiliary=[KickstartLoss()])
+def imitating(kind, loss=None):
+    return kind(worlds.cones(), anchor=Anchor(), auxiliary=[loss or KickstartLoss()])
 
 
 def constant():
@@ -136,6 +136,8 @@ SIZES = "must have one number for each convolution"
         (lambda: dynamic(guides={"still": constant()}), "guide 'still' has no parameters"),
         (lambda: dynamic(guides=dict.fromkeys("ab", driver())), "two guides share parameters"),
         (lambda: PPO(AnyEnv(), auxiliary=[FilteredKickstartLoss()]), "take learner=sac"),
+        (lambda: PPO(AnyEnv(), auxiliary=[KickstartLoss()]), "row 0 of guide_action.* no advice"),
+        (lambda: imitating(PPO, KickstartLoss(guide=1)), "row 1 of guide_action.* of 1 guides"),
         (lambda: imitating(PPO), "an anchored policy adds numbers to its guide's.* learner.anchor"),
         (lambda: imitating(SAC), "an anchored policy adds numbers to its guide's.* learner.anchor"),
         (lambda: SAC(AnyEnv(), critics=1), "critics=1 must be"),
