@@ -52,7 +52,6 @@ class ExportedGuide(ToldGuide):
         self.memory = {f"exported_{entry['input']}": entry for entry in contract["state"]}
         self.in_keys = [*self.read, *self.memory]
         self.out_keys: list[NestedKey] = ["action", *(("next", name) for name in self.memory)]
-        self.fits = False
 
     def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
         """Check the action of an env.

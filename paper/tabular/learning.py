@@ -160,12 +160,10 @@ class QLearningResult:
 
     Attributes:
         Q: [O, A], the estimated value of each action.
-        visits: [O, A], the number of updates of each pair.
         history: [K, O, A], Q after each of the K requested numbers of steps.
     """
 
     Q: Array
-    visits: Integers
     history: Array
 
     @property
@@ -232,7 +230,7 @@ def q_learning(
         if step in snapshots:
             history[step] = np.array(Q)
     ordered = np.array([history[step] for step in snapshots]).reshape(-1, *np.shape(Q))
-    return QLearningResult(np.array(Q), np.array(visits), ordered)
+    return QLearningResult(np.array(Q), ordered)
 
 
 def _observations(states: int, observations: ArrayLike | None) -> Integers:
