@@ -90,8 +90,8 @@ def record(
         seed: of the env and of the drawn actions.
         tick: called after every step.
     """
-    plant = (run.make_env.of_agent or run.make_env.bare)(1, TRAIN, None)
-    env = transformed(plant, [], "env").eval()
+    bare = run.make_env.of_agent or run.make_env.bare
+    env = transformed(bare(1, TRAIN, None), [], "env").eval()
     env.set_seed(seed)
     steps = list[Step]()
     heard = None if controller.guides is None else Heard(controller.guides)
@@ -102,7 +102,7 @@ def record(
             if done or age == LONGEST:
                 carrier, episode, age = env.reset(), episode + 1, 0
                 controller.reset()
-            entries = carrier.select(*plant.observation_spec.keys())
+            entries = carrier.select(*env.base_env.observation_spec.keys())
             copied, before = entries.clone(), time.process_time()
             action = controller.act_on(copied)
             seconds = time.process_time() - before
