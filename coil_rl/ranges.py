@@ -28,6 +28,13 @@ Count = Annotated[int, Ge(1)]
 Index = Annotated[int, Ge(0)]
 Seed = Annotated[int, Interval(ge=0, le=2**63 - 1)]
 Processes = Literal["auto"] | Annotated[int, Interval(ge=0, le=256)]
+# Of worlds with cones: laps, seconds and starts of an episode, visible cones of a side (two make a
+# curve), and the largest steering.
+Laps = Annotated[int, Interval(gt=0, le=10**6)]
+Seconds = Annotated[float, Interval(gt=0, le=10**6)]
+Starts = Annotated[int, Interval(ge=1, le=10**5)]
+SeenCones = Annotated[int, Ge(2)]
+Degrees = Annotated[float, Interval(gt=0, le=90)]
 
 # What is said of pydantic's errors; of others its own words.
 WORDS = {

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from coil_rl.envs.level_files import shipped_track as shipped_track
     from coil_rl.envs.level_files import shipped_tracks as shipped_tracks
     from coil_rl.envs.level_files import track_names as track_names
-    from coil_rl.envs.limits import Degrees as Degrees
     from coil_rl.envs.recordings.folders import RecordingError as RecordingError
     from coil_rl.envs.recordings.mcap_files import RecordingWriter as RecordingWriter
     from coil_rl.envs.recordings.reading import read_recording as read_recording

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from coil_rl.envs.boundaries import Boundaries
 from coil_rl.envs.constants import constant
-from coil_rl.envs.limits import Degrees, Kept, Laps, Seconds, Starts
 from coil_rl.envs.meanings import of_cones
 from coil_rl.envs.reward import LapsEnv
 from coil_rl.envs.seeded_env import declare_specs
@@ -27,7 +26,18 @@ from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SAMPLES, SIGHT, Frame, View, 
 from coil_rl.envs.splines import spline_fit
 from coil_rl.envs.track import NEVER, Track, begin_in_sight
 from coil_rl.envs.track_map import Location, TrackMap
-from coil_rl.ranges import Count, Interval, Positive, Seed, checked
+from coil_rl.ranges import (
+    Count,
+    Degrees,
+    Interval,
+    Laps,
+    Positive,
+    Seconds,
+    Seed,
+    SeenCones,
+    Starts,
+    checked,
+)
 
 FINISH_RADIUS = 0.625  # m
 
@@ -118,7 +128,7 @@ class ConeTrackEnv(LapsEnv):
         sight: Annotated[float, Interval(gt=0, le=100)] = SIGHT,
         hold_boundary: bool = False,
         finish_in_sight: bool = False,
-        kept_cones: Kept = 16,
+        kept_cones: SeenCones = 16,
         speed: Positive = 2.0,
         car_length: Positive = 2.0,
         max_steering: Degrees = 80.0,

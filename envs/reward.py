@@ -52,7 +52,6 @@ class Outcome(NamedTuple):
         finished: [B], whether a lap was completed.
         discovered: [B], number of sides with a newly visible cone.
         to_boundaries: [2, B] m, distances to the left and the right boundary.
-        clearance: [B] m, distance to a crash.
         crashed: [B], whether the car crashed.
         alive: [B], 0 after a crash, else 1.
     """
@@ -63,7 +62,6 @@ class Outcome(NamedTuple):
     finished: Tensor
     discovered: Tensor
     to_boundaries: Tensor
-    clearance: Tensor
     crashed: Tensor
     alive: Tensor
 
@@ -270,7 +268,7 @@ class LapsEnv(SeededEnv):
         """
         crashed = clearance <= constant(0, clearance)
         alive = (~crashed).to(clearance.dtype)
-        outcome = Outcome(**happened, clearance=clearance, crashed=crashed, alive=alive)
+        outcome = Outcome(**happened, crashed=crashed, alive=alive)
         terms = self._reward(outcome)
         completed = (self.lap >= constant(self.laps, self.lap)) & ~crashed
         terminated = crashed | completed

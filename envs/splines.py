@@ -49,15 +49,7 @@ class Spline:
 
     def along(self, fraction: Tensor) -> Tensor:
         """Evaluate at fractions [S, *batch] of the last knot, from 0 to 1: [D, S, *batch], m."""
-        return self._at(self.knots[-1] * fraction)
-
-    def equidistant(self, samples: int) -> Tensor:
-        """Evaluate from first to last point in equal steps: [D, samples, *batch] m, at least 3."""
-        inner = constant(tuple(k / (samples - 1) for k in range(1, samples - 1)), self.knots)
-        return torch.cat([self.values[:, :1], self.along(inner), self.values[:, -1:]], 1)
-
-    def _at(self, u: Tensor) -> Tensor:
-        """Evaluate at parameters u [S, *batch] m, from 0 to the last knot: [D, S, *batch], m."""
+        u = self.knots[-1] * fraction
         ends, dim = self._interval_ends(u), len(self.values)
         x0, x1 = self.knots.flatten().index_select(0, ends).view(2, *u.shape).unbind(0)
         y0, y1 = self.values.flatten(1).index_select(1, ends).view(dim, 2, *u.shape).unbind(1)
@@ -69,6 +61,11 @@ class Spline:
         t = before / width.clamp(min=torch.finfo(u.dtype).eps)
         chord = torch.lerp(y0, y1, t)
         return torch.addcmul(chord, before * after, torch.lerp(g0, g1, t) + g0 + g1, value=-1 / 6)
+
+    def equidistant(self, samples: int) -> Tensor:
+        """Evaluate from first to last point in equal steps: [D, samples, *batch] m, at least 3."""
+        inner = constant(tuple(k / (samples - 1) for k in range(1, samples - 1)), self.knots)
+        return torch.cat([self.values[:, :1], self.along(inner), self.values[:, -1:]], 1)
 
     def _interval_ends(self, u: Tensor) -> Tensor:
         """Return the knots before and after parameters u [S, *batch].

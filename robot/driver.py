@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from coil_rl.envs import Degrees, Perception
+from coil_rl.envs import Perception
 from coil_rl.envs.recordings import in_order
 from coil_rl.envs.robot import BoundaryMemory
-from coil_rl.ranges import Positive, checked
+from coil_rl.ranges import Degrees, Positive, checked
 from coil_robot.watchdog import Limits, Scan, Watchdog
 
 State = Literal["waiting", "driving", "stopped"]

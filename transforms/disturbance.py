@@ -103,18 +103,14 @@ class Delay(Disturbance):
     def _kept(self) -> Mapping[NestedKey, TensorSpec]:
         """Return for each key of the memory the spec of what it keeps of one step."""
 
-    def _check_env(self, spec: Composite) -> None:
-        """Raise a `ValueError` for an env in which the past cannot be kept."""
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the memory; raises a `ValueError` if it cannot be kept."""
         name = type(self).__name__
-        if self.memory_key in spec.keys(True):
+        if self.memory_key in observation_spec.keys(True):
             raise ValueError(
                 f"{name} keeps the past in {self.memory_key!r}, which exists already; give each "
                 "delay a memory_key of its own"
             )
         if "_reset" not in self.parent.reset_keys:
             raise ValueError(f"{name} needs one episode a row, but the env resets its agents alone")
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the memory; raises a `ValueError` if it cannot be kept."""
-        self._check_env(observation_spec)
         return super().transform_observation_spec(observation_spec)

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from coil_rl.envs.limits import Degrees
-from coil_rl.ranges import Positive, checked
+from coil_rl.ranges import Degrees, Positive, checked
 
 INSTALL = "pip install git+https://github.com/papalotis/ft-fsd-path-planning.git"
 

@@ -9,9 +9,8 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from coil_rl.cones.spline import TARGET_REACHED, SplineGuide, first_point
-from coil_rl.envs.limits import Degrees
 from coil_rl.envs.splines import slots_in_use
-from coil_rl.ranges import Positive, checked
+from coil_rl.ranges import Degrees, Positive, checked
 
 
 @checked

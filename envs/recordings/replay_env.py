@@ -18,7 +18,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.limits import Degrees, Kept
 from coil_rl.envs.recordings.cautions import about_demonstrations, cautions_about
 from coil_rl.envs.recordings.folders import RecordingError, files_of
 from coil_rl.envs.recordings.mcap_files import read_messages
@@ -28,7 +27,7 @@ from coil_rl.envs.reward import HISTORY, recent_mean
 from coil_rl.envs.robot.perception import BoundaryMemory, Perception
 from coil_rl.envs.seeded_env import declare_specs
 from coil_rl.envs.sight import SIGHT
-from coil_rl.ranges import Count, Interval, Positive, checked
+from coil_rl.ranges import Count, Degrees, Interval, Positive, SeenCones, checked
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.float64]], tuple[Any, Any]]
 AnyPath = str | os.PathLike[str]
@@ -134,7 +133,7 @@ class McapReplayEnv(EnvBase):
         spline: Literal["cubic", "quadratic"] = "cubic",
         smoothing: float = 0.1,
         smooth: Annotated[float, Interval(ge=-1e6, le=1e6)] = -0.1,
-        kept_cones: Kept = 16,
+        kept_cones: SeenCones = 16,
         sight: Positive | None = None,
         speed: Positive = 0.15,
         car_length: Positive = 2 / 7,

@@ -15,7 +15,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from coil_rl.envs.limits import Degrees, Laps, Seconds, Starts
 from coil_rl.envs.meanings import of_cones
 from coil_rl.envs.reward import LapsEnv
 from coil_rl.envs.robot.course import RobotCourse, robot_track
@@ -27,7 +26,7 @@ from coil_rl.envs.robot.perception import (
 )
 from coil_rl.envs.seeded_env import declare_specs
 from coil_rl.envs.track import NEVER, Track
-from coil_rl.ranges import Count, Positive, checked
+from coil_rl.ranges import Count, Degrees, Laps, Positive, Seconds, Starts, checked
 
 FINISH_RADIUS = 0.15  # m, covers the width between the cones
 

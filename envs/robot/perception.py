@@ -15,11 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from coil_rl.envs.limits import Kept
 from coil_rl.envs.robot.clusters import GAP, Clusters, measure, points_of, single_linkage
 from coil_rl.envs.sight import SAMPLES, SIGHT, encode_samples
 from coil_rl.envs.splines import spline_fit
-from coil_rl.ranges import Interval, NonNegative, Positive, checked
+from coil_rl.ranges import Interval, NonNegative, Positive, SeenCones, checked
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -152,7 +151,7 @@ class Perception:
     laser_yaw: Annotated[float, Interval(ge=-360, le=360)] = 0.0
     margin: NonNegative = 0.15
     gap: Positive = GAP
-    kept_cones: Kept = 16
+    kept_cones: SeenCones = 16
 
     def __post_init__(self) -> None:
         if not 0 < self.range_min < self.range_max:
