@@ -58,8 +58,6 @@ class ActionDelay(Delay):
     @property
     def state(self) -> Mapping[NestedKey, TensorSpec]:
         """Lag and age of each row, and the actions on their way."""
-        if not self.max_lag:
-            return {}
         age = self._of_rows(Bounded, 0, self.max_lag, dtype=torch.int64)
         return {**super().state, self._of_memory("age"): age}
 
@@ -70,12 +68,10 @@ class ActionDelay(Delay):
 
     def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
         """Draw the lags."""
-        return {**self._empty, self._of_memory("lag"): self._drawn(data)} if self.max_lag else {}
+        return {**self._empty, self._of_memory("lag"): self._drawn(data)}
 
     def act(self, data: TensorDictBase, state: State) -> State:
         """Write the action that takes effect now, and keep the one that was chosen."""
-        if not self.max_lag:
-            return state
         past, age = self._of_memory("past"), self._of_memory("age")
         lag = torch.minimum(state[self._of_memory("lag")], state[age])
         return {

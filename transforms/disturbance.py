@@ -89,8 +89,6 @@ class Delay(Disturbance):
     @property
     def state(self) -> Mapping[NestedKey, TensorSpec]:
         """The lag of each row and its past."""
-        if not self.max_lag:
-            return {}
         lag = self._of_rows(Bounded, 0, self.max_lag, dtype=torch.int64)
         specs: dict[NestedKey, TensorSpec] = {self._of_memory("lag"): lag}
         dim = len(self.parent.batch_size)

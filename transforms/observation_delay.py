@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 from tensordict import NestedKey, TensorDictBase
-from torchrl.data import Composite, NonTensor, TensorSpec
+from torchrl.data import NonTensor, TensorSpec
 
 from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.disturbance import Delay, Lag
@@ -77,8 +77,6 @@ class ObservationDelay(Delay):
 
     def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
         """Draw the lags; the past is the first observation."""
-        if not self.max_lag:
-            return {}
         state = {self._of_memory("lag"): self._drawn(data)}
         for key in self.late_keys:
             first = data[key].unsqueeze(data.ndim)
@@ -87,16 +85,9 @@ class ObservationDelay(Delay):
 
     def observe(self, data: TensorDictBase, state: State) -> State:
         """Write the late entries, and keep the new ones."""
-        if not self.max_lag:
-            return state
         lag = self._of_memory("lag")
         after = {lag: state[lag]}
         for key in self.late_keys:
             past = self._past_key(key)
             after[past] = self._delay(data, key, state[past], state[lag])
         return after
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the memory; raises a `ValueError` if it cannot be kept."""
-        self.late_keys  # noqa: B018  checks the keys, also where nothing is late
-        return super().transform_observation_spec(observation_spec)
