@@ -10,19 +10,19 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Mapping
 from functools import cache, cached_property
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
-from coil_rl.ranges import Finite, Interval, NonNegative, checked
+from coil_rl.ranges import Finite, NonNegative, checked
 from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested_key
+from coil_rl.transforms.disturbance import Lag
 from coil_rl.transforms.guide_transform import DrawingLink, SeededGenerator
 from coil_rl.transforms.link import Link, State
 
-LONGEST_DELAY = 10_000  # steps, each of which is kept for every row
 CHOSEN = "action_for_advice"  # entry for the action that the agent chose, within a step
 
 
@@ -35,8 +35,8 @@ class DegradedAdvice(Link):
 
     Args:
         key: entry of the advice, [*batch, n_guides, A].
-        memory_key: entry for advice of the past, [*batch, slots, n_guides, A].
-        slots: length of the memory; 0 for none.
+        memory_key: entry for advice of the past, [*batch, slots, n_guides, A]; None: no memory.
+        slots: length of the memory.
     """
 
     numbers_only: str | None = None  # its name in conf/degrade if it is not for choices
@@ -45,7 +45,7 @@ class DegradedAdvice(Link):
         self, key: NestedKey = "guide_action", memory_key: NestedKey | None = None, slots: int = 0
     ) -> None:
         key, memory_key = nested_key(key), nested_key(memory_key)
-        out_keys = [key, memory_key] if slots else [key]
+        out_keys = [key] if memory_key is None else [key, memory_key]
         super().__init__(in_keys=[key], out_keys=out_keys)
         self.key, self.memory_key, self.slots = key, memory_key, slots
 
@@ -87,7 +87,7 @@ class DegradedAdvice(Link):
     @property
     def state(self) -> Mapping[NestedKey, TensorSpec]:
         """The advice of the past, if it has a memory."""
-        if not self.slots:
+        if self.memory_key is None:
             return {}
         advice = self.parent.full_observation_spec[self.key]
         *batch, guides, size = advice.shape
@@ -312,7 +312,7 @@ class DelayedAdvice(DegradedAdvice):
 
     def __init__(
         self,
-        steps: Annotated[int, Interval(ge=0, le=LONGEST_DELAY)] = 12,
+        steps: Lag = 12,
         key: NestedKey = "guide_action",
         memory_key: NestedKey = "delayed_advice",
     ) -> None:
@@ -320,19 +320,15 @@ class DelayedAdvice(DegradedAdvice):
 
     def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
         """Return that nothing was advised before, as NaN; the first advice takes its place."""
-        if not self.slots:
-            return {}
         missing = torch.full_like(self._entry(data, self.key), torch.nan).unsqueeze(-3)
         return {self.memory_key: missing.repeat_interleave(self.slots, -3)}
 
     def observe(self, data: TensorDictBase, state: State) -> State:
         """Write the oldest advice, and keep the new one."""
-        if not self.slots:
-            return state
         newest, memory = data[self.key].unsqueeze(-3), state[self.memory_key]
-        memory = torch.where(memory.isnan(), newest, memory)
-        data.set(self.key, memory[..., 0, :, :])
-        return {self.memory_key: torch.cat([memory[..., 1:, :, :], newest], -3)}
+        values = torch.cat([torch.where(memory.isnan(), newest, memory), newest], -3)
+        data.set(self.key, values[..., 0, :, :])
+        return {self.memory_key: values[..., 1:, :, :]}
 
 
 class RemovedAdvice(DegradedAdvice, ActionTransform):
