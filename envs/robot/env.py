@@ -110,7 +110,7 @@ class SimulatedRobotEnv(LapsEnv):
         self.step_length = speed / self.rate
         self.max_steering = math.radians(max_steering)
         self.memory = BoundaryMemory(num_envs, spline, smoothing, sight=self.perception.sight)
-        self.generator = torch.Generator()
+        self.generator, self.everyone = torch.Generator(), torch.arange(num_envs)
         self.course = RobotCourse(self.tracks)
         finish = np.stack([track.finish for track in self.tracks], axis=1)
         self.finish = torch.tensor(finish).float()
@@ -148,7 +148,7 @@ class SimulatedRobotEnv(LapsEnv):
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
         roughness = self._act(action)
         self._move(action)
-        view = self._perceive()
+        view = self._perceive(self.everyone)
         lap_time, finished = self._count_laps(self._inside(self.pose, self.track))
         clearance, to_boundaries = self.course.clearance(self.track, self.pose)
         return self._judged(
@@ -170,17 +170,15 @@ class SimulatedRobotEnv(LapsEnv):
             self.pose.unsqueeze(-1), self.step_length * phase, turn.unsqueeze(-1) * phase
         )
         self.pose = move_along_arc(self.pose, torch.full_like(turn, self.step_length), turn)
-        self.scan = self._measure(poses)
+        self.scan = self._measure(poses, self.everyone)
 
-    def _measure(self, poses: Tensor, rows: Tensor | None = None) -> Tensor:
+    def _measure(self, poses: Tensor, rows: Tensor) -> Tensor:
         """Return a scan [B, P] m, measured at a pose for each beam.
 
         Args:
             poses: [3, B, P].
-            rows: indices of the robots whose scan is needed; None for all. Noise is drawn for all.
+            rows: indices of the robots whose scan is needed. Noise is drawn for all.
         """
-        if rows is None:
-            rows = torch.arange(self.batch_size[0])
         track = self.track[rows]
         cones, radius = self.course.cones[:, track], self.course.radius[track]
         distance, _ = cast_beams(poses[:, rows], self.lidar.angles, cones, radius)
@@ -189,23 +187,20 @@ class SimulatedRobotEnv(LapsEnv):
 
     def stand(self) -> None:
         """Measure another scan while all robots stand, which is no step of their episodes."""
-        self.scan = self._measure(self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams))
+        standing = self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams)
+        self.scan = self._measure(standing, self.everyone)
 
-    def _perceive(self, rows: Tensor | None = None) -> dict[str, Tensor]:
+    def _perceive(self, rows: Tensor) -> dict[str, Tensor]:
         """Update the memory with the last scan; return the entries that come from it.
 
         Args:
-            rows: indices of the robots whose scan is a new one; None for all.
+            rows: indices of the robots whose scan is a new one.
         """
-        scans = self.scan if rows is None else self.scan[rows]
-        found, number = self.perception(scans.numpy(), self.lidar.angles.numpy())
-        cones, count = torch.from_numpy(found).float(), torch.from_numpy(number)
-        if rows is not None:
-            cones = self.cones.index_copy(0, rows, cones)
-            count = self.count.index_copy(0, rows, count)
-        self.cones, self.count = cones, count
-        observation, self.valid = self.memory(cones, count)
-        return {"observation": observation, "cones": cones, "cone_count": count}
+        found, number = self.perception(self.scan[rows].numpy(), self.lidar.angles.numpy())
+        self.cones = self.cones.index_copy(0, rows, torch.from_numpy(found).float())
+        self.count = self.count.index_copy(0, rows, torch.from_numpy(number))
+        observation, self.valid = self.memory(self.cones, self.count)
+        return {"observation": observation, "cones": self.cones, "cone_count": self.count}
 
     def _inside(self, pose: Tensor, track: Tensor) -> Tensor:
         """Return whether poses [3, N] on tracks [N] are in the finish circle, [N]."""
