@@ -1,4 +1,4 @@
-"""Base class of transforms that use a guide's advice, and a random generator with a saved state."""
+"""Base classes of transforms that use advice, or draw, and a generator with a saved state."""
 
 from __future__ import annotations
 

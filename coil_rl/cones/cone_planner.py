@@ -5,7 +5,6 @@ hidden. A pure pursuit follows its path: the car steers along the arc through a 
 """
 
 import math
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -46,7 +45,11 @@ class ConePlannerGuide(TensorDictModuleBase):
         super().__init__()
         self.look_ahead, self.car_length = look_ahead, car_length
         self.max_steering = math.radians(max_steering)
-        self.package = _package()
+        try:
+            import fsd_path_planning  # type: ignore[import-not-found, unused-ignore]
+        except ImportError as error:
+            raise ImportError(f"fsd_path_planning is missing: {INSTALL}") from error
+        self.package: Any = fsd_path_planning
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action`: [*batch, 1], fraction of the maximal steering."""
@@ -83,13 +86,3 @@ class ConePlannerGuide(TensorDictModuleBase):
         x, y = points[np.abs(distance - self.look_ahead).argmin()]
         curvature = 2 * y / (x * x + y * y)
         return math.asin(min(max(curvature * self.car_length, -1.0), 1.0))
-
-
-def _package() -> ModuleType:
-    """Return the package of the planner; raises an `ImportError` that says how to install it."""
-    try:
-        import fsd_path_planning  # type: ignore[import-not-found, unused-ignore]
-    except ImportError as error:
-        raise ImportError(f"fsd_path_planning is missing: {INSTALL}") from error
-    package: Any = fsd_path_planning
-    return package

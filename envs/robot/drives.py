@@ -215,7 +215,7 @@ def save_drive(drive: SimulatedDrive, path: Path) -> None:
 
 
 def record_labelling_drives(
-    folder: Path, pairs: int = 5, both: int = 3, tick: Callable[[], Any] | None = None
+    folder: Path, pairs: int = 5, both: int = 3, tick: Callable[[], Any] = lambda: None
 ) -> dict[Sides, list[str]]:
     """Record drives to train a cone classifier, and drives to test it.
 
@@ -234,8 +234,7 @@ def record_labelling_drives(
         for seed in seeds:
             files.append(os.path.join(folder, f"{sides}_{seed}.mcap"))
             save_drive(simulated_drive(sides, seed), files[-1])
-            if tick is not None:
-                tick()
+            tick()
     return paths
 
 
@@ -245,7 +244,7 @@ def record_drives(
     policy: TensorDictModuleBase,
     paths: Sequence[Path],
     about: Mapping[str, str] | None = None,
-    tick: Callable[[], Any] | None = None,
+    tick: Callable[[], Any] = lambda: None,
 ) -> None:
     """Run a policy on B simulated robots for an episode, and record each robot as MCAP.
 
@@ -288,7 +287,7 @@ def _run_episode(
     env: EnvBase,
     base: SimulatedRobotEnv,
     policy: TensorDictModuleBase,
-    tick: Callable[[], Any] | None,
+    tick: Callable[[], Any],
 ) -> TensorDict:
     """Run a policy until the episodes of all robots of `base`, which is inside `env`, are over.
 
@@ -313,8 +312,7 @@ def _run_episode(
             # The robot stands during the first scan, so the second one starts at the same pose.
             start, running = pose, running & ~after["done"].squeeze(-1)
             state = step_mdp(step)
-            if tick is not None:
-                tick()
+            tick()
     return torch.stack(steps, 1)
 
 

@@ -55,7 +55,7 @@ def record(
     make_env_and_policy: Callable[[], tuple[EnvBase, TensorDictModuleBase]],
     paths: Sequence[Path],
     notes: Mapping[str, str],
-    tick: Callable[[], Any] | None = None,
+    tick: Callable[[], Any] = lambda: None,
 ) -> list[Recording]:
     """Return recordings of a deterministic episode of each robot of an env.
 
