@@ -14,11 +14,11 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
-import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import pandas as pd
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -287,25 +287,23 @@ def main(argv: Sequence[str] | None = None) -> None:
     values = {**VALUES[args.algorithm], **TUNED.get((args.algorithm, args.env), {})}
     values["envs"] = args.envs or values["envs"]
     learners = {"ours": ours, "Stable-Baselines3": theirs}
-    runs: dict[str, list[tuple[float, float, float]]] = {name: [] for name in learners}
+    runs = []
     # In turns, so that a machine that becomes slower or faster is so for both.
     turns = list(itertools.product(range(args.seeds), learners.items()))
     for seed, (name, train) in tqdm(turns, disable=None):
         start = time.process_time()
         act, steps = train(args.algorithm, args.env, values, args.frames, seed)
         rate = args.frames / (time.process_time() - start)
-        runs[name].append((mean_return(args.env, act), rate, steps))
-    rows = []
-    for name, numbers in runs.items():
-        returns, rates, steps_a_second = zip(*numbers, strict=True)
-        row = {"": name, "return": statistics.mean(returns), "sd": math.nan}
-        if args.seeds > 1:
-            row["sd"] = statistics.stdev(returns)
-        row["frames per CPU s"] = statistics.median(rates)
-        row["gradient steps per CPU s"] = statistics.median(steps_a_second)
-        rows.append(row)
+        runs.append({"": name, "return": mean_return(args.env, act), "rate": rate, "steps": steps})
+    columns = {
+        "return": ("return", "mean"),
+        "sd": ("return", "std"),
+        "frames per CPU s": ("rate", "median"),
+        "gradient steps per CPU s": ("steps", "median"),
+    }
+    table = pd.DataFrame(runs).groupby("", sort=False).agg(**columns).reset_index()
     print(f"{args.algorithm}, {args.env}, {args.frames} frames, {args.seeds} runs, {values}")
-    print(markdown_table(rows, {name: (name, ".0f") for name in rows[0]}))
+    print(markdown_table(table.to_dict("records"), {name: (name, ".0f") for name in table}))
 
 
 if __name__ == "__main__":

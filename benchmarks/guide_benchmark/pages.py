@@ -177,42 +177,36 @@ def _table(rows: Sequence[Row], columns: Mapping[str, Sequence[str]]) -> str:
 
 def summarised(rows: Sequence[Row]) -> list[Row]:
     """Return a row for each arm and method over all tasks, in the order of the arms."""
-    groups = _grouped(rows, "arm", "method")
-    return [
-        _summary(arm, method, groups[arm, method])
-        for arm, method in sorted(groups, key=lambda key: (ARMS.index(key[0]), key[1]))
-    ]
-
-
-def _grouped(rows: Sequence[Row], *names: str) -> dict[tuple[str, ...], list[Row]]:
-    """Return the rows with a guide by their values of some columns."""
-    groups: dict[tuple[str, ...], list[Row]] = {}
-    for row in rows:
-        if row["arm"] in ARMS:
-            groups.setdefault(tuple(row[name] for name in names), []).append(row)
-    return groups
+    found = _summaries(rows, "arm", "method")
+    return sorted(found, key=lambda row: (ARMS.index(row["arm"]), row["method"]))
 
 
 def by_method(rows: Sequence[Row]) -> list[Row]:
     """Return a row for each method over all tasks and guides, with the fewest losses first."""
-    found = []
-    for (method,), own in _grouped(rows, "method").items():
-        worst = own[int(np.argmin([row["difference"] for row in own]))]
-        where = f"{worst['task']}, {worst['arm']}"
-        found.append(_summary("", method, own) | {"pairs": len(own), "where": where})
+    found = _summaries(rows, "method")
     return sorted(found, key=lambda row: (row["loss"] / row["pairs"], -row["difference"]))
 
 
-def _summary(arm: str, method: str, rows: Sequence[Row]) -> Row:
+def _summaries(rows: Sequence[Row], *names: str) -> list[Row]:
+    """Return a row for all rows with a guide that have the same values of some columns."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        if row["arm"] in ARMS:
+            groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return [dict(zip(names, key, strict=True)) | _summary(own) for key, own in groups.items()]
+
+
+def _summary(rows: Sequence[Row]) -> Row:
     counts = Counter(row["verdict"] for row in rows)
     lowest = [row["lowest"] for row in rows if not math.isnan(row["lowest"])]
+    worst = rows[int(np.argmin([row["difference"] for row in rows]))]
     return {
-        "arm": arm,
-        "method": method,
+        "pairs": len(rows),
+        "where": f"{worst['task']}, {worst['arm']}",
         "tasks": len({row["task"] for row in rows}),
         "score": float(np.mean([row["score"] for row in rows])),
         "difference": float(np.mean([row["difference"] for row in rows])),
         **{name: counts[name] for name in ("gain", "even", "unknown", "loss")},
-        "worst": float(np.min([row["difference"] for row in rows])),
+        "worst": worst["difference"],
         "lowest": min(lowest, default=math.nan),
     }

@@ -53,26 +53,33 @@ def draw_report(
     beside = beside_guides(next(iter(compared.values())).agents)
     curves = [run for run in runs if run.curve and run.label in strokes]
     use = guide_use(curves)
-    drawings: dict[str, tuple[str, str, Draw]] = {  # by the name of the file: title and caption
+    drawings: dict[str, tuple[str, str, Draw | None]] = {  # by the name of the file
         "report": (
             "Evaluation",
             "Mean return in the cases of the evaluation.",
             partial(draw_intervals, panels, measure="return"),
-        )
+        ),
+        "report_cases": (
+            "Case by case",
+            BESIDE,
+            partial(draw_beside_guides, beside, strokes=strokes) if beside else None,
+        ),
+        "report_curves": (
+            "Training",
+            "Deterministic policies kept on the way.",
+            _learning_curves(curves, strokes) if curves else None,
+        ),
+        "report_guides": (
+            "Use of the guide",
+            "A line for each run.",
+            partial(draw_guide_use, use, strokes=strokes) if use else None,
+        ),
     }
-    if beside:
-        draw = partial(draw_beside_guides, beside, strokes=strokes)
-        drawings["report_cases"] = ("Case by case", BESIDE, draw)
-    if curves:
-        caption = "Deterministic policies kept on the way."
-        drawings["report_curves"] = ("Training", caption, _learning_curves(curves, strokes))
-    if use:
-        draw = partial(draw_guide_use, use, strokes=strokes)
-        drawings["report_guides"] = ("Use of the guide", "A line for each run.", draw)
     figures = []
     for name, (title, caption, drawn) in drawings.items():
-        drawn(folder / f"{name}{suffix}")
-        figures.append(Figure(title, svg(drawn), caption))
+        if drawn is not None:
+            drawn(folder / f"{name}{suffix}")
+            figures.append(Figure(title, svg(drawn), caption))
     return [*figures, *films(runs)]
 
 
