@@ -44,19 +44,17 @@ def page_of(
     if all(np.isnan(row.get("failures", np.nan)) for row in outcome.rows):
         del columns["failures"]
     parts = [
-        *(f"{number}. {sentence}" for number, sentence in enumerate(verdict.sentences, 1)),
-        "",
+        "\n".join(f"{number}. {each}" for number, each in enumerate(verdict.sentences, 1)),
         markdown_table(outcome.rows, columns),
+        *COMPARE.said("about_table", measured=measured),
+        *delayed,
     ]
-    about = COMPARE.said("about_table", measured=measured)
-    for each in [*about, *delayed]:
-        parts += ["", each]
     if command:
         lead = "Train it to the end"
         if verdict.use != verdict.train:
             lead = "To see what a whole training of anchored COIL changes"
-        parts += ["", f"{lead}: {command}"]
-    return "\n".join(parts)
+        parts.append(f"{lead}: {command}")
+    return "\n\n".join(parts)
 
 
 def delayed_sentence(entry: Entry, late: Entry, random: Entry) -> list[str]:

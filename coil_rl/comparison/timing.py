@@ -22,6 +22,7 @@ from coil_rl.comparison.arms import (
     curve_cases,
 )
 from coil_rl.comparison.baselines import Policy, uniform
+from coil_rl.comparison.sentences import COMPARE
 from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.run.evaluation import episodes
 from coil_rl.run.parts import TEST
@@ -59,14 +60,7 @@ class Pace:
     @property
     def sentence(self) -> str:
         """What was measured, for people."""
-        frames = " and ".join(
-            f"{1000 * seconds:.2f} ms with {name}" for name, seconds in self.learning.items()
-        )
-        return (
-            f"A step of the env takes {1000 * self.step:.2f} ms, an action of the guide "
-            f"{1000 * self.guide:.2f} ms, a frame of training {frames}; an episode has about "
-            f"{self.length:.0f} steps."
-        )
+        return COMPARE.said("pace", pace=self)[0]
 
 
 @dataclass(frozen=True)
@@ -101,18 +95,8 @@ class Plan:
         Args:
             minutes: that it may take.
         """
-        more = ""
-        if self.seconds > 1.3 * 60 * minutes:
-            more = f" (minutes={minutes:g} is not enough: each training needs a few batches)"
-        frames = ", ".join(f"{name} {frames:,}" for name, frames in self.frames.items())
-        duration = f"{max(self.seconds, 1):.0f} s"
-        if self.seconds >= 90:
-            duration = f"{self.seconds / 60:.1f} min"
-        return (
-            f"It runs {self.jobs} trainings (frames: {frames}; {self.seeds} seeds), beside the "
-            "guide, its opposite, zero, random actions and the first network, and takes about "
-            f"{duration}{more}."
-        )
+        is_enough = self.seconds <= 1.3 * 60 * minutes
+        return COMPARE.said("plan", plan=self, minutes=minutes, is_enough=is_enough)[0]
 
 
 def measure(plain: Mapping[str, DictConfig], overhead: float) -> Pace:

@@ -20,6 +20,7 @@ from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.output import progress, say
 from coil_rl.report.runs import EVALUATION
+from coil_rl.report.sentences import Sentences
 from coil_rl.report.table import return_format
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
@@ -35,6 +36,7 @@ from coil_rl.tune.candidates import Candidates
 from coil_rl.tune.numbers import GuideWithNumbers
 from coil_rl.tune.search import BEST, MEAN, OWN, Number, Search, Tuner, Values, chosen
 
+SENTENCES = Sentences("coil_rl.tune", "tune.j2")
 NAMES = {OWN: "guide", MEAN: "tuned", BEST: "best_candidate"}  # in delivery.json
 
 
@@ -77,11 +79,14 @@ class TunedRun(Run):
 
     def reasons(self) -> list[str]:
         """Return the sentences on the test, the numbers of the guide, and a budget too small."""
-        found = super().reasons()
-        values = read_tuned(self.folder, self.numbers)
-        if values is not None:
-            found.append(numbers_sentence(values, {each.name: each.own for each in self.numbers}))
-        return [*found, *beyond_budget(self.folder, self.budget.frames)]
+        values, report = read_tuned(self.folder, self.numbers), record.DELIVERY.read(self.folder)
+        own = {each.name: each.own for each in self.numbers}
+        steps = 0 if report is None else report.steps
+        return [
+            *super().reasons(),
+            *SENTENCES.said("numbers", values=values, own=own, file=record.TUNED.name),
+            *SENTENCES.said("beyond_budget", steps=steps, frames=self.budget.frames),
+        ]
 
     def _say_next(self) -> None:
         """Print what usually follows: a training with the guide itself, faster than this run."""
@@ -254,31 +259,6 @@ class TunedTraining:
             found = measures(env, FollowAdvice(env), cases=cases, watch=self.tuned.watch)
         means = means_of(found, EVALUATION, len(kept))
         self.metrics.fill(dict(zip(kept, means, strict=True)))
-
-
-def beyond_budget(folder: Path, frames: int) -> list[str]:
-    """Return the sentence for a search that took more frames than its budget; none for another.
-
-    Raises:
-        UserError: if the file is damaged.
-    """
-    report = record.DELIVERY.read(folder)
-    if report is None or report.steps <= frames:
-        return []
-    return [
-        f"The search took {report.steps:,} frames, more than budget.frames={frames:,}: that is "
-        "too little for a generation and a test of its result."
-    ]
-
-
-def numbers_sentence(values: Values, own: Values) -> str:
-    """Return the sentence that says which numbers a guide got.
-
-    Args:
-        values: by name.
-    """
-    listed = (f"{name} {value:.4g} (its own {own[name]:.4g})" for name, value in values.items())
-    return f"The guide's numbers: {', '.join(listed)}; all digits are in {record.TUNED.name}."
 
 
 def read_tuned(folder: Path, numbers: Sequence[Number]) -> Values | None:

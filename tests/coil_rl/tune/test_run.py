@@ -1,6 +1,5 @@
 """Sentences of a run that tunes its guide."""
 
-import json
 import shlex
 from types import SimpleNamespace
 
@@ -8,17 +7,26 @@ import pytest
 from programs import composed
 
 from coil_rl import UserError, extras
-from coil_rl.record import DELIVERY
 from coil_rl.tune import Tuning
-from coil_rl.tune.run import TunedRun, beyond_budget
+from coil_rl.tune.run import SENTENCES, TunedRun
 
 
-def test_search_beyond_its_budget_is_said_from_a_file_that_may_be_missing(tmp_path):
-    assert beyond_budget(tmp_path, 300) == []
-    report = {"policy": "own", "cases": 4, "returns": {}, "frames": None, "steps": 1800}
-    (tmp_path / DELIVERY.name).write_text(json.dumps(report))
-    assert "took 1,800 frames, more than budget.frames=300" in str(beyond_budget(tmp_path, 300))
-    assert beyond_budget(tmp_path, 1800) == []
+def test_numbers_of_the_guide_are_said_beside_its_own():
+    values, own = {"kp": 2.51189, "ki": 0.0001}, {"kp": 1.0, "ki": 0.5}
+    assert SENTENCES.said("numbers", values=values, own=own, file="tuned.json") == [
+        "The guide's numbers: kp 2.512 (its own 1), ki 0.0001 (its own 0.5); all digits are in "
+        "tuned.json."
+    ]
+    assert SENTENCES.said("numbers", values=None, own=own, file="tuned.json") == []
+
+
+def test_search_beyond_its_budget_is_said():
+    (said,) = SENTENCES.said("beyond_budget", steps=1800, frames=300)
+    assert said == (
+        "The search took 1,800 frames, more than budget.frames=300: that is too little for a "
+        "generation and a test of its result."
+    )
+    assert SENTENCES.said("beyond_budget", steps=1800, frames=1800) == []
 
 
 def test_missing_extra_is_named(monkeypatch):
