@@ -275,10 +275,19 @@ def rows_of_runs(name: str, arms: Mapping[Key, Arm]) -> list[dict[str, object]]:
     for (method, kind), arm in arms.items():
         for seed, run in sorted(arm.runs.items()):
             frames = run.curve[-1]["frames"] if run.curve else math.nan
-            row = {"task": name, "method": method, "arm": kind, "seed": seed, "frames": frames}
-            row |= {"seconds": run.seconds, "guide": arm.guide, "end": arm.reward(seed)}
-            more = {"handed_over": run.handed_over, "fingerprint": fingerprint(run.settings)}
-            rows.append(row | more)
+            row = {
+                "task": name,
+                "method": method,
+                "arm": kind,
+                "seed": seed,
+                "frames": frames,
+                "seconds": run.seconds,
+                "guide": arm.guide,
+                "end": arm.reward(seed),
+                "handed_over": run.handed_over,
+                "fingerprint": fingerprint(run.settings),
+            }
+            rows.append(row)
     return rows
 
 

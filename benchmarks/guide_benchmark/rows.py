@@ -122,18 +122,22 @@ def _row(
     runs = list(arm.runs.values())
     row: dict[str, Any] = dict.fromkeys(COLUMNS, math.nan)
     row |= {name: compared[name] for name in COLUMNS if name in compared}
-    row |= dict(zip(("task", "method", "arm"), (task, *key), strict=True))
-    row["seeds"] = len(runs)
-    row["ppo"] = float(np.mean([alone.reward(seed) for seed in alone.runs]))
-    row["end"] = float(np.mean([arm.reward(seed) for seed in arm.runs]))
-    row["random"] = guide_of(arms, RANDOM)
-    row["reference"] = reference.value(guide_of(arms, INTACT))
-    row |= _learning(runs)
+    row |= {
+        "task": task,
+        "method": key[0],
+        "arm": key[1],
+        "seeds": len(runs),
+        "ppo": float(np.mean([alone.reward(seed) for seed in alone.runs])),
+        "end": float(np.mean([arm.reward(seed) for seed in arm.runs])),
+        "random": guide_of(arms, RANDOM),
+        "reference": reference.value(guide_of(arms, INTACT)),
+        "fingerprint": fingerprint(runs[0].settings),
+        **_learning(runs),
+        **_versions(runs),
+    }
     scale = scale_of(arms, arms[PPO, ALONE])
     row |= {name: 100 * row[name] / scale for name in ("first", "lowest")}
-    row |= derived(row, reference)
-    row["fingerprint"] = fingerprint(runs[0].settings)
-    return row | _versions(runs)
+    return row | derived(row, reference)
 
 
 def _versions(runs: Sequence[Run]) -> dict[str, str]:

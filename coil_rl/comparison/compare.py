@@ -49,7 +49,7 @@ from coil_rl.files import FAILED_JOBS, write_text
 from coil_rl.output import decoration, quietly, say
 from coil_rl.record import json_file
 from coil_rl.report import write_csv
-from coil_rl.run.folder import locked
+from coil_rl.run.folder import is_evaluated, locked
 from coil_rl.run.parts import TEST
 from coil_rl.run.run import as_before
 
@@ -260,11 +260,9 @@ class Comparison:
     def _judge(self, plan: Plan, base: DictConfig, failed: Mapping[str, str]) -> Worth:
         """Write and print what was found."""
         with quietly():
+            for plain in filter(is_evaluated, sorted(self.folder.glob(job_name(PPO, "*")))):
+                measure_network(self.folder, plain)
             outcome = read_outcome(self.folder, plan.arms, failed)
-            plain = first_of(outcome, PPO)
-            if plain is not None:
-                measure_network(self.folder, plain.folder)
-                outcome = read_outcome(self.folder, plan.arms, failed)
             found = verdict(
                 outcome.entries, [name for name in plan.arms if name not in outcome.runs]
             )

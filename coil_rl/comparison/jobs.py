@@ -13,8 +13,8 @@ from coil_rl.run.folder import is_evaluated
 BAR = "compare, {desc}{percentage:3.0f}%|{bar}| {elapsed}<{remaining}"  # in trainings
 
 
-def job_name(arm: str, seed: int) -> str:
-    """Return the name of a training, and of its folder."""
+def job_name(arm: str, seed: int | str) -> str:
+    """Return the name of a training, and of its folder; of all seeds for the seed `*`."""
     return f"{arm}_seed{seed}"
 
 

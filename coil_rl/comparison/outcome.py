@@ -25,7 +25,7 @@ class Outcome:
     Args:
         entries: by name, what acts without learning first.
         rows: of the table.
-        runs: finished, by arm.
+        runs: finished, by arm, in the order of their seeds.
     """
 
     entries: Mapping[str, Entry]
@@ -48,7 +48,8 @@ def read_outcome(folder: Path, arms: Sequence[str], failed: Mapping[str, str]) -
         asked = int(table["steps"].sum()) if name in (GUIDE, OPPOSITE) else 0
         rows.append(_row(entries[str(name)], [table], calls=asked))
     found = read_runs([folder]) if any(folder.rglob("config.yaml")) else []
-    of_labels = by_label(run for run in found if run.finished)
+    finished = [run for run in found if run.finished]
+    of_labels = by_label(sorted(finished, key=lambda run: run.seed))
     runs = {name: of_labels[name] for name in arms if name in of_labels}
     for name in arms:
         reasons = [reason for job, reason in failed.items() if job.startswith(f"{name}_seed")]
