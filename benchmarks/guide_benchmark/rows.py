@@ -214,23 +214,34 @@ def check_row(row: Mapping[str, str]) -> dict[str, Any]:
         reached = int(cell) if cell else None  # None if it was not counted
     except ValueError as error:
         raise ValueError(f"{place}: a number is expected ({error})") from error
-    unknown = [name for name in KNOWN if not math.isfinite(numbers[name])]
-    if unknown:
-        raise ValueError(f"{place}: {', '.join(unknown)} must be known; random needs its arm")
-    if seeds < 1 or numbers["frames"] <= 0 or any(map(math.isinf, numbers.values())):
-        raise ValueError(f"{place}: seeds and frames must be above 0, and no number infinite")
-    if reached is not None and not 0 <= reached <= seeds:
-        raise ValueError(f"{place}: reached={reached}, but the row has {seeds} seeds")
-    if reached is not None and (reached == 0) != math.isnan(numbers["frames_to_guide"]):
-        raise ValueError(
-            f"{place}: reached={reached}, but frames_to_guide={row['frames_to_guide']}"
-        )
     numbered = {**row, **numbers, "seeds": seeds, REACHED: reached}
+    unknown = ", ".join(name for name in KNOWN if not math.isfinite(numbers[name]))
+    missing = ", ".join(name for name in VERSIONS if not row[name])
+    without = math.isnan(numbers["frames_to_guide"])
+    rules = [
+        (unknown == "", f"{unknown} must be known; random needs its arm"),
+        (
+            seeds > 0 and numbers["frames"] > 0 and not any(map(math.isinf, numbers.values())),
+            "seeds and frames must be above 0, and no number infinite",
+        ),
+        (
+            reached is None or 0 <= reached <= seeds,
+            f"reached={reached}, but the row has {seeds} seeds",
+        ),
+        (
+            reached is None or (reached == 0) == without,
+            f"reached={reached}, but frames_to_guide={row['frames_to_guide']}",
+        ),
+        (
+            re.fullmatch("[0-9a-f]{10}", row["fingerprint"]),
+            f"fingerprint={row['fingerprint']} is not ten hexadecimal digits",
+        ),
+        (missing == "", f"the versions of {missing} are missing"),
+    ]
+    for holds, problem in rules:
+        if not holds:
+            raise ValueError(f"{place}: {problem}")
     _check_derived(place, numbered, known[row["task"]])
-    if not re.fullmatch("[0-9a-f]{10}", row["fingerprint"]):
-        raise ValueError(f"{place}: fingerprint={row['fingerprint']} is not ten hexadecimal digits")
-    if missing := [name for name in VERSIONS if not row[name]]:
-        raise ValueError(f"{place}: the versions of {', '.join(missing)} are missing")
     return {name: numbered[name] for name in COLUMNS}
 
 

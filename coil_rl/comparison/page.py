@@ -12,7 +12,6 @@ from coil_rl.comparison.entry import Entry, difference
 from coil_rl.comparison.outcome import Outcome
 from coil_rl.comparison.sentences import COMPARE
 from coil_rl.comparison.verdict import Verdict
-from coil_rl.config.compose import key_of
 from coil_rl.config.python import Named
 from coil_rl.report import draw_learning_curves, markdown_table
 from coil_rl.report.table import AUTO_FORMAT, return_format
@@ -82,7 +81,7 @@ def command_of(given: Named, verdict: Verdict) -> str:
     if not verdict.train:
         return ""
     arm = ARMS[verdict.train]
-    words = [word for word in given.words if arm.name == TUNE or key_of(word) != "tune"]
+    words = list(given.words)
     tune = given.nodes.get("tune")
     if not [key for key in given.nodes if key != "tune"]:
         if arm.name == TUNE and tune is not None:

@@ -12,9 +12,7 @@ if TYPE_CHECKING:
     from coil_rl.report.comparison import compare as compare
     from coil_rl.report.comparison import paired as paired
     from coil_rl.report.configurations import differing as differing
-    from coil_rl.report.curves import draw_curve_grid as draw_curve_grid
     from coil_rl.report.curves import draw_learning_curves as draw_learning_curves
-    from coil_rl.report.curves import draw_phases as draw_phases
     from coil_rl.report.curves import frames_until as frames_until
     from coil_rl.report.curves import guide_return as guide_return
     from coil_rl.report.curves import learning as learning

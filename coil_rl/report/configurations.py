@@ -138,13 +138,10 @@ def _named(
 
 def _free_name(name: str, taken: Collection[str], several: int) -> str:
     """Return a short name that is not taken, with a number if there are several of it."""
-    if len(name) <= LONGEST_NAME and several == 1 and name not in taken:
-        return name
     short = name if len(name) <= LONGEST_NAME - 4 else f"{name[: LONGEST_NAME - 5]}…"
-    if several == 1 and short not in taken:
-        return short
-    numbers = (f"{short} {number}" for number in itertools.count(1))
-    return next(each for each in numbers if each not in taken)
+    alone = [each for each in (name, short) if several == 1 and len(each) <= LONGEST_NAME]
+    numbered = (f"{short} {number}" for number in itertools.count(1))
+    return next(each for each in itertools.chain(alone, numbered) if each not in taken)
 
 
 def _what_differs(

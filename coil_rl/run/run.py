@@ -23,7 +23,7 @@ from coil_rl.foreign.batch import SeededRows
 from coil_rl.foreign.controllers import PerRow
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.output import decoration, say
-from coil_rl.report import draw_learning_curves, draw_phases
+from coil_rl.report.curves import draw_learning_curves, draw_phases
 from coil_rl.report.runs import EVALUATION, begun_with
 from coil_rl.run import checkpoint
 from coil_rl.run.beside import Beside, Driver

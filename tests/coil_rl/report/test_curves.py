@@ -5,8 +5,13 @@ import numpy as np
 import pytest
 from scipy.stats import t
 
-from coil_rl.report import draw_curve_grid, draw_learning_curves, draw_phases
-from coil_rl.report.curves import frames_until, mean_curve
+from coil_rl.report.curves import (
+    draw_curve_grid,
+    draw_learning_curves,
+    draw_phases,
+    frames_until,
+    mean_curve,
+)
 from coil_rl.report.runs import RETURN
 
 NAN = math.nan

@@ -1,7 +1,8 @@
 import pytest
 from run_folders import driven, make_run
 
-from coil_rl.report import draw_curve_grid, draw_learning_curves, style
+from coil_rl.report import style
+from coil_rl.report.curves import draw_curve_grid, draw_learning_curves
 from coil_rl.report.figures import _learning_curves
 from coil_rl.report.runs import read_runs
 
