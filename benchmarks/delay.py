@@ -84,7 +84,7 @@ def late_run(folder: Path, lags: tuple[int, int], missing: float, count: int) ->
         config.evaluation.pictures = {}
         config.disturb = {"observation_delay": delay}
         config.evaluation.disturb = {}
-    return assemble(config, folder)
+    return assemble(config)
 
 
 def driven(

@@ -58,7 +58,8 @@ class Training:
     ) -> None:
         config = train_config(args, method, *(["learner.compile=true"] if compile else []))
         self.folder = tempfile.TemporaryDirectory()
-        run = assemble(config, Path(self.folder.name))
+        config.run_dir = self.folder.name
+        run = assemble(config)
         run.budget = replace(run.budget, rows=cars, steps=steps)
         self.experiment = run.training(0)
         learner = self.experiment.learner

@@ -114,7 +114,7 @@ def measure_network(folder: Path, run: Path) -> None:
     first = min((run / POLICIES).glob("*.pt"), default=None)
     if file.exists() or first is None:
         return
-    opened = assemble(read_config(run, "run"), run)
+    opened = assemble(read_config(run, "run"))
     env = opened.make_env(len(opened.trial.evaluation.cases), TEST)
     policy = opened.make_learner(env).policy  # type: ignore[misc]
     checkpoint.put_weights(policy, checkpoint.load(first), first)
@@ -138,7 +138,7 @@ def measure_delayed(name: str, run: Path | None, config: DictConfig) -> pd.DataF
     if run is None:
         env, policy = env_maker(late).guided(cases, TEST)
     else:
-        opened = assemble(late, run)
+        opened = assemble(late)
         env = opened.make_env(cases, TEST)
         policy = opened.policy(env)
     return pd.DataFrame(_rows(name, evaluation.run(env, policy)))

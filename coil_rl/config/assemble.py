@@ -52,15 +52,14 @@ LONGEST_CHAIN = 4  # learned guides of learned guides
 _DEPTH: ContextVar[int] = ContextVar("depth", default=0)
 
 
-def assemble(config: DictConfig, folder: Path | None = None) -> Run:
+def assemble(config: DictConfig) -> Run:
     """Return the run that a configuration describes; its envs and learner are built when used.
 
     Args:
         config: of `coil-train`, composed or read from a folder.
-        folder: of the run, instead of `run_dir`.
     """
-    folder = Path(config.run_dir) if folder is None else folder
-    make_env = env_maker(config, folder)
+    folder = Path(config.run_dir)
+    make_env = env_maker(config)
     trains = trains_guides(config)
 
     def make_learner(env: EnvBase) -> Learner:
@@ -162,7 +161,7 @@ def load_guides(folder: Path, config: DictConfig) -> Mapping[str, TensorDictModu
             raise UserError(
                 f"{proxy} trains guides itself, but a proxy imitates one; train the run again"
             )
-        run = assemble(proxy_config, proxy)
+        run = assemble(proxy_config)
         env = run.make_env()
         guides[name] = in_unit_of(env, run.policy(env, which="last"))
     return guides
@@ -225,7 +224,7 @@ class LearnedGuide(HostedGuide):
                 "guide instead"
             )
         with _guarded(self.folder):
-            opened = assemble(config, self.folder)
+            opened = assemble(config)
             # The transforms need the specs of an env; some need at least two rows.
             env = opened.make_env.around(opened.make_env.bare(2, TRAIN, None)).eval()
             policy = opened.policy(env, which)

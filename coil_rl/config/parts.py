@@ -121,12 +121,11 @@ def _added(config: DictConfig) -> set[Any]:
     return {get_object(node["_target_"]) for node in config.method.transforms.values()}
 
 
-def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
-    """Return the maker of the envs of a configuration.
+def env_maker(config: DictConfig) -> EnvMaker:
+    """Return the maker of the envs of a configuration, whose run may have found numbers of a guide.
 
     Args:
         config: of `coil-train`, composed or read from a folder.
-        folder: of the run, which may have found other numbers for its guide.
     """
     seconds: dict[str, float | None] = {}  # of a step of its envs
 
@@ -139,8 +138,8 @@ def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
         return env
 
     def transforms(advice: str) -> list[Transform]:
-        own = None if folder is None else own_run(config)
-        found = config if own is None or folder is None else own.found(config, folder)
+        own = own_run(config)
+        found = config if own is None else own.found(config, Path(config.run_dir))
         return build_transforms(found, advice)
 
     def of_agent(rows: int | None, cases: str, count: int | None) -> EnvBase:

@@ -285,7 +285,7 @@ def open_run(
         trust_packages(trust)
     config = read_config(folder, "folder", {"device": device}, goes_on=bool(trust))
     give(config, {"guide": guide, "env": env})
-    run = assemble(config, folder)
+    run = assemble(config)
     run.in_python = True
     return run
 

@@ -37,14 +37,13 @@ def evaluate(config: DictConfig) -> float:
     results = Path(config.run_dir)
     alone = config
     if config.run is not None:
-        folder = run_folder(config.run)
-        alone = configured(folder, config)
+        alone = configured(run_folder(config.run), config)
     if config.exported is not None:
         alone = with_exported(alone, config.exported)
     if config.run is None or config.exported is not None:
         judge(trial(alone, env_maker(alone)), None, results, config.seed)
     else:
-        run = assemble(alone, folder)
+        run = assemble(alone)
         run.judge(run.trial, results, config.seed)
     return report_outcome(results)
 

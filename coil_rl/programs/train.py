@@ -76,7 +76,7 @@ def resume(folder: Path, frames: int | None = None, workers: Any = None, changed
         if "workers" not in config.env:
             raise UserError(f"env.workers={workers} has no effect on the env of {folder}")
         config.env.workers = workers
-    run = assemble(config, folder)
+    run = assemble(config)
     try:
         if frames is not None or not is_evaluated(folder):
             check(config)

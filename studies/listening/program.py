@@ -42,7 +42,7 @@ def listen(config: DictConfig) -> None:
     folder = Path(config.run_dir)
     source = run_folder(config.run)
     of_run = configured(source, config)
-    run = assemble(of_run, source)
+    run = assemble(of_run)
     agent = _agent(run)
     node = of_run.evaluation.sections
     sections: WholeEpisode = build(node, "evaluation.sections") if node else WholeEpisode()

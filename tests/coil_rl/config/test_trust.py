@@ -341,9 +341,9 @@ def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatc
     OmegaConf.save(config, folder / "config.yaml")
     resumed, assemble = [], assembling.assemble
 
-    def remembered(config, folder):
+    def remembered(config):
         resumed.append(config)
-        run = assemble(config, folder)
+        run = assemble(config)
         run.finish_begun = lambda changed: 0.0
         return run
 

@@ -121,7 +121,7 @@ def test_lap_driven_by_the_file_alone_has_the_reward_of_torch(name, tmp_path):
     folder = folder_of(f"cone_track/{name}")
     config = read_config(folder, "run")
     config.env.laps = 1
-    run = assemble(config, folder)
+    run = assemble(config)
     export_policy(run, tmp_path, observations=300)
     policy, controller = copied(tmp_path).Policy(), run.controller()
     read = [entry["name"] for entry in policy.contract["inputs"]]
