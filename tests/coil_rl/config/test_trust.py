@@ -25,7 +25,7 @@ from coil_rl.config.trust import shipped_logger
 from coil_rl.errors import UserError
 from coil_rl.programs import train
 from coil_rl.run import folder as run_folder
-from coil_rl.run.folder import begin
+from coil_rl.run.folder import write_config
 
 CODE = """
     os.system os.popen os.execv posix.system subprocess.run subprocess.Popen subprocess.check_output
@@ -70,7 +70,7 @@ def saved(tmp_path_factory):
 def begun(folder, *overrides):
     config = composed(*overrides, f"run_dir={folder}")
     folder.mkdir()
-    begin(folder, settings(config))
+    write_config(folder, settings(config))
     return OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
 
 
@@ -237,7 +237,7 @@ def test_every_choice_of_the_configuration_can_be_saved_and_read(tmp_path, monke
 def test_configuration_of_a_proxy_can_be_read(saved, tmp_path):
     proxy = proxy_config(OmegaConf.merge(OmegaConf.structured(TrainConfig), saved), "spline")
     proxy.run_dir = "anywhere"
-    begin(tmp_path, settings(proxy))
+    write_config(tmp_path, settings(proxy))
     assert read_config(tmp_path, "run").label == "proxy of spline"
 
 
