@@ -13,7 +13,6 @@ All other arguments are those of coil-train, but for what is compared: method an
 docs/compare.md.
 """
 
-import logging
 import shlex
 from collections.abc import Sequence
 from functools import partial
@@ -50,7 +49,6 @@ def compare(arguments: Sequence[str]) -> None:
     from coil_rl.comparison.compare import Comparison
     from coil_rl.config.python import Named, new_folder
 
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
     nodes: dict[str, Any] = {}
     if "tune" in own:
         nodes["tune"] = _value("tune", own["tune"])

@@ -279,8 +279,8 @@ def program(name: str) -> Iterator[None]:
     STOP.received = False
     listen()
     _draw_into_files()
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
-    warnings.formatwarning = lambda message, *_, **__: f"{name}: {message}\n"
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # read when torchrl is imported, later
+    warnings.formatwarning = _saying_once(name)
     threading.excepthook = _end_of_thread
     out = SafeStream(sys.stdout)
     sys.stdout, sys.stderr = out, SafeStream(sys.stderr)
@@ -322,6 +322,25 @@ def plain_program(name: str, usage: str, task: Callable[[list[str]], None]) -> N
         return
     with program(name):
         task(arguments)
+
+
+def _saying_once(name: str) -> Callable[..., str]:
+    """Return what makes a line of a warning, nothing of one that was said before.
+
+    Python does so too, but begins anew where code of somebody else sets filters at each step.
+
+    Args:
+        name: of the program.
+    """
+    said = set[str]()
+
+    def line(message: Warning | str, *_: object, **__: object) -> str:
+        text = f"{name}: {message}\n"
+        is_new = text not in said
+        said.add(text)
+        return text if is_new else ""
+
+    return line
 
 
 def _check_written(name: str, out: SafeStream) -> None:

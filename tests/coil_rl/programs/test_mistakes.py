@@ -342,8 +342,11 @@ def test_folder_in_place_of_a_file_is_named(tmp_path):
     assert said.startswith("report: runs/one/config.yaml cannot be used (Is a directory); ")
 
 
-def test_warning_is_one_line_of_the_program(monkeypatch):
+def test_warning_is_one_line_of_the_program_however_often_it_is_given(monkeypatch):
     monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
     with app.program("replay"):
-        said = warnings.formatwarning("a topic is ignored", UserWarning, "reading.py", 189)
-    assert said == "replay: a topic is ignored\n"
+        said = [
+            warnings.formatwarning(f"topic {topic} is ignored", UserWarning, "reading.py", 189)
+            for topic in ("a", "a", "b", "a")
+        ]
+    assert said == ["replay: topic a is ignored\n", "", "replay: topic b is ignored\n", ""]

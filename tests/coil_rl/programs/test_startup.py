@@ -108,3 +108,14 @@ def test_programs_draw_whatever_backend_the_environment_names(backend):
         "    print(pyplot.get_backend().lower())\n"
     )
     assert printed(script, MPLBACKEND=backend) == "agg"
+
+
+def test_log_of_torchrl_is_not_shown():
+    script = "from coil_rl.programs.app import program\nwith program('train'):\n"
+    script += " from torchrl._utils import logger\n logger.info('Initialized a storage')\n"
+    script += " logger.warning('it is full')"
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    said = done.stdout + done.stderr
+    assert "Initialized a storage" not in said
+    assert "it is full" in said
