@@ -4,7 +4,7 @@ They are what a guide may be, see `ControllerGuide`. Only these may also have th
 """
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -16,21 +16,28 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
+from coil_rl.foreign.codec import Codec
 from coil_rl.foreign.controllers import ControllerGuide, load
 from coil_rl.foreign.host import asks_for_env, called, role_of
 from coil_rl.foreign.remembered import maker_of_rows
+from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.transforms.guide_actions import Guides
 
 
 class OneRow:
-    """A guide as an object with `act`: its env has one row.
+    """A guide as an object with `act`: its env has one row, and the entries of a training.
 
     Args:
         guide: anything that a guide may be.
+        env: beside which it acts.
     """
 
-    def __init__(self, guide: Any) -> None:
+    def __init__(self, guide: Any, env: gymnasium.Env[Any, Any]) -> None:
+        self.codec = Codec(type(env.unwrapped).__name__, env, torch.float32)
         self.guides = Guides({"it": ControllerGuide(guide)})
+        actions = self.codec.actions
+        space = ActionSpace(actions.spec, 0, actions.first, actions.own_shape)
+        self.guides.tell(space, self.codec.choices)
         self.reset()
 
     def reset(self) -> None:
@@ -41,19 +48,21 @@ class OneRow:
         self.starts = True
 
     def act(self, observation: Any) -> NDArray[Any]:
-        """Return the action for an observation, or for one of several entries by name."""
-        named = observation if isinstance(observation, Mapping) else {"observation": observation}
-        data = TensorDict({key: _entry(value) for key, value in named.items()}, [1])
+        """Return the action for an observation, in the shape in which the guide gives it."""
+        data = TensorDict({}, [1])
+        for key, value in self.codec.read(observation).items():
+            data.set(key, torch.from_numpy(value)[None])
         data["row"], data["is_init"] = torch.zeros(1, 1).long(), torch.tensor([[self.starts]])
         self.starts = False
+        given: list[torch.Tensor] = []
+
+        def taken(_: str, action: torch.Tensor, batch: torch.Size) -> torch.Tensor:
+            given.append(action[0])
+            return action.reshape(*batch, -1)
+
         with torch.no_grad():
-            return np.asarray(self.guides.advice(data, None, self.memory)[0, 0])
-
-
-def _entry(value: Any) -> torch.Tensor:
-    """Return an entry of one row, as the env of a training has it."""
-    entry = torch.as_tensor(np.asarray(value))[None]
-    return entry.float() if entry.is_floating_point() else entry
+            self.guides.advice(data, taken, self.memory)
+        return np.asarray(given[0])
 
 
 def maker_beside(thing: Any, name: str, env: gymnasium.Env[Any, Any]) -> Callable[[], Any]:
@@ -82,4 +91,4 @@ def maker_beside(thing: Any, name: str, env: gymnasium.Env[Any, Any]) -> Callabl
         return partial(SimpleNamespace, act=thing)
     if role == "act":
         return thing if is_class else maker_of_rows(thing)
-    return partial(OneRow, thing() if is_class else thing)
+    return partial(OneRow, thing() if is_class else thing, env)

@@ -449,6 +449,11 @@ class Codec:
         self.fineness = Fineness(f"the env {name}", "the reward", self.floats)
         self.largest = float(np.finfo(self.floats).max)  # number of a reward
 
+    @property
+    def choices(self) -> dict[NestedKey, Choices]:
+        """What converts an entry to its choices as the env gives them, by key."""
+        return {entry.key: Choices(entry.space) for entry in self.entries if entry.choices}
+
     def read(self, observation: Any) -> dict[NestedKey, NDArray[Any]]:
         """Return copies of the entries of an observation, by their keys.
 

@@ -18,10 +18,7 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from coil_rl.foreign.batch import SeededRows
-from coil_rl.foreign.codec import (
-    Choices,
-    Codec,
-)
+from coil_rl.foreign.codec import Codec
 from coil_rl.foreign.faults import ForeignError, shortened
 from coil_rl.foreign.guard import Guard
 from coil_rl.foreign.makers import (
@@ -167,15 +164,13 @@ class GymnasiumEnv(SeededRows):
         action, number = self.codec.actions.spec, Unbounded(1, dtype=dtype)
         observation = Composite()
         self.observation_bounds: dict[Any, tuple[torch.Tensor, torch.Tensor]] = {}
-        self.observed_choices: dict[Any, Choices] = {}
+        self.observed_choices = self.codec.choices
         for entry in self.codec.entries:
             if entry.name in RESERVED:
                 raise ValueError(
                     f"the observation of {id} has an entry {entry.name!r}: rename it with a wrapper"
                 )
             observation[entry.key] = entry.spec
-            if entry.choices:
-                self.observed_choices[entry.key] = Choices(entry.space)
             if entry.bounds is not None and entry.spec.dtype.is_floating_point:
                 low, high = (torch.from_numpy(bound).to(self.device) for bound in entry.bounds)
                 self.observation_bounds[entry.key] = low, high

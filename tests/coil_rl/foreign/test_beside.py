@@ -1,9 +1,12 @@
 """One convention for a controller: it means the same wherever one is taken."""
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
@@ -162,3 +165,49 @@ def test_what_cannot_act_is_refused_everywhere():
     for take in (in_a_transform, in_the_env, in_the_observation):
         with pytest.raises(ValueError, match="act"):
             take(object())
+
+
+class Still(gymnasium.Env):
+    """Shows always the same.
+
+    Args:
+        space: of the observation, which is its first sample.
+        actions: shape of the action.
+    """
+
+    def __init__(self, space, actions):
+        self.observation_space, self.action_space = space, spaces.Box(-1, 1, actions)
+
+    def reset(self, *, seed=None, options=None):
+        self.observation_space.seed(1)
+        return self.observation_space.sample(), {}
+
+
+def linear(inputs):
+    network = nn.Linear(inputs, 1)
+    nn.init.constant_(network.weight, 0.1)
+    return network
+
+
+def square(observation):
+    return [[observation[0], 0.25], [-0.5, 0.5 * observation[1]]]
+
+
+@pytest.mark.parametrize(
+    ("space", "actions", "controller"),
+    [
+        (spaces.Discrete(3, start=4), (1,), linear(3)),
+        (spaces.MultiDiscrete([2, 3]), (1,), linear(5)),
+        (spaces.Box(-3, 3, (2,), np.int64), (1,), linear(2)),
+        (spaces.Box(-1, 1, (2,)), (2, 2), square),
+    ],
+)
+def test_controller_reads_and_gives_the_same_numbers_everywhere(space, actions, controller):
+    make = partial(GymnasiumEnv, lambda: Still(space, actions), max_steps=STEPS)
+    transformed = TransformedEnv(make(), GuideActions({"it": controller}))
+    expected = transformed.reset()["guide_action"].flatten()
+    beside = make(controllers={"it": controller}).reset()["controller", "it"].flatten()
+    torch.testing.assert_close(beside, expected)
+    wrapped = AdviceObservation(Still(space, actions), controller)
+    wrapped.reset()
+    torch.testing.assert_close(torch.from_numpy(wrapped.advice), expected)
