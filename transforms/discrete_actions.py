@@ -79,7 +79,7 @@ class DiscreteActions(ActionTransform):
             found = f"{size} numbers" if size != 1 else type(spec).__name__
             raise ValueError(
                 "DiscreteActions needs an action of one bounded number, but this env's action is "
-                f"{found}"
+                f"{found}; leave it out: action=continuous, with another learner than DQN"
             )
         if isinstance(self.choices, int):
             low, high = map(float, bounds)

@@ -260,9 +260,11 @@ def _guide_of(
     role, read, is_class = role_of(thing), keys or ["observation"], inspect.isclass(called(thing))
     if not role:
         what = "a class without act(observation)" if is_class else type(thing).__name__
+        is_regressor = callable(getattr(thing, "predict", None))
         raise ValueError(
             f"of={title} is {what}; name a class or an object with act(observation), a function, "
             "or a model with predict(observation, deterministic=True)"
+            f"{'; its predict is a function: of=MODULE:NAME.predict' if is_regressor else ''}"
         )
     if role == "function":
         check_call(thing, title, read, options)

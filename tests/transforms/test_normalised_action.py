@@ -212,5 +212,5 @@ def test_values_of_choices_are_in_the_unit_of_the_env():
         np.testing.assert_allclose(got(env).flatten(), expected, atol=1e-6)
     with pytest.raises(ValueError, match=r"must lie between the action's bounds 0.0 and 2.0"):
         advised(box([0], [2]), ConstantGuide([0.4]), DiscreteActions([-0.5, 0.5])).reset()
-    with pytest.raises(ValueError, match="needs an action of one bounded number"):
+    with pytest.raises(ValueError, match=r"of one bounded number, .*; leave it out: action=con"):
         advised(box([0], [INF]), ConstantGuide([0.4]), DiscreteActions(3)).reset()

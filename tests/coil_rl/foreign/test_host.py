@@ -233,7 +233,7 @@ class Regressor:
         ("my_broken:Net", {}, r"my_broken cannot be imported \(ZeroDivisionError: division by z"),
         ("my_control:Conter", {}, "my_control has no Conter; did you mean Counter"),
         ("my_control:number", {}, "my_control:number is int; name a class or an object with act"),
-        (Regressor(), {}, r"or a model with predict\(observation, deterministic=T"),
+        (Regressor(), {}, r"or a model with predict\(observation, deterministic=T.*:NAME\.predict"),
         (
             "my_control:Other",
             {},
