@@ -144,26 +144,10 @@ def check_folder(key: str) -> None:
             raise UserError(f"{text} has no effect: the files are written to {key}=FOLDER")
 
 
-def check_run(config: DictConfig) -> None:
-    """Check everything that a run needs, unless it is finished.
-
-    See `coil_rl.config.check.check`.
-    """
-    from coil_rl.config.folder import holds
-    from coil_rl.run.folder import is_evaluated
-
-    folder = Path(config.run_dir)
-    if config.get("existing") == "resume" and is_evaluated(folder) and holds(folder, config):
-        return
-    from coil_rl.config.check import check
-
-    check(config)
-
-
 def run_program(
     task: Callable[[DictConfig], Any],
     config_name: str,
-    check: Callable[[DictConfig], None] = check_run,
+    check: Callable[[DictConfig], None],
     config_path: str = "pkg://coil_rl.conf",
     further: Callable[[list[str]], list[str]] | None = None,
     no_sweep: str = "",

@@ -184,7 +184,9 @@ def check(config: DictConfig) -> None:
         app.check_unused((*OF_AN_AGENT, "degrade"), alone)
     elif not given:
         app.check_unused(OF_AN_AGENT, reason)
-    app.check_run(config)
+    from coil_rl.config import check as checks  # torch, which a wrong word does not wait for
+
+    checks.check(config)
 
 
 main = partial(app.run_program, evaluate, "evaluate", check)

@@ -42,14 +42,18 @@ def check(config: DictConfig) -> None:
 
     In a sweep a word may be meant for other runs, so each run says what it ignores.
     """
-    from coil_rl.config.check import check_read, unread
+    from coil_rl.config import check as checks
+    from coil_rl.config.folder import holds
+    from coil_rl.run.folder import is_evaluated
 
-    app.check_run(config)
+    folder = Path(config.run_dir)
+    if not (config.existing == "resume" and is_evaluated(folder) and holds(folder, config)):
+        checks.check(config)
     words = [text for _, text in app.overrides()]
     if not sweeps.is_sweep():
-        check_read(config, words)
+        checks.check_read(config, words)
         return
-    for sentence in unread(config, words):
+    for sentence in checks.unread(config, words):
         say(f"{sentence}, if no other run of this sweep reads it", error=True)
 
 

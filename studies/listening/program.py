@@ -165,7 +165,9 @@ def check(config: DictConfig) -> None:
         ("run", "track", "evaluation", "donors"), f"run={config.run} has its own configuration"
     )
     app.check_unused(OF_TRAINING, "only a training reads it")
-    app.check_run(config)
+    from coil_rl.config import check as checks  # torch, which a wrong word does not wait for
+
+    checks.check(config)
 
 
 main = partial(app.run_program, listen, "listen", check, "pkg://coil_studies.conf")
