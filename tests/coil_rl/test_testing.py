@@ -268,6 +268,21 @@ def test_observation_outside_of_its_space_is_said():
         check_env(GymnasiumEnv(Tank, 2), steps=4)
 
 
+def test_entry_without_numbers_is_within_its_space():
+    class Partial(Tank):
+        observation_space = spaces.Dict({**Tank.observation_space, "spare": spaces.Box(0, 1, (0,))})
+
+        def reset(self, **options):
+            observation, info = super().reset(**options)
+            return observation | {"spare": np.zeros(0)}, info
+
+        def step(self, action):
+            observation, *others = super().step(action)
+            return observation | {"spare": np.zeros(0)}, *others
+
+    check_env(GymnasiumEnv(Partial, 2), steps=4)
+
+
 def test_check_of_a_guide_says_how_to_make_more_rows():
     lean = PerRow(lambda: OneNumber(), ["level"])
     with pytest.raises(ValueError, match=r"not \[1\]; make it with more, .*num_envs=2\)"):
