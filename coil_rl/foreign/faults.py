@@ -109,8 +109,6 @@ def flag(value: Any, what: str) -> bool:
     Raises:
         FaultError: for anything but True, False, 1 and 0.
     """
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
     single = np.ndim(value) == 0 and not isinstance(value, (str, bytes))
     if not single or value is None or value not in (0, 1):
         raise FaultError(f"{what} is {shown(value)}, not True or False")

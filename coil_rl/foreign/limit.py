@@ -20,7 +20,6 @@ LIMIT = 1_000  # steps
 # Attributes in which envs keep the largest number of steps of an episode themselves.
 NAMES = ("max_steps", "max_episode_steps", "_max_episode_steps", "horizon", "episode_length")
 SECONDS = "time_limit"  # name of the longest time of an episode of a TorchRL env
-COUNTER = StepCounter.__name__
 
 
 def limit_of(env: Any) -> int | None:
@@ -74,17 +73,17 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def warn_of_limit(
-    name: str, limit: int, wrapper: str, remedy: str = "env.max_steps=NUMBER sets another limit"
-) -> None:
+def warn_of_limit(name: str, limit: int, wrapper: str) -> None:
     """Warn that the episodes of an env are truncated.
 
     Args:
         limit: the number of steps.
+        wrapper: or transform that could have ended them.
     """
     warnings.warn(
         f"an episode of the env {name} did not end within {limit:,} steps, and no {wrapper} ends "
-        f"it: episodes are truncated there ({remedy})",
+        f"it: episodes are truncated there (env.max_steps=NUMBER, or a {wrapper} of yours, sets "
+        "another limit)",
         stacklevel=3,
     )
 
@@ -107,8 +106,7 @@ class StepLimit(StepCounter):
             counts = [after[key] for key in self.step_count_keys]
             if any(bool((count >= self.max_steps).any()) for count in counts):
                 self.said = True
-                remedy = f"put TorchRL's {COUNTER}(NUMBER) around it for another limit"
-                warn_of_limit(self.name, self.max_steps, COUNTER, remedy)
+                warn_of_limit(self.name, self.max_steps, StepCounter.__name__)
         return after
 
 
