@@ -26,6 +26,7 @@ from torchrl.data import (
 
 from coil_rl.foreign.faults import FaultError, ForeignError, plain_array, shown
 from coil_rl.foreign.makers import Env
+from coil_rl.transforms.action_space import choices_of
 
 MOST_CHOICES = 32  # of a whole number that is an action
 WATCHED = 256  # first observations, in which the range of each number is found
@@ -396,11 +397,18 @@ class Actions:
         """Return the action of a controller in the shape and numbering of the env.
 
         Args:
-            action: what the controller gave; the bounds of real numbers are not checked.
+            action: what the controller gave, of choices also their one-hot vectors; the bounds of
+                real numbers are not checked.
 
         Raises:
             ForeignError: for what is no action of the env.
         """
+        sizes = choices_of(self.spec)
+        if action.shape == (sum(sizes),) and np.isin(action, (0, 1)).all():
+            parts = np.split(action, np.cumsum(sizes)[:-1])
+            if all(part.sum() == 1 for part in parts):
+                indices = np.array([part.argmax() for part in parts])
+                action = indices.reshape(self.space.shape) + self.lowest
         if action.size == 1 and math.prod(self.space.shape or ()) == 1:
             action = action.reshape(self.space.shape)
         if self.real:

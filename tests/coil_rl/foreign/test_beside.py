@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
 from torchrl.envs import TransformedEnv
 
-from coil_rl import AdviceObservation, ControllerGuide, GuideActions, GymnasiumEnv
+from coil_rl import AdviceObservation, ControllerGuide, EntryGuide, GuideActions, GymnasiumEnv
 
 GAINS = np.array([0.3, -0.2, 0.1], np.float32)
 STEPS = 4
@@ -172,11 +172,11 @@ class Still(gymnasium.Env):
 
     Args:
         space: of the observation, which is its first sample.
-        actions: shape of the action.
+        actions: space of the action.
     """
 
     def __init__(self, space, actions):
-        self.observation_space, self.action_space = space, spaces.Box(-1, 1, actions)
+        self.observation_space, self.action_space = space, actions
 
     def reset(self, *, seed=None, options=None):
         self.observation_space.seed(1)
@@ -193,21 +193,31 @@ def square(observation):
     return [[observation[0], 0.25], [-0.5, 0.5 * observation[1]]]
 
 
+def one_hot(observation):
+    return [0, 1, 0, 0, 1]
+
+
+NUMBER, PAIR = spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (2,))
+
+
 @pytest.mark.parametrize(
     ("space", "actions", "controller"),
     [
-        (spaces.Discrete(3, start=4), (1,), linear(3)),
-        (spaces.MultiDiscrete([2, 3]), (1,), linear(5)),
-        (spaces.Box(-3, 3, (2,), np.int64), (1,), linear(2)),
-        (spaces.Box(-1, 1, (2,)), (2, 2), square),
+        (spaces.Discrete(3, start=4), NUMBER, linear(3)),
+        (spaces.MultiDiscrete([2, 3]), NUMBER, linear(5)),
+        (spaces.Box(-3, 3, (2,), np.int64), NUMBER, linear(2)),
+        (PAIR, spaces.Box(-1, 1, (2, 2)), square),
+        (PAIR, spaces.Discrete(5, start=-2), lambda observation: [0, 0, 0, 1, 0]),
+        (PAIR, spaces.MultiDiscrete([2, 3], start=[1, -1]), one_hot),
     ],
 )
 def test_controller_reads_and_gives_the_same_numbers_everywhere(space, actions, controller):
     make = partial(GymnasiumEnv, lambda: Still(space, actions), max_steps=STEPS)
     transformed = TransformedEnv(make(), GuideActions({"it": controller}))
     expected = transformed.reset()["guide_action"].flatten()
-    beside = make(controllers={"it": controller}).reset()["controller", "it"].flatten()
-    torch.testing.assert_close(beside, expected)
+    beside = make(controllers={"it": controller})
+    found = TransformedEnv(beside, GuideActions({"it": EntryGuide(("controller", "it"))}))
+    torch.testing.assert_close(found.reset()["guide_action"].flatten(), expected)
     wrapped = AdviceObservation(Still(space, actions), controller)
     wrapped.reset()
     torch.testing.assert_close(torch.from_numpy(wrapped.advice), expected)
