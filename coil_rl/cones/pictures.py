@@ -23,7 +23,7 @@ class DrivenLines(Picture):
     """Driven lines on the tracks as `lines.png`, and as an animation, `lines.gif`.
 
     Args:
-        tracks: one for each case.
+        tracks: of the cases, in their order; further cases drive them again, and are not drawn.
         gif: whether to make the animation, for an env that has a `rate`.
         most: number of tracks that are drawn, the first ones.
     """
@@ -37,12 +37,14 @@ class DrivenLines(Picture):
         """Draw the lines; see `Picture.draw`.
 
         Args:
-            results: the episodes of each policy, one for each case.
+            results: the episodes of each policy, one for each case, in the same cases.
             folder: where the pictures are written.
         """
-        tracks, lines, crashed = self.tracks[: self.most], {}, {}
+        cases = len(next(iter(results.values())).episodes)
+        tracks = self.tracks[: min(self.most, cases)]
+        lines, crashed = {}, {}
         for policy, result in results.items():
-            first = result[: self.most]
+            first = result[: len(tracks)]
             lines[policy] = [pose[:, :2] for pose in first.histories["pose"]]
             crashed[policy] = [row.get("crashed", False) > 0 for row in first.episodes]
         draw_lines(tracks, lines, folder / "lines.png", crashed=crashed)

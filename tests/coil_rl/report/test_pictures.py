@@ -38,12 +38,13 @@ def test_driven_lines_are_drawn_with_an_animation(measures, tmp_path):
         assert animation.n_frames > 10
 
 
-def test_only_the_first_tracks_are_drawn(tmp_path):
-    pictures = []
-    for tracks, most in ((TRACKS, 1), (TRACKS[:1], 12)):
-        DrivenLines(tracks, gif=False, most=most).draw({"agent": drive()[: len(tracks)]}, tmp_path)
-        pictures.append((tmp_path / "lines.png").read_bytes())
-    assert pictures[0] == pictures[1]
+def test_only_the_first_tracks_and_cases_are_drawn(tmp_path):
+    pictures = set()
+    for tracks, cases, most in ((2, 2, 1), (1, 1, 12), (1, 2, 12), (2, 1, 12)):
+        picture = DrivenLines(TRACKS[:tracks], gif=False, most=most)
+        picture.draw({"agent": drive()[:cases]}, tmp_path)
+        pictures.add((tmp_path / "lines.png").read_bytes())
+    assert len(pictures) == 1
 
 
 @pytest.mark.parametrize(("gif", "rate"), [(False, 2.0), (True, math.nan)])
