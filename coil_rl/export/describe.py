@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
+from tensordict import unravel_key
 from torchrl.data import Bounded
 
 from coil_rl import record
@@ -159,15 +160,15 @@ def _input(
         }
     about["bounds"] = _bounds(plant.observation_spec[entry.key], plant.batch_dims)
     if isinstance(plant, GymnasiumEnv):
-        about |= _source(plant, key)
+        about |= _source(plant, entry)
     return about | {"unit": AS_GIVEN, "meaning": AS_GIVEN} | dict(known.get(entry.name, {}))
 
 
-def _source(plant: GymnasiumEnv, key: list[str]) -> dict[str, Any]:
+def _source(plant: GymnasiumEnv, given: Entry) -> dict[str, Any]:
     """Return where an input is in the observation of a Gymnasium env."""
-    found = [entry for entry in plant.codec.entries if list(entry.key) == key]
+    found = [entry for entry in plant.codec.entries if entry.key == unravel_key(given.key)]
     about: dict[str, Any] = {}
-    for entry in found[:1]:
+    for entry in found:
         start = torch.as_tensor(entry.start).reshape(-1)
         start = start.expand(len(entry.choices)) if entry.choices else start[:0]
         source = {"path": list(entry.path), "choices": entry.choices, "start": start.tolist()}
