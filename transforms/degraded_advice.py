@@ -217,7 +217,7 @@ class RandomAdvice(_DrawnAdvice):
         high: largest number, in normalised actions, finite and more than `low`.
     """
 
-    sample = staticmethod(torch.rand)
+    _sample = staticmethod(torch.rand)
 
     def __init__(
         self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action"

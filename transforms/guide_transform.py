@@ -201,7 +201,7 @@ class DrawingLink(Link):
     The state in `observe` is one number for each number of these entries, by their keys.
     """
 
-    sample: Callable[..., Tensor] = staticmethod(torch.randn)  # of a shape, with a generator
+    _sample: Callable[..., Tensor] = staticmethod(torch.randn)  # of a shape, with a generator
     rng: SeededGenerator
 
     def first(self, data: TensorDictBase, reset: TensorDictBase | None = None) -> State:
@@ -214,5 +214,5 @@ class DrawingLink(Link):
 
     def _drawn(self, data: TensorDictBase, *, after_reset: bool = False) -> State:
         shapes = [self._entry(data, key).shape for key in self.in_keys]
-        draws = self.rng.draw(self.sample, shapes, after_reset=after_reset)
+        draws = self.rng.draw(self._sample, shapes, after_reset=after_reset)
         return dict(zip(self.in_keys, draws, strict=True))
