@@ -11,6 +11,7 @@ from coil_rl.config.parts import OwnRun
 from coil_rl.errors import UserError
 from coil_rl.extras import require
 from coil_rl.ranges import checked
+from coil_rl.record import TUNED
 from coil_rl.run.run import Run
 from coil_rl.tune.numbers import GuideWithNumbers, numbers_to_tune, with_values
 from coil_rl.tune.run import TunedRun, read_tuned
@@ -49,5 +50,7 @@ class Tuning(Search, OwnRun):
             config: of the run.
             folder: of the run.
         """
+        if not (folder / TUNED.name).is_file():
+            return config
         values = read_tuned(folder, numbers_to_tune(config))
         return config if values is None else with_values(config, values)
