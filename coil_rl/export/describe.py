@@ -166,18 +166,18 @@ def _input(
 
 def _source(plant: GymnasiumEnv, given: Entry) -> dict[str, Any]:
     """Return where an input is in the observation of a Gymnasium env."""
-    found = [entry for entry in plant.codec.entries if entry.key == unravel_key(given.key)]
-    about: dict[str, Any] = {}
-    for entry in found:
-        start = torch.as_tensor(entry.start).reshape(-1)
-        start = start.expand(len(entry.choices)) if entry.choices else start[:0]
-        source = {"path": list(entry.path), "choices": entry.choices, "start": start.tolist()}
-        about["from"] = source
-        if entry.choices:
-            about["encoding"] = "one-hot vectors of the choices side by side"
-        elif isinstance(entry.space, spaces.Box) and entry.space.is_bounded():
-            low, high = _numbers(entry.space.low), _numbers(entry.space.high)
-            about["bounds"] = {"low": low, "high": high}
+    entry = {each.key: each for each in plant.codec.entries}.get(unravel_key(given.key))
+    if entry is None:  # an entry beside the observation, such as the action of a controller
+        return {}
+    start = torch.as_tensor(entry.start).reshape(-1)
+    start = start.expand(len(entry.choices)) if entry.choices else start[:0]
+    source = {"path": list(entry.path), "choices": entry.choices, "start": start.tolist()}
+    about: dict[str, Any] = {"from": source}
+    if entry.choices:
+        about["encoding"] = "one-hot vectors of the choices side by side"
+    elif isinstance(entry.space, spaces.Box) and entry.space.is_bounded():
+        low, high = _numbers(entry.space.low), _numbers(entry.space.high)
+        about["bounds"] = {"low": low, "high": high}
     return about
 
 

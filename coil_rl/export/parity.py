@@ -121,7 +121,7 @@ def record(
 
 
 class Heard:
-    """Listens to the guides of a controller, which are at least one.
+    """What the guides of a controller advised last, at least one of them, by hooks.
 
     Args:
         guides: of the controller.

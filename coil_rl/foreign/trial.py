@@ -86,10 +86,11 @@ class Trial:
             self.steps = self._affordable(steps, partial(self._rollout, 0))
 
     def _affordable(self, most: int, take_few: Callable[[], object]) -> int:
-        """Return how many steps an env or a controller may take; of a slow one it is the fewest.
+        """Return for how many steps an env or a controller is tried: fewer of a slow one.
 
         Args:
-            take_few: lets it take the fewest steps.
+            most: number of steps of a fast one.
+            take_few: lets it take `FEWEST` steps, whose time decides.
         """
         start = time.perf_counter()
         take_few()

@@ -52,5 +52,4 @@ class Tuning(Search, OwnRun):
         """
         if not (folder / TUNED.name).is_file():
             return config
-        values = read_tuned(folder, numbers_to_tune(config))
-        return config if values is None else with_values(config, values)
+        return with_values(config, read_tuned(folder, numbers_to_tune(config)) or {})

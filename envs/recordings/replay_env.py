@@ -238,10 +238,6 @@ class McapReplayEnv(EnvBase):
         out["terminated"] = torch.zeros_like(done)
         return out
 
-    def _current(self) -> Tensor:
-        """Return the index of each row's current scan among all scans [B]."""
-        return self.first + torch.minimum(self.steps, self.length - 1)
-
     def _entries(self, roughness: Tensor) -> TensorDict:
         """Update the memory with the current scans; return the entries of a reset or a step.
 
