@@ -23,6 +23,7 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import hydra.utils
@@ -212,13 +213,36 @@ def _check_origin(target: str, package: str, entry: str) -> None:
         entry: that names it, the beginning of the sentence.
     """
     try:
-        origin = str(getattr(hydra.utils.get_object(target), "__module__", None))
+        thing = hydra.utils.get_object(target)
     except Exception as error:
         raise UserError(
             f"{entry}, which {package} does not have; check that the package is installed"
         ) from error
-    if origin.partition(".")[0] != package:
+    if not _is_own(thing, target, package):
         raise UserError(f"{entry}, which is defined elsewhere; name the package that defines it")
+
+
+def _is_own(thing: Any, target: str, package: str) -> bool:
+    """Return whether what a package has under a name is its own.
+
+    A class or function says where it is defined. Other objects, such as a trained model of a
+    library or a `functools.partial`, are own values of a module of the package, which no installed
+    package has too; so is their method `predict`.
+    """
+    if str(getattr(thing, "__module__", None)).partition(".")[0] == package:
+        return True
+    home, _, name = target.rpartition(".")
+    if name == "predict":
+        return _is_own(hydra.utils.get_object(home), home, package)
+    if hasattr(thing, "__qualname__") or isinstance(thing, ModuleType) or home not in sys.modules:
+        return False
+    holders = {
+        module.partition(".")[0]
+        for module, content in list(sys.modules.items())
+        if any(value is thing for value in list(getattr(content, "__dict__", {}).values()))
+    }
+    installed = {*sys.stdlib_module_names, *metadata.packages_distributions()}
+    return not installed & (holders - {package})
 
 
 @cache

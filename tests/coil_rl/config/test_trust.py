@@ -292,6 +292,30 @@ def test_trusted_package_may_be_used_and_nothing_that_it_imports(
         read(tmp_path, theirs)
 
 
+def test_objects_of_a_trusted_package_may_be_used_if_it_made_them(package, saved, tmp_path):
+    source = """
+from functools import partial
+from torch.nn import Linear
+from numpy import sin  # an object
+from torch import ops  # another, whose load_library runs any code
+from sklearn.linear_model import LinearRegression
+
+def steer(observation, gain): ...
+
+quick, network, forest = partial(steer, gain=2), Linear(2, 1), LinearRegression()
+"""
+    (package / "their_package" / "objects.py").write_text(source)
+    trust.trust_packages(["their_package"])
+    for name in ("quick", "network", "forest.predict"):
+        assert read(tmp_path, with_controller(saved, f"their_package.objects:{name}"))
+    for name in (
+        *("sin", "ops", "ops.load_library", "Linear", "partial", "LinearRegression.predict"),
+        *("forest.fit", "quick.func.__globals__", "network.weight"),
+    ):
+        with pytest.raises(UserError, match="which is defined elsewhere"):
+            read(tmp_path, with_controller(saved, f"their_package.objects:{name}"))
+
+
 @pytest.mark.parametrize(("naming", "sep"), [(with_target, "."), (with_controller, ":")])
 def test_what_the_command_itself_names_is_trusted_in_folders(naming, sep, package, saved, tmp_path):
     theirs = naming(saved, f"their_package{sep}TheirGuide")
