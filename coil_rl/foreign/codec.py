@@ -337,7 +337,7 @@ class Actions:
             return Binary(shape=space.shape, dtype=torch.int8)
         raise ValueError(
             f"the action of {self.name} is a {type(space).__name__} space: replace it with a "
-            "wrapper"
+            "wrapper that has a Box, a Discrete or a MultiDiscrete"
         )
 
     def _of_whole_numbers(self) -> TensorSpec:

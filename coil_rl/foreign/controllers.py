@@ -305,6 +305,11 @@ def _of_object(thing: Any, title: str, keys: list[NestedKey] | None) -> TensorDi
     parts = getattr(getattr(thing, "observation_space", None), "spaces", None)
     if keys is None and isinstance(parts, Mapping):
         read = [nested_key(key) for key in parts]
+    elif len(read) > 1 and not isinstance(parts, Mapping):
+        raise ValueError(
+            f"of={title} predicts from one entry, as its observation_space is no Dict, but in_keys "
+            f"names {', '.join(map(written_key, read))}; name one"
+        )
     return PerRow(partial(Predictor, thing, read), read, title=title)
 
 

@@ -224,6 +224,11 @@ class Regressor:
         return x
 
 
+class OfOneEntry:
+    def predict(self, observation, deterministic=True):
+        return observation
+
+
 @pytest.mark.parametrize(
     ("of", "given", "message"),
     [
@@ -264,6 +269,11 @@ class Regressor:
             "my_control:Guide",
             {"in_keys": ["a", "b"]},
             r"of=my_control:Guide has its own in_keys=\['steering'\]; leave in_keys out",
+        ),
+        (
+            OfOneEntry(),
+            {"in_keys": ["a", ("b", "c")]},
+            r"of=OfOneEntry predicts from one entry.*in_keys names a, \[b,c\]; name one",
         ),
     ],
 )
