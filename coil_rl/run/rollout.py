@@ -72,16 +72,10 @@ class Rollout:
         A number that is NaN or infinite is a `UserError` with its entry, step and row.
         """
         set_progress(self.env, progress)
-        self.acting = self.env.reset() if self.carrier is None else self.carrier
+        carrier = self.env.reset() if self.carrier is None else self.carrier
         columns: dict[NestedKey, list[Tensor]] = {}
-        try:
-            with set_exploration_type(ExplorationType.RANDOM):
-                carrier = self._drive(columns)
-        except Exception:
-            # NaN of an earlier step may be the cause.
-            self._check(self._stacked(columns), 0)
-            self._check(self.acting.unsqueeze(-1), max(map(len, columns.values()), default=0))
-            raise
+        with set_exploration_type(ExplorationType.RANDOM):
+            carrier = self._drive(carrier, columns)
         batch = self._stacked(columns)
         self._check(batch, 0)
         self.carrier = carrier
@@ -92,24 +86,31 @@ class Rollout:
         """Check a batch [*B, T] that comes `steps` after the last one, see `check_batch`."""
         check_batch(batch.exclude(*self.unchecked), self.taken + steps)
 
-    def _drive(self, columns: dict[NestedKey, list[Tensor]]) -> TensorDictBase:
+    def _drive(
+        self, first: TensorDictBase, columns: dict[NestedKey, list[Tensor]]
+    ) -> TensorDictBase:
         """Take the steps of a batch, and return the data of the next one.
 
+        What fails may have met a number that is NaN or infinite: then that is the error.
+
         Args:
+            first: data of the first step.
             columns: gets the entries of each step.
         """
         lean: Any = self.lean
         take = self.env.step_and_maybe_reset if lean is None else lean.step
-        carrier = acting = self.acting if lean is None else lean.carry(self.acting)
+        carrier = first if lean is None else lean.carry(first)
         try:
             for _ in range(self.steps):
-                acting = carrier  # of the step that fails, for the check of its numbers
-                acting = self.acts(acting)
-                step, carrier = take(acting)
+                # The policy writes its action into the carrier.
+                step, after = take(self.acts(carrier))
                 for key in self.keys or step.keys(True, True):
                     columns.setdefault(key, []).append(step[key])
+                carrier = after
         except Exception:
-            self.acting = acting if lean is None else lean.env.data(acting)
+            self._check(self._stacked(columns), 0)
+            failed = carrier if lean is None else lean.env.data(carrier)
+            self._check(failed.unsqueeze(-1), max(map(len, columns.values()), default=0))
             raise
         return carrier if lean is None else lean.env.data(carrier)
 

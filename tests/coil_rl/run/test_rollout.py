@@ -129,6 +129,22 @@ def test_first_nan_is_reported_with_its_entry_step_and_row(places, message):
         check_batch(batch, steps=100)
 
 
+@pytest.mark.parametrize("lean", [True, False])
+def test_nan_of_a_policy_is_named_where_its_action_breaks_the_step(lean):
+    env = GymnasiumEnv("MountainCarContinuous-v0", 2)  # refuses such an action
+    policy, calls = PPO(env).policy, iter(range(9))
+
+    def break_action(module, inputs, outputs):
+        outputs[0][1] += torch.nan if next(calls) == 6 else 0.0
+
+    policy.module[-2].module.register_forward_hook(break_action)
+    collected = Rollout(env, policy, 4, policy.in_keys if lean else None)
+    assert (collected.lean is not None) == lean
+    collected.collect()
+    with pytest.raises(UserError, match=r"^loc is nan at step 7 of row 1$"):
+        collected.collect()
+
+
 def test_number_of_info_without_a_value_is_no_fault():
     env = GymnasiumEnv("CartPole-v1", 2, info=["lap"])
     collected = Rollout(env, RandomPolicy(env.action_spec), 5)
