@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 POLICY, TRACK = "cone_track/coil_anchored", "test_1"
 PICTURE = "coil_demo.png"
-USAGE = "coil-demo takes nothing, or the name of the picture: coil-demo FILE.png"
 HELP = """coil-demo: a picture of a trained agent beside its guide, from a shipped policy.
 
   coil-demo
@@ -30,10 +29,9 @@ def demo(path: Path) -> None:
     from coil_rl.envs import shipped_track
 
     print(f"demo: one lap on a track that {POLICY} has never seen ...", flush=True)
-    laps, lines, crashed = driven(), {}, {}
-    for name, result in zip(("guide alone", "agent with its advice"), laps.values(), strict=True):
-        lines[name] = [pose[:, :2] for pose in result.histories["pose"]]
-        crashed[name] = [bool(episode["crashed"]) for episode in result.episodes]
+    laps = driven()
+    lines = {name: [pose[:, :2] for pose in lap.histories["pose"]] for name, lap in laps.items()}
+    crashed = {name: [bool(each["crashed"]) for each in lap.episodes] for name, lap in laps.items()}
     draw_lines([shipped_track(TRACK)], lines, path, crashed=crashed)
     print(
         f"demo: {path} shows where both drove: the guide steers for the middle between the cones "
@@ -52,7 +50,7 @@ def demo(path: Path) -> None:
 
 
 def driven() -> dict[str, EvaluationResult]:
-    """Return one lap of the guide, and one of the agent, on the same track."""
+    """Return one lap of the guide, and one of the agent, on the same track, by their titles."""
     from coil_rl.config.python import pretrained
     from coil_rl.guides.simple import FollowAdvice
 
@@ -60,7 +58,7 @@ def driven() -> dict[str, EvaluationResult]:
     evaluation = replace(run.trial.evaluation, record={"pose": ("info", "pose")})
     env: Any = run.trial.env(1)  # of the first case, which is `TRACK`
     env.base_env.laps = 1
-    policies = {"guide": FollowAdvice(env), "agent": run.policy(env)}
+    policies = {"guide alone": FollowAdvice(env), "agent with its advice": run.policy(env)}
     return {name: evaluation.run(env, policy) for name, policy in policies.items()}
 
 
@@ -85,7 +83,10 @@ def target(arguments: Sequence[str]) -> Path:
     if not arguments:
         return Path(PICTURE)
     if len(arguments) > 1 or not arguments[0].endswith(".png"):
-        raise UserError(f"{' '.join(arguments)}: {USAGE}")
+        raise UserError(
+            f"{' '.join(arguments)} is not the name of one picture, which ends with .png; give "
+            f"one, or nothing for {PICTURE}"
+        )
     return Path(arguments[0]).expanduser()
 
 
