@@ -200,8 +200,13 @@ def _computed_tables(
     filled = np.concatenate(used)
     candidate = _stack([np.full((1, SECTORS, 2, 1), -1), *visible])
     slot = np.where(candidate < 0, slots - 1, candidate) + np.array([[0], [slots]])
-    lefts = [len(track.left) for track in tracks]
-    decisive = _stack([np.where(n < k, n, n - k + slots) for n, k in zip(near, lefts, strict=True)])
+    # The right cones of a track are numbered after its left ones; their slots begin at `slots`.
+    decisive = _stack(
+        [
+            np.where(cone < len(track.left), cone, cone - len(track.left) + slots)
+            for cone, track in zip(near, tracks, strict=True)
+        ]
+    )
 
     points, counts = _grid_numbers(tracks, dtype)
     field = np.concatenate([boundary_distances(track, dtype) for track in tracks])
@@ -256,7 +261,9 @@ def _grid_numbers(
 def nearby_cones(
     track: Track, sight: float, dtype: torch.dtype
 ) -> tuple[NDArray[np.bool_], Numbers, Numbers]:
-    """Return the relevant cones of each cell of a track, by number, ascending, then -1.
+    """Return which cones of a track matter to a car in each cell.
+
+    A row of cones holds their numbers, ascending, and ends with -1 where another row is longer.
 
     Args:
         sight: m, range of view.

@@ -91,10 +91,10 @@ class DriveNode(Node):
         self.publish(self.driver.scan(scan, self.now()))
 
     def _bearings(self, message: Any, points: int) -> NDArray[np.float64]:
-        """Return the bearings of a scan as they are taken of a recording, [P] radians.
+        """Return the bearings of a scan, [P] radians, by the rules for recordings.
 
-        What had to be decided is logged the first time. Bearings that mean nothing are left to the
-        driver, which refuses the scan.
+        The first doubt about what a scanner says of its bearings is logged. Those that mean nothing
+        are returned as it says them, and the driver refuses the scan.
         """
         given = Angles(message.angle_min, message.angle_max, message.angle_increment)
         first, step = given.first, given.step

@@ -61,11 +61,11 @@ class GuideTransform(ActionTransform):
     def train(self, mode: bool = True) -> GuideTransform:
         """Set the mode: training, or evaluation."""
         super().train(mode)
-        # TorchRL calls `eval` itself while it puts a transform into an env, and it is no part of
-        # the env until then.
+        # TorchRL calls `eval` itself on a transform that it is about to put into an env: only one
+        # that is a part of its env already was told by somebody that this is an evaluation.
         whole = getattr(self.container, "transform", None)
-        inside = whole is not None and any(self is part for part in whole.modules())
-        self._mode_is_set = mode or inside
+        is_part = whole is not None and any(self is part for part in whole.modules())
+        self._mode_is_set = mode or is_part
         return self
 
     @property
@@ -160,12 +160,12 @@ class SeededGenerator(nn.Module):
 
         Args:
             sample: draws a tensor of a shape with a generator, such as `torch.randn`.
+            dim: of `shape`, whose places are the rows.
         """
         if self.different is None:
             return sample(*shape, generator=self.generator)
-        few = [*shape[:dim], self.different, *shape[dim + 1 :]]
-        rows = torch.arange(shape[dim]) % self.different
-        return sample(*few, generator=self.generator).index_select(dim, rows)
+        few = sample(*shape[:dim], self.different, *shape[dim + 1 :], generator=self.generator)
+        return few.index_select(dim, torch.arange(shape[dim]) % self.different)
 
     def draw(
         self, sample: Callable[..., Tensor], shapes: Sequence[torch.Size], *, after_reset: bool

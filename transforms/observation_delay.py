@@ -12,7 +12,7 @@ from coil_rl.transforms.action_space import nested_key
 from coil_rl.transforms.disturbance import Delay, Lag
 from coil_rl.transforms.link import State
 
-EVALUATION_ONLY = "info"  # entries that nobody acts on
+INFO = "info"  # of the entries for measures, which nobody acts on
 
 
 class ObservationDelay(Delay):
@@ -23,8 +23,8 @@ class ObservationDelay(Delay):
     observation too; behind it only the agent does.
 
     Args:
-        in_keys: entries that are late; None for all numbers that the env itself writes, but for
-            those under `info`.
+        in_keys: entries that are late; None for the numbers that the env itself writes, without
+            those under `info` and those that a transform before this one has taken out.
         memory_key: entry for the lag of each row and for its past observations, oldest first.
 
     Raises:
@@ -55,11 +55,10 @@ class ObservationDelay(Delay):
     def late_keys(self) -> list[NestedKey]:
         """The keys of the entries that are late."""
         specs = self.parent.full_observation_spec
-        if self.given_keys is None:
-            own = self.parent.base_env.full_observation_spec.keys(True, True)
-            keys = [key for key in own if key != EVALUATION_ONLY and key[0] != EVALUATION_ONLY]
-            return [key for key in keys if not isinstance(specs.get(key, None), NonTensor | None)]
         known = [key for key in specs.keys(True, True) if not isinstance(specs[key], NonTensor)]
+        if self.given_keys is None:
+            own = list(self.parent.base_env.full_observation_spec.keys(True, True))
+            return [key for key in known if key in own and INFO not in (key, key[0])]
         for key in self.given_keys:
             if key not in known:
                 raise ValueError(

@@ -67,7 +67,7 @@ def as_onnx(program: ExportedProgram, step: PolicyStep) -> bytes:
     """Return the content of a file of ONNX.
 
     Args:
-        step: the same, for the names.
+        step: what was traced, for the names of inputs and outputs.
 
     Raises:
         NotExportableError: for an operation that ONNX does not have.
@@ -128,9 +128,9 @@ def _smaller(model: Any) -> bytes:
 def explained(content: bytes, contract: Mapping[str, Any]) -> bytes:
     """Return the content of a file of ONNX that says what its numbers mean, as metadata.
 
-    `contract` is all of it as JSON. The other entries are what programs of robots read today, lists
-    with commas: an entry of the observation needs no scale, and no steps before the present one,
-    and the action is in the unit of the env, so that all scales are 1.
+    Its entry `contract` is all of that as JSON. The others are lists with commas that programs of
+    robots read. Their scales are 1, because inputs and action are in the units of the env, and so
+    are the lengths of the history, because an input is of the present step.
 
     Args:
         contract: without its `files`, among which is this one.

@@ -101,7 +101,7 @@ class Critics(TensorDictModuleBase):
             reads, the inputs among them.
         dropout: share of the numbers of a hidden layer that are left out in learning.
         gain: factor of the numbers that each gives; a small one slows the last layer down.
-        inputs: has written what they read in place of some of `in_keys` already.
+        inputs: writes, before these are asked, what they read in place of some of `in_keys`.
     """
 
     by_key = True
@@ -126,15 +126,16 @@ class Critics(TensorDictModuleBase):
         self.count, self.dropout, self.gain = count, dropout, gain
         self.concat = ConcatObservations(env, keys, {"action": action_shape(env)}, network)
         architecture, width = Mlp(network.hidden, network.activation), self.concat.width
-        each = [architecture.layers(width, outputs, 1.0, env.device) for _ in range(count)]
-        linear = [[layer for layer in mlp if isinstance(layer, nn.Linear)] for mlp in each]
+        alone = [architecture.layers(width, outputs, 1.0, env.device) for _ in range(count)]
+        # Of each network its layers with weights; of those the first ones, the second ones, ...
+        linear = [[layer for layer in mlp if isinstance(layer, nn.Linear)] for mlp in alone]
         self.layers = nn.ModuleList(Layer(same) for same in zip(*linear, strict=True))
         self.activation = ACTIVATIONS[network.activation]()
         self.norm: Norm = "layer" if norm == "none" and network.layer_norm else norm
         hidden: Sequence[int] = network.hidden
         widths = {"none": [], "layer": hidden, "batch": [width, *hidden]}[self.norm]
         kind = BatchNorm if self.norm == "batch" else LayerNorm
-        self.norms = nn.ModuleList(kind(count, each, env.device) for each in widths)
+        self.norms = nn.ModuleList(kind(count, numbers, env.device) for numbers in widths)
 
     def outputs(self, entries: Any, *, train: bool = False) -> Tensor:
         """Return the numbers of each critic for the action of entries, [critics, *B, outputs].

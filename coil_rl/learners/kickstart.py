@@ -14,7 +14,7 @@ from coil_rl.learners.anchor import AnchoredSample
 from coil_rl.learners.critics import Critics
 from coil_rl.learners.density import Choices, Normal, SquashedNormal
 from coil_rl.learners.extension import Extension
-from coil_rl.ranges import Positive, checked
+from coil_rl.ranges import Index, Positive, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.guide_transform import check_advised
 
@@ -40,7 +40,6 @@ class KickstartLoss(Extension):
         scale: standard deviation of the guide for the divergence of numbers, before squashing.
         guide: index of the guide in the advice.
         advice_key: entry with the advice, [N, n_guides, A].
-
     """
 
     LOSS: ClassVar[str] = "loss_guide"
@@ -48,7 +47,7 @@ class KickstartLoss(Extension):
     coefficient: float | Schedule = Linear(1.0, 0.0, until=0.5)
     kind: Literal["likelihood", "divergence"] = "likelihood"
     scale: Positive = 0.2
-    guide: int = 0
+    guide: Index = 0
     advice_key: NestedKey = "guide_action"
 
     def __post_init__(self) -> None:
@@ -72,8 +71,9 @@ class KickstartLoss(Extension):
             check_advised(env.observation_spec, self)
         if isinstance(policy.module[-1], AnchoredSample):
             raise ValueError(
-                "an anchored policy adds numbers to its guide's, so none of them is to be drawn to "
-                "the guide's action; leave learner.anchor out, or learner.auxiliary"
+                "what an anchored policy learns is added to its guide's action, and this loss "
+                "would draw it to that action itself; leave learner.anchor out, or "
+                "learner.auxiliary"
             )
 
     def losses(
@@ -95,7 +95,8 @@ class KickstartLoss(Extension):
         advice = minibatch[self.advice_key][..., self.guide, :]
         density = policy.get_dist(minibatch.select(*policy.in_keys))
         if isinstance(density, Choices):
-            # The advice is one-hot for each choice, one beside the other.
+            # The advice has a one-hot vector for each choice, side by side. The logits have rows of
+            # one length, in which `valid` are the options.
             return -(advice * density.logits[:, density.valid]).sum(-1)
         mean = advice
         if isinstance(density, SquashedNormal):

@@ -154,6 +154,7 @@ def actor(
     before: list[TensorDictModuleBase] = [] if inputs is None else [inputs]
     if isinstance(network, Gru):
         before += memory(env, in_keys, keys, network, shapes)
+        # What follows reads the memory only.
         in_keys = keys = [REMEMBERED]
         shapes, network = {REMEMBERED: torch.Size([network.state])}, network.after
 
@@ -218,8 +219,8 @@ def _sample_of_numbers(env: EnvBase, spec: TensorSpec, squash: bool, clip: bool)
     kind: type[Density] = Normal
     options: dict[str, Any] = {"event_dims": len(action_shape(env))}
     if isinstance(spec, Bounded):
-        first = (0,) * len(env.batch_size)
-        low, high = spec.space.low[first], spec.space.high[first]
+        row = (0,) * len(env.batch_size)  # all have the same bounds
+        low, high = spec.space.low[row], spec.space.high[row]
         if squash and bool((high - low).isfinite().all()):
             is_unit = bool((low == -1).all() and (high == 1).all())
             kind, options["bounds"] = SquashedNormal, None if is_unit else (low, high)
@@ -237,8 +238,13 @@ def memory(
 ) -> list[TensorDictModuleBase]:
     """Return the modules of a policy that remember the entries of an episode.
 
-    They write `remembered` [*batch, H]. `read` are the keys under which the modules read the
-    entries `in_keys` of the env. An env that does not carry the state is a `ValueError`.
+    They write `remembered` [*batch, H]. An env that does not carry the state is a `ValueError`.
+
+    Args:
+        in_keys: entries of the env, for their shapes.
+        read: the keys under which the modules find them, in the same order.
+        network: has the size of the memory.
+        shapes: see `actor`.
     """
     carried = {
         key: spec.shape[len(env.batch_size) :]

@@ -8,7 +8,13 @@ import worlds
 from gymnasium import spaces
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, Unbounded
-from torchrl.envs import Compose, EnvBase, ObservationNorm, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    ExcludeTransform,
+    ObservationNorm,
+    TransformedEnv,
+)
 
 from coil_rl import GymnasiumEnv
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -90,6 +96,15 @@ def test_observations_are_those_of_the_lag_of_their_row_and_episode():
     assert set(lag[starts].tolist()) == {1, 2, 3}
     # A lag holds for its episode, whichever other rows begin another one meanwhile.
     assert torch.equal(lag[:, 1:][~starts[:, 1:]], lag[:, :-1][~starts[:, 1:]])
+
+
+def test_without_names_the_entries_of_the_env_are_late_that_are_still_there_and_no_measures():
+    before = [ExcludeTransform("executed"), LastAction()]
+    env = TransformedEnv(Counter(), Compose(*before, ObservationDelay(2, 2)))
+    assert set(env.transform[-1].late_keys) == {"observation", ("inner", "count")}
+    data = env.rollout(4)
+    assert data["observation"][0, :, 0].tolist() == [0, 0, 0, 1]
+    assert data["info", "step"][0, :, 0].tolist() == [0, 1, 2, 3]
 
 
 def test_only_the_entries_that_are_named_are_late():

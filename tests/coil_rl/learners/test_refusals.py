@@ -138,8 +138,15 @@ SIZES = "must have one number for each convolution"
         (lambda: PPO(AnyEnv(), auxiliary=[FilteredKickstartLoss()]), "take learner=sac"),
         (lambda: PPO(AnyEnv(), auxiliary=[KickstartLoss()]), "row 0 of guide_action.* no advice"),
         (lambda: imitating(PPO, KickstartLoss(guide=1)), "row 1 of guide_action.* of 1 guides"),
-        (lambda: imitating(PPO), "an anchored policy adds numbers to its guide's.* learner.anchor"),
-        (lambda: imitating(SAC), "an anchored policy adds numbers to its guide's.* learner.anchor"),
+        (lambda: KickstartLoss(guide=-1), "guide=-1 must be at least 0"),
+        (
+            lambda: imitating(PPO),
+            "an anchored policy learns is added to its guide's.* learner.anchor",
+        ),
+        (
+            lambda: imitating(SAC),
+            "an anchored policy learns is added to its guide's.* learner.anchor",
+        ),
         (lambda: SAC(AnyEnv(), critics=1), "critics=1 must be"),
         (lambda: SAC(AnyEnv(), critics=4, target_critics=4), "at least 1 and less than critics=4"),
         (lambda: SAC(AnyEnv(), prior=0.5), r"prior=0\.5 needs steps in which a guide acts"),
