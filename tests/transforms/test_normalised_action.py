@@ -1,10 +1,10 @@
 """The unit of the action: guides and env speak the env's, all else the normalised one."""
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from plants import Plant
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
@@ -26,29 +26,12 @@ from coil_rl.transforms.normalised_action import ActionUnits, normalising
 INF = np.inf
 
 
-class Seen(gymnasium.Env):
-    """Shows random numbers, and keeps the actions that it gets."""
-
-    observation_space = Box(-1, 1, (2,), np.float32)
-
-    def __init__(self, space):
-        self.action_space, self.got = space, []
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.np_random.uniform(-1, 1, 2).astype(np.float32), {}
-
-    def step(self, action):
-        self.got.append(np.array(action))
-        return self.np_random.uniform(-1, 1, 2).astype(np.float32), 0.0, False, False, {}
-
-
 def box(low, high, dtype=np.float32):
     return Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
 
 
 def advised(space, guide, *transforms, normalised=True):
-    env = GymnasiumEnv(lambda: Seen(space))
+    env = GymnasiumEnv(lambda: Plant(actions=space))
     first = normalising(env) if normalised else []
     env = TransformedEnv(env)
     for transform in (*first, GuideActions({"guide": guide}), *transforms):
@@ -58,7 +41,7 @@ def advised(space, guide, *transforms, normalised=True):
 
 def got(env):
     (plant,) = env.base_env.held.plants
-    return np.array(plant.env.got)
+    return np.array(plant.env.given)
 
 
 def followed(env, steps=3):
@@ -102,8 +85,8 @@ def test_units_of_bounds():
 
 
 def test_an_action_between_minus_one_and_one_is_left_alone():
-    assert normalising(GymnasiumEnv(lambda: Seen(box([-1, -1], [1, 1])))) == []
-    assert normalising(GymnasiumEnv(lambda: Seen(Discrete(3)))) == []
+    assert normalising(GymnasiumEnv(lambda: Plant(actions=box([-1, -1], [1, 1])))) == []
+    assert normalising(GymnasiumEnv(lambda: Plant(actions=Discrete(3)))) == []
 
 
 @pytest.mark.parametrize(

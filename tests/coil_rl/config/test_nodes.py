@@ -113,6 +113,11 @@ def wrapped(wrapper, arguments):
         ("DtypeObservation", {"dtype": "float64"}, [3]),
         ("DiscretizeObservation", {"bins": [2, 2, 2]}, [8]),
         ("RepeatAction", {"num_repeats": 2}, [3]),
+        (
+            "StickyAction",
+            {"repeat_action_probability": 0.5, "repeat_action_duration": [1, 3]},
+            [3],
+        ),
     ],
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")

@@ -1,10 +1,10 @@
 """Observations and actions of every kind go through an exported policy as the env has them."""
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
 from learned_runs import TINY
+from plants import Plant
 
 import coil_rl
 
@@ -21,23 +21,11 @@ OBSERVATIONS = spaces.Dict(
 )
 
 
-class Gears(gymnasium.Env):
+class Gears(Plant):
     """Shows random observations for ten steps."""
 
     def __init__(self, kind="several"):
-        self.observation_space, self.action_space = OBSERVATIONS, ACTIONS[kind]
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        if seed is not None:
-            self.observation_space.seed(seed)
-        self.steps = 0
-        return self.observation_space.sample(), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action), action
-        self.steps += 1
-        return self.observation_space.sample(), float(np.sum(action)), False, self.steps == 10, {}
+        super().__init__(OBSERVATIONS, ACTIONS[kind], end=10)
 
 
 class First:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from plants import UNIT, Plant
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
@@ -167,22 +168,6 @@ def test_what_cannot_act_is_refused_everywhere():
             take(object())
 
 
-class Still(gymnasium.Env):
-    """Shows always the same.
-
-    Args:
-        space: of the observation, which is its first sample.
-        actions: space of the action.
-    """
-
-    def __init__(self, space, actions):
-        self.observation_space, self.action_space = space, actions
-
-    def reset(self, *, seed=None, options=None):
-        self.observation_space.seed(1)
-        return self.observation_space.sample(), {}
-
-
 def linear(inputs):
     network = nn.Linear(inputs, 1)
     nn.init.constant_(network.weight, 0.1)
@@ -197,27 +182,27 @@ def one_hot(observation):
     return [0, 1, 0, 0, 1]
 
 
-NUMBER, PAIR = spaces.Box(-1, 1, (1,)), spaces.Box(-1, 1, (2,))
+PAIR = spaces.Box(-1, 1, (2,))
 
 
 @pytest.mark.parametrize(
     ("space", "actions", "controller"),
     [
-        (spaces.Discrete(3, start=4), NUMBER, linear(3)),
-        (spaces.MultiDiscrete([2, 3]), NUMBER, linear(5)),
-        (spaces.Box(-3, 3, (2,), np.int64), NUMBER, linear(2)),
+        (spaces.Discrete(3, start=4), UNIT, linear(3)),
+        (spaces.MultiDiscrete([2, 3]), UNIT, linear(5)),
+        (spaces.Box(-3, 3, (2,), np.int64), UNIT, linear(2)),
         (PAIR, spaces.Box(-1, 1, (2, 2)), square),
         (PAIR, spaces.Discrete(5, start=-2), lambda observation: [0, 0, 0, 1, 0]),
         (PAIR, spaces.MultiDiscrete([2, 3], start=[1, -1]), one_hot),
     ],
 )
 def test_controller_reads_and_gives_the_same_numbers_everywhere(space, actions, controller):
-    make = partial(GymnasiumEnv, lambda: Still(space, actions), max_steps=STEPS)
+    make = partial(GymnasiumEnv, lambda: Plant(space, actions, STEPS), first_seed=1)
     transformed = TransformedEnv(make(), GuideActions({"it": controller}))
     expected = transformed.reset()["guide_action"].flatten()
     beside = make(controllers={"it": controller})
     found = TransformedEnv(beside, GuideActions({"it": EntryGuide(("controller", "it"))}))
     torch.testing.assert_close(found.reset()["guide_action"].flatten(), expected)
-    wrapped = AdviceObservation(Still(space, actions), controller)
-    wrapped.reset()
+    wrapped = AdviceObservation(Plant(space, actions), controller)
+    wrapped.reset(seed=1)
     torch.testing.assert_close(torch.from_numpy(wrapped.advice), expected)

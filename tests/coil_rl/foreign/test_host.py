@@ -4,12 +4,12 @@ import importlib
 import textwrap
 from functools import partial
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
 from hosted_guides import cones, driven, steps_of_episode
+from plants import Plant
 from sklearn.linear_model import LinearRegression
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -283,56 +283,25 @@ def test_controller_that_cannot_be_used_is_refused_in_one_sentence(of, given, me
     assert "\n" not in str(error.value)
 
 
-class Matrix(gymnasium.Env):
-    """Its action is a matrix, and its reward the sum of the first row."""
-
-    action_space = spaces.Box(-1, 1, (2, 3), np.float64)
-    observation_space = spaces.Box(-1, 1, (2,), np.float64)
-
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(2), {}
-
-    def step(self, action):
-        return np.zeros(2), action[0].sum(), False, False, {}
-
-
-class GivesMatrix:
-    def act(self, observation):
-        return np.arange(6.0).reshape(2, 3) / 10
-
-
 def test_matrix_of_a_controller_is_the_matrix_that_the_env_gets():
-    env = GymnasiumEnv(Matrix, 2, controllers={"beside": GivesMatrix()})
-    assert env.action_spec.shape == (2, 6)
-    env = TransformedEnv(env, GuideActions({"theirs": PerRow(GivesMatrix)}))
+    plant, matrix = Plant(actions=spaces.Box(-1, 1, (2, 3))), np.arange(6.0).reshape(2, 3) / 10
+
+    class Gives:
+        def act(self, observation):
+            return matrix
+
+    env = GymnasiumEnv(lambda: plant, controllers={"beside": Gives()}, max_steps=9)
+    assert env.action_spec.shape == (1, 6)
+    env = TransformedEnv(env, GuideActions({"theirs": PerRow(Gives)}))
     data = env.reset()
-    assert data["guide_action"].shape == (2, 1, 6)
-    actions = [FollowAdvice(env, guide)(data.clone())["action"] for guide in (0, [0, 0])]
+    assert data["guide_action"].shape == (1, 1, 6)
+    actions = [FollowAdvice(env, guide)(data.clone())["action"] for guide in (0, [0])]
     for action in (*actions, data["controller", "beside"]):
-        stepped = env.step(data.clone().set("action", action))
-        assert stepped["next", "reward"].flatten().tolist() == pytest.approx([0.3, 0.3])
+        env.step(data.clone().set("action", action))
+        np.testing.assert_allclose(plant.given[-1], matrix, rtol=1e-6)
 
 
-class Shelf(gymnasium.Env):
-    """Choices to observe, numbered as the env numbers them."""
-
-    action_space = spaces.Box(-9.0, 9.0, (2,))
-
-    def __init__(self, observation_space, made):
-        self.observation_space, self.seen = observation_space, []  # what it returned
-        made.append(self)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.observation_space.seed(seed)
-        return self.observe(), {}
-
-    def step(self, action):
-        return self.observe(), 0.0, False, False, {}
-
-    def observe(self):
-        self.seen.append(self.observation_space.sample())
-        return self.seen[-1]
+TWO = spaces.Box(-9.0, 9.0, (2,))
 
 
 def first_two(numbers):
@@ -361,18 +330,18 @@ class Reader:
     ids=["class", "object", "function", "batch"],
 )
 def test_controller_reads_choices_as_the_env_numbers_them(space, controller):
-    made = []
-    env = GymnasiumEnv(lambda: Shelf(space, made), num_envs=1)
+    plant = Plant(space, TWO)
+    env = GymnasiumEnv(lambda: plant, max_steps=9)
     advised = TransformedEnv(env, GuideActions({"reader": ControllerGuide(controller)}))
     advice = advised.rollout(5)["guide_action"].reshape(-1, 2)
     batched = not isinstance(controller, (type, Reader)) and controller is not first_two
-    seen = [np.ravel(each) for each in made[0].seen[-6:-1]]
+    seen = [np.ravel(each) for each in plant.shown[-6:-1]]
     expected = [each[[0, -1]] if batched else first_two(each) for each in seen]
     assert np.array_equal(advice.numpy(), np.array(expected, np.float32))
 
 
 def test_network_reads_choices_as_one_hot_vectors():
-    env = GymnasiumEnv(partial(Shelf, spaces.MultiDiscrete([2, 3]), []), num_envs=2)
+    env = GymnasiumEnv(partial(Plant, spaces.MultiDiscrete([2, 3]), TWO), 2, max_steps=9)
     advised = TransformedEnv(env, GuideActions({"net": ControllerGuide(torch.nn.Linear(5, 2))}))
     data = advised.rollout(3)
     assert torch.equal(data["observation"].sum(-1), torch.full((2, 3), 2.0))
@@ -478,7 +447,7 @@ def test_memory_of_a_model_is_in_the_checkpoint():
 
 
 def test_model_gets_choices_and_dictionaries_as_its_spaces_have_them():
-    seen, made = [], []
+    seen = []
 
     class Reads:
         observation_space = spaces.Dict(
@@ -489,8 +458,10 @@ def test_model_gets_choices_and_dictionaries_as_its_spaces_have_them():
             seen.append((int(observation["place"]), observation["pair"].tolist()))
             return np.zeros(2), None
 
-    advised(ControllerGuide(Reads()), lambda: Shelf(Reads.observation_space, made), 1)
-    assert seen[:STEPS] == [(each["place"], each["pair"].tolist()) for each in made[0].seen][:STEPS]
+    plant = Plant(Reads.observation_space, TWO)
+    advised(ControllerGuide(Reads()), lambda: plant, 1, max_steps=9)
+    shown = [(each["place"], each["pair"].tolist()) for each in plant.shown]
+    assert seen[:STEPS] == shown[:STEPS]
 
 
 def test_saved_model_of_stable_baselines3_is_a_guide(tmp_path):

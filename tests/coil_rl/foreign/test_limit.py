@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from plants import Plant
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Composite, Unbounded
@@ -93,6 +94,11 @@ def test_limit_that_an_env_names_is_left_to_it(make):
     assert not limits_of(env)
 
 
+def test_envs_of_the_project_are_left_as_they_are():
+    env = ConeTrackEnv(shipped_tracks("train")[:1], num_envs=1)
+    assert not limits_of(env)
+
+
 def test_attribute_only_makes_the_limit_longer():
     class Planner(Endless):
         horizon = 10
@@ -104,37 +110,11 @@ def test_attribute_only_makes_the_limit_longer():
     assert [part.max_steps for part in limits_of(Planner(2))] == [1000]
 
 
-def test_envs_of_the_project_are_left_as_they_are():
-    env = ConeTrackEnv(shipped_tracks("train")[:1], num_envs=1)
-    assert not limits_of(env)
-
-
 @pytest.mark.usefixtures("few")
 def test_rows_of_a_batch_keep_a_longer_limit():
     env = EnvBatch(lambda: TransformedEnv(Endless(), StepCounter(40)), num_envs=1)
     steps = evaluate_policy(env, stay(env)).episodes[0]["steps"]
     assert steps == 40
-
-
-class Plant(gymnasium.Env):
-    """It ends after some steps.
-
-    Args:
-        end: number of steps; None: never.
-    """
-
-    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
-
-    def __init__(self, end=None):
-        self.end = end
-
-    def reset(self, *, seed=None, options=None):
-        self.time = 0
-        return [0.0], {}
-
-    def step(self, action):
-        self.time += 1
-        return [0.0], 1.0, False, self.time == self.end, {}
 
 
 def ended(env, steps):

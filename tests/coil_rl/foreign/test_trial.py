@@ -1,11 +1,14 @@
-"""Controllers that draw random numbers which no seed of a run reaches."""
+"""What a trial finds: what rows share, what lives by the clock, and draws without a seed."""
 
 import random
+import re
+import time
 import warnings
 
 import numpy as np
 import pytest
 import torch
+from plants import Drift
 
 from coil_rl.config.check import check
 from coil_rl.config.python import composed, named
@@ -13,43 +16,118 @@ from coil_rl.foreign.controllers import ControllerGuide
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.foreign.trial import STEPS, Trial
 
+MEMORY = []
+
+
+class SharesDefault(Drift):
+    def __init__(self, state=[0.0, 0.0], **options):  # noqa: B006
+        super().__init__(**options)
+        self.state = state
+
+    def begin(self, seed):
+        self.state[:] = [self.np_random.uniform(), 0.0]
+
+
+class SharesAttribute(SharesDefault):
+    shared = [0.0, 0.0]  # noqa: RUF012
+
+    def __init__(self, **options):
+        super().__init__(self.shared, **options)
+
+
+class Slow(Drift):
+    """Moves with the time that has passed."""
+
+    def begin(self, seed):
+        super().begin(seed)
+        self.began = time.monotonic()
+
+    def move(self, action):
+        super().move(action)
+        self.state[1] = float(time.monotonic() - self.began > 0.03)
+
 
 class Still:
-    """Controller that draws nothing, and counts its calls."""
-
-    calls = 0
+    """A controller of each row alone; its variants share something or draw."""
 
     def __init__(self):
-        self.past = 0.0
+        self.memory = []
 
     def act(self, observation):
-        Still.calls += 1
-        self.past = 0.9 * self.past + 0.1 * float(observation[0])
-        return [self.past + self.draw()]
+        self.memory.append(float(observation[0]))
+        return [0.1 * sum(self.memory[-3:]) + self.draw()]
 
     def draw(self):
         return 0.0
 
 
-class Global(Still):
-    def draw(self):
-        return np.random.randn()
+class OfClass(Still):
+    memory = []  # noqa: RUF012
+
+    def __init__(self):
+        pass
+
+    def reset(self):
+        pass
 
 
-class Python(Still):
-    def draw(self):
-        return random.gauss(0.0, 1.0)
+class OfClassCleared(OfClass):
+    def reset(self):
+        self.memory.clear()
+
+
+class OfModule(OfClass):
+    def act(self, observation):
+        MEMORY.append(float(observation[0]))
+        return [0.1 * sum(MEMORY[-3:])]
+
+
+class OfClock:
+    """Gives a new output only after 10 ms, as a PID controller of a package does."""
+
+    def __init__(self):
+        self.last, self.output = -np.inf, [0.0]
+
+    def reset(self):
+        self.last = -np.inf
+
+    def act(self, observation):
+        now = time.monotonic()
+        if now - self.last > 0.01:
+            self.last, self.output = now, [float(observation[0])]
+        return self.output
+
+
+class OfDate(OfClock):
+    """Gives a new output each second."""
+
+    def act(self, observation):
+        now = time.mktime(time.localtime())
+        if now > self.last:
+            self.last, self.output = now, [float(observation[0])]
+        return self.output
+
+
+def drawing(draw):
+    """Return a class of controllers with these random numbers."""
+    return type("Drawing", (Still,), {"draw": lambda self: draw()})
+
+
+def fails():
+    raise RuntimeError("no device")
+
+
+GLOBAL = drawing(np.random.randn)
 
 
 class Late(Still):
     def draw(self):
-        self.step = getattr(self, "step", 0) + 1
-        return np.random.randn() if self.step == STEPS else 0.0
+        return np.random.randn() if len(self.memory) == STEPS else 0.0
 
 
 class AtReset(Still):
     def reset(self):
-        self.past = np.random.randn()
+        self.memory = [np.random.randn()]
 
 
 class Seeded(Still):
@@ -84,49 +162,68 @@ class Unused(Unseeded):
         return 0.0
 
 
-class OfTorch(Still):
-    def draw(self):
-        return torch.randn(()).item()
+def findings(controller=None, env=Drift):
+    """Return the sentences of the trial of an env of two rows, or of a controller in it."""
+    trial = Trial(GymnasiumEnv(env, 2, first_seed=0))
+    if controller is None:
+        trial.ask_env()
+    else:
+        trial.ask_controller(ControllerGuide(controller))
+    return [(kind, text) for kind, text in trial.findings if kind != "bounds"]
 
 
-class Fails(Global):
-    def draw(self):
-        raise RuntimeError("no device")
+UNSEEDED = "Unseeded gives other actions for the same .*reads the clock"
+INSIDE = "Inside gives other actions for the same .*reads the clock"
 
 
-def found(of):
-    """Return the sentences of a trial of a controller, by their kind."""
-    trial = Trial(GymnasiumEnv("Pendulum-v1", 2, first_seed=0))
-    trial.ask_controller(ControllerGuide(of))
-    return dict(trial.findings)
-
-
-@pytest.mark.fast(2)
-@pytest.mark.parametrize("of", [Unseeded, Unseeded(), Inside, Inside()])
-def test_controller_that_draws_what_no_seed_reaches_is_found(of):
-    sentence = found(of)["draws"]
-    name = of.__name__ if isinstance(of, type) else type(of).__name__
-    assert sentence.startswith(f"the controller {name} gives other actions for the same")
-    assert "reads the clock" in sentence
-
-
-@pytest.mark.fast(6)
 @pytest.mark.parametrize(
-    "of",
+    ("controller", "env", "kind", "message"),
     [
-        *(Still, Still(), Seeded, Seeded(3), Inside(3), Unused(), OfTorch, Fails),
-        *(Global, Global(), Python, Late, AtReset),
+        (None, SharesDefault, "rows", "all rows share a default of SharesDefault.__init__; mak"),
+        (None, SharesAttribute, "rows", "all rows share SharesAttribute.shared; make it in __i"),
+        (None, Slow, "clock", "observation of the env differs when time passes between two"),
+        (OfClass, Drift, "rows", "all rows share OfClass.memory; make it in __init__"),
+        (OfClassCleared, Drift, "rows", "all rows share OfClass.memory; make it in __init__"),
+        (OfModule, Drift, "rows", r"all rows share .*test_trial\.MEMORY; make it in"),
+        (OfClock, Drift, "clock", "when time passes between two steps: it reads the clock"),
+        (OfDate, Drift, "clock", "the controller OfDate gives other actions when time"),
+        (Unseeded, Drift, "draws", UNSEEDED),
+        (Inside(), Drift, "draws", INSIDE),
+        pytest.param(Unseeded(), Drift, "draws", UNSEEDED, marks=pytest.mark.slow),
+        pytest.param(Inside, Drift, "draws", INSIDE, marks=pytest.mark.slow),
     ],
 )
-def test_controller_that_a_run_repeats_is_not_found(of):
-    assert not found(of)
+def test_trial_names_what_no_run_repeats(controller, env, kind, message):
+    ((found, text),) = findings(controller, env)
+    assert found == kind
+    assert re.search(message, text)
+
+
+def test_trial_finds_what_rows_share_also_after_they_were_in_processes():
+    env = GymnasiumEnv(SharesAttribute, 2, first_seed=0, workers=2)
+    env.rollout(3)
+    trial = Trial(env)
+    trial.ask_env()
+    assert [each.kind for each in trial.findings] == ["rows"]
+
+
+@pytest.mark.fast(8)
+@pytest.mark.parametrize(
+    "controller",
+    [
+        *(None, Still, Still(), Seeded, Seeded(3), Inside(3), Unused()),
+        *(GLOBAL, GLOBAL(), Late, AtReset, drawing(random.random), drawing(fails)),
+        drawing(lambda: torch.randn(()).item()),
+    ],
+)
+def test_trial_blames_nothing_that_a_run_repeats(controller):
+    assert findings(controller) == []
 
 
 def test_function_is_not_asked():
-    def function(observation):
-        raise AssertionError
-
-    assert not found(function)
+    calls = []
+    assert findings(calls.append) == []
+    assert not calls
 
 
 def test_global_random_numbers_go_on_as_without_the_trial():
@@ -139,14 +236,14 @@ def test_global_random_numbers_go_on_as_without_the_trial():
     seed()
     expected = drawn()
     seed()
-    assert not found(Global)
+    assert not findings(GLOBAL)
     assert drawn() == expected
 
 
 def test_controller_is_asked_in_few_steps():
-    Still.calls = 0
-    found(Still)
-    assert 0 < Still.calls <= 9 * (STEPS + 1)
+    calls = []
+    findings(drawing(lambda: calls.append(1) or 0.0))
+    assert 0 < len(calls) <= 9 * (STEPS + 1)
 
 
 @pytest.mark.parametrize(("of", "count"), [(Still, 0), (Unseeded, 1)])
@@ -170,5 +267,5 @@ def test_generator_that_all_objects_share_is_left_alone():
             super().__init__()
             self.generator = shared
 
-    found(Shares)
+    findings(Shares)
     assert shared.bit_generator.state == before

@@ -196,6 +196,14 @@ for program in programs:
 """
 
 
+def started(program: str, count: int = 1, **options) -> subprocess.Popen:
+    """Start a program that finds this file."""
+    paths = os.pathsep.join(path for path in sys.path if path)
+    words = [sys.executable, "-c", program.format(tests=os.path.dirname(__file__), count=count)]
+    options |= {"stdout": subprocess.PIPE, "text": True}
+    return subprocess.Popen(words, env=os.environ | {"PYTHONPATH": paths}, **options)
+
+
 class Simulator(Plant):
     """The plant with something that it must release, here a file that it removes."""
 
@@ -223,13 +231,7 @@ def test_envs_are_closed_in_their_processes(workers, fails, tmp_path) -> None:
 def test_no_process_outlives_its_program(tmp_path) -> None:
     errors = tmp_path / "errors"
     kinds = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
-    paths = os.pathsep.join(path for path in sys.path if path)
-    parent = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM.format(tests=os.path.dirname(__file__), count=len(kinds))],
-        stdout=subprocess.PIPE,
-        stderr=errors.open("w"),
-        env=os.environ | {"PYTHONPATH": paths},
-    )
+    parent = started(PROGRAM, count=len(kinds), stderr=errors.open("w"))
     for kind in kinds:
         program, *workers = map(int, parent.stdout.readline().split())
         assert len(workers) == 2
@@ -289,14 +291,6 @@ env.reset()
 
 @pytest.mark.slow
 def test_program_ends_while_an_env_is_open() -> None:
-    program = OPEN_AT_THE_END.format(tests=os.path.dirname(__file__))
-    paths = os.pathsep.join(path for path in sys.path if path)
-    ended = subprocess.run(
-        [sys.executable, "-c", program],
-        env=os.environ | {"PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    )
-    assert ended.stdout == "ended\n"
+    ended = started(OPEN_AT_THE_END, stderr=subprocess.PIPE)
+    out, error = ended.communicate(timeout=60)
+    assert (out, ended.returncode) == ("ended\n", 0), error

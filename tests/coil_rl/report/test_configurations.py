@@ -49,33 +49,30 @@ def labels(runs):
         ({"learner": {"normalise": False}}, {"learner": {"normalise": True}}, "learner.normalise"),
         ({"disturb": {"lag": 0}}, {"disturb": {"lag": 1}}, "disturb.lag"),
         ({"init": None}, {"init": "policy.pt"}, "init"),
+        ({"budget": {"frames": 10}}, {"budget": {"frames": 20}}, "budget.frames"),
+        ({}, {}, None),
+        ({"learner": {"seed": 0}}, {"learner": {"seed": 1}}, None),
+        ({"learner": {"random_state": 0}}, {"learner": {"random_state": 1}}, None),
+        ({"run_dir": "a", "existing": "refuse"}, {"run_dir": "b", "existing": "resume"}, None),
+        ({"device": "cpu", "threads": 1}, {"device": "cuda", "threads": 4}, None),
+        ({"logger": {"a": 1}}, {"logger": None}, None),
+        ({"guide": {"run": "x/coil_seed0"}}, {"guide": {"run": "x/coil_seed1"}}, None),
+        ({"proxy": {"folder": "a"}}, {"proxy": {"folder": "b"}}, None),
     ],
 )
-def test_runs_that_differ_are_divided_and_the_key_is_named(runs, one, two, names):
+def test_runs_that_differ_in_more_than_their_seed_are_divided_and_the_key_is_named(
+    runs, one, two, names
+):
     read = runs(one, two)
     divided, rows = distinguish(read)
+    if names is None:
+        assert [run.label for run in divided] == ["coil", "coil"]
+        return
     assert [run.label for run in divided] == ["coil 1", "coil 2"]
     assert [row["name"] for row in rows] == ["coil 1", "coil 2"]
     assert all(names in row["differs"] for row in rows)
     for run in divided:
         assert set(run.evaluation["driver"]) == {run.label}
-
-
-@pytest.mark.parametrize(
-    ("one", "two"),
-    [
-        ({}, {}),
-        ({"learner": {"seed": 0}}, {"learner": {"seed": 1}}),
-        ({"learner": {"random_state": 0}}, {"learner": {"random_state": 1}}),
-        ({"run_dir": "a", "existing": "refuse"}, {"run_dir": "b", "existing": "resume"}),
-        ({"device": "cpu", "threads": 1}, {"device": "cuda", "threads": 4}),
-        ({"logger": {"a": 1}}, {"logger": None}),
-        ({"guide": {"run": "x/coil_seed0"}}, {"guide": {"run": "x/coil_seed1"}}),
-        ({"proxy": {"folder": "a"}}, {"proxy": {"folder": "b"}}),
-    ],
-)
-def test_runs_that_differ_in_their_seed_only_are_pooled(runs, one, two):
-    assert labels(runs(one, two)) == ["coil", "coil"]
 
 
 def test_what_differs_tells_the_runs_apart(runs):

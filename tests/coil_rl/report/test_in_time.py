@@ -1,8 +1,8 @@
-import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from plants import Plant
 from torchrl.envs import Compose, TransformedEnv
 
 from coil_rl import GuideActions, GymnasiumEnv, NormalisedAction
@@ -10,31 +10,9 @@ from coil_rl.report import InTime
 from coil_rl.transforms import DiscreteActions
 
 
-class Odd(gymnasium.Env):
-    """Notes the actions that it is given.
-
-    Args:
-        actions: its action space.
-        observed: its observation space; it shows the first sample of it.
-    """
-
-    def __init__(self, actions, observed=None):
-        self.action_space, self.observation_space = actions, observed or spaces.Box(-9, 9, (2,))
-        self.given = []
-
-    def reset(self, *, seed=None, options=None):
-        self.observation_space.seed(0)
-        self.shown = self.observation_space.sample()
-        return self.shown, {}
-
-    def step(self, action):
-        self.given.append(np.asarray(action, np.float64).reshape(-1).tolist())
-        return self.shown, 0.0, False, False, {}
-
-
-def drive(odd, actions, *transforms):
+def drive(plant, actions, *transforms):
     """Return the trace of a policy that takes these actions."""
-    env = TransformedEnv(GymnasiumEnv(lambda: odd, max_steps=9), Compose(*transforms))
+    env = TransformedEnv(GymnasiumEnv(lambda: plant, max_steps=9), Compose(*transforms))
     picture, data = InTime(), env.reset()
     for action in actions:
         before = data.set("action", torch.tensor([action]))
@@ -48,10 +26,10 @@ def up(observation):
 
 
 def test_numbers_among_which_an_agent_chooses_are_drawn_as_the_env_is_given_them():
-    odd = Odd(spaces.Box(100, 200, (1,)))
+    plant = Plant(actions=spaces.Box(100, 200, (1,)))
     transforms = NormalisedAction(), GuideActions({"up": up}), DiscreteActions(5)
-    trace = drive(odd, [0, 1, 4], *transforms)
-    assert trace["action"] == odd.given == [[100], [125], [200]]
+    trace = drive(plant, [0, 1, 4], *transforms)
+    assert trace["action"] == np.array(plant.given).tolist() == [[100], [125], [200]]
     assert trace["guide_action"] == [[150]] * 3
 
 
@@ -64,19 +42,18 @@ def test_numbers_among_which_an_agent_chooses_are_drawn_as_the_env_is_given_them
     ],
 )
 def test_actions_are_drawn_in_the_units_and_the_numbering_of_the_env(space, actions):
-    odd = Odd(space)
+    plant = Plant(actions=space)
     transforms = [NormalisedAction()] if isinstance(space, spaces.Box) else []
-    assert drive(odd, actions, *transforms)["action"] == odd.given
+    drawn = drive(plant, actions, *transforms)["action"]
+    assert drawn == np.reshape(plant.given, (2, -1)).tolist()
 
 
 def test_all_entries_but_pictures_are_drawn_of_an_env_without_one_observation():
     pair = spaces.Tuple([spaces.Box(-1, 1, (2,)), spaces.Discrete(9, start=7)])
     pixels = spaces.Box(0, 255, (4, 4, 3), np.uint8)
-    odd = Odd(spaces.Discrete(2), pair)
-    trace = drive(odd, [0])
-    assert trace["observation.0"] == [odd.shown[0].tolist()]
-    assert trace["observation.1"] == [[float(odd.shown[1])]]
-    named = Odd(
-        spaces.Discrete(2), spaces.Dict({"camera": pixels, "speed": spaces.Box(-1, 1, (1,))})
-    )
-    assert drive(named, [0]).keys() == {"speed", "action"}
+    plant = Plant(pair)
+    trace = drive(plant, [[0.0]])
+    assert trace["observation.0"] == [plant.shown[0][0].tolist()]
+    assert trace["observation.1"] == [[float(plant.shown[0][1])]]
+    named = Plant(spaces.Dict({"camera": pixels, "speed": spaces.Box(-1, 1, (1,))}))
+    assert drive(named, [[0.0]]).keys() == {"speed", "action"}
