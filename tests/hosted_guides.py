@@ -7,9 +7,11 @@ from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.transforms import GuideActions
 
 
-def cones(guide, cars=6, seed=0):
+def cones(guides, *transforms, cars=6, seed=0):
+    """Return cars with the advice of one guide, or of several by their names."""
     env = ConeTrackEnv(shipped_tracks("test"), cars, rate=6, seed=seed)
-    return TransformedEnv(env, Compose(GuideActions({"theirs": guide}))).train()
+    guides = guides if isinstance(guides, dict) else {"theirs": guides}
+    return TransformedEnv(env, Compose(GuideActions(guides), *transforms)).train()
 
 
 def driven(env, steps=80):

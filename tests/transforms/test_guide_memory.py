@@ -5,11 +5,11 @@ import itertools
 import pytest
 import torch
 import worlds
+from hosted_guides import cones
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.data import Unbounded
 from torchrl.envs import (
-    Compose,
     ParallelEnv,
     PendulumEnv,
     SerialEnv,
@@ -18,7 +18,6 @@ from torchrl.envs import (
 )
 from torchrl.modules import GRUModule, LSTMModule
 
-from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import SplineGuide
 from coil_rl.run.rollout import Rollout
 from coil_rl.testing import check_env
@@ -66,11 +65,6 @@ def recurrent(kind):
     return TensorDictSequential(
         core, TensorDictModule(head, in_keys=["features"], out_keys=["action"])
     )
-
-
-def cones(guides, *transforms, cars=6, seed=0):
-    env = ConeTrackEnv(shipped_tracks("test"), cars, rate=6, seed=seed)
-    return TransformedEnv(env, Compose(GuideActions(guides), *transforms)).train()
 
 
 def episodes(rollout):
