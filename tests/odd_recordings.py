@@ -164,34 +164,19 @@ def stamps(new):
     return change
 
 
-def burst(messages, period=400_000_000):
-    """Log messages late, all of a period in ns at once."""
-    messages[:] = [(-(-time // period) * period, fields) for time, fields in messages]
+def logged(new, kinds=("scans", "commands", "odometry")):
+    """Return a change of log times, a function of the numbers and the times of the messages."""
+
+    def change(drive):
+        for messages in (getattr(drive, kind) for kind in kinds):
+            messages[:] = [(new(n, time), fields) for n, (time, fields) in enumerate(messages)]
+
+    return change
 
 
-def bursts(drive):
-    for messages in (drive.scans, drive.commands, drive.odometry):
-        burst(messages)
-
-
-def bursts_of_scans(drive):
-    burst(drive.scans)
-
-
-def bursts_of_stamped_commands(drive):
-    stamped_commands(drive)
-    bursts(drive)
-
-
-def long_bursts_in_order(drive):
-    for messages in (drive.scans, drive.commands, drive.odometry):
-        burst(messages, 10**9)
-        messages[:] = [(time + n * 1000, fields) for n, (time, fields) in enumerate(messages)]
-
-
-def one_log_time(drive):
-    for messages in (drive.scans, drive.commands, drive.odometry):
-        messages[:] = [(10**9, fields) for _, fields in messages]
+def bursts(period=400_000_000, apart=0):
+    """Return log times that are late, all of a period in ns at once or some ns apart."""
+    return lambda number, time: -(-time // period) * period + apart * number
 
 
 # Commands
@@ -208,10 +193,7 @@ def commands(part, axis, factor):
 
 
 def later_commands(nanoseconds):
-    def change(drive):
-        drive.commands = [(time + nanoseconds, fields) for time, fields in drive.commands]
-
-    return change
+    return logged(lambda number, time: time + nanoseconds, ["commands"])
 
 
 def commands_end_early(drive):
@@ -242,37 +224,30 @@ def stamped_commands(drive):
     drive.commands = [(time, stamped(time, fields)) for time, fields in drive.commands]
 
 
+def late_and_stamped(drive):
+    stamped_commands(drive)
+    logged(bursts())(drive)
+
+
 def stamped_commands_by_turns(drive):
     every_other = [(time, stamped(time, fields)) for time, fields in drive.commands[1::2]]
     drive.more = [("/cmd_vel", TWIST_STAMPED, *each) for each in every_other]
     del drive.commands[1::2]
 
 
-def ackermann(drive):
-    drive.command_type = ACKERMANN
-    for _, fields in drive.commands:
-        sine = np.clip(fields["angular"]["z"] * (2 / 7) / 0.15, -1, 1)
-        fields.clear()
-        fields.update(speed=0.15, steering_angle=float(np.arcsin(sine)))
+def ackermann(topic="/cmd_vel", unit=1.0, stamped=False):
+    """Return a change of all commands to steering angles in a unit in radians."""
 
+    def change(drive):
+        drive.command_topic = topic
+        drive.command_type = ACKERMANN_STAMPED if stamped else ACKERMANN
+        for number, (time, fields) in enumerate(drive.commands):
+            sine = np.clip(fields["angular"]["z"] * (2 / 7) / 0.15, -1, 1)
+            angle = {"speed": 0.15, "steering_angle": float(np.arcsin(sine)) / unit}
+            command = {"header": header(time, "base"), "drive": angle} if stamped else angle
+            drive.commands[number] = time, command
 
-def ackermann_in_degrees(drive):
-    ackermann(drive)
-    for _, fields in drive.commands:
-        fields["steering_angle"] *= 180 / np.pi
-
-
-def ackermann_on_another_topic(drive):
-    ackermann(drive)
-    drive.command_topic = "/drive"
-
-
-def stamped_ackermann_on_another_topic(drive):
-    ackermann(drive)
-    drive.command_topic, drive.command_type = "/drive", ACKERMANN_STAMPED
-    drive.commands = [
-        (time, {"header": header(time, "base"), "drive": fields}) for time, fields in drive.commands
-    ]
+    return change
 
 
 def two_topics_of_commands(drive):
@@ -323,7 +298,7 @@ OF_A_READING = [
     (stamps(lambda number, stamp: stamp * 1000), "0.0055 times a second by their stamps"),
     (stamps(lambda number, stamp: number + 1), "times a second by their stamps"),
     (stamps(lambda number, stamp: stamp * 3), "run 3 times as fast"),
-    (one_log_time, "log times that are all the same"),
+    (logged(lambda number, time: 10**9), "log times that are all the same"),
     (later_commands(-(10**10)), "no command of the last 0.55 s at 44 of 44 scans (44 on /cmd_vel)"),
     (commands_without_numbers, "5 of 44 commands"),
     (commands_of_zeros, "only zeros"),
@@ -336,10 +311,10 @@ OF_A_READING = [
 ]
 # Those that are logged late, so that commands must be spread over the scans.
 IN_BURSTS = [
-    (bursts, "logged up to 0.36 s late, so their stamps are the clock"),
-    (bursts_of_scans, "logged up to 0.36 s late, so their stamps are the clock"),
-    (bursts_of_stamped_commands, "logged up to 0.36 s late, so their stamps are the clock"),
-    (long_bursts_in_order, "logged up to 0.91 s late, so their stamps are the clock"),
+    (logged(bursts()), "logged up to 0.36 s late, so their stamps are the clock"),
+    (logged(bursts(), ["scans"]), "logged up to 0.36 s late, so their stamps are the clock"),
+    (late_and_stamped, "logged up to 0.36 s late, so their stamps are the clock"),
+    (logged(bursts(10**9, apart=1000)), "logged up to 0.91 s late, so their stamps are the clock"),
 ]
 # What is said of a replay: of its view, and of commands that contradict the odometry.
 OF_A_REPLAY = [
@@ -347,7 +322,7 @@ OF_A_REPLAY = [
     (mirrored_by_turns, "the scans are mirrored"),
     (scans(ranges=backwards), "180 for a laser that points backwards"),
     (commands("angular", "z", 180 / np.pi), "beyond what the robot can steer"),
-    (ackermann_in_degrees, "beyond what the robot can steer"),
+    (ackermann(unit=np.pi / 180), "beyond what the robot can steer"),
     (commands("linear", "x", 100), "drives 0.01 times as fast as it is told (0.15 for 15 m/s)"),
     (commands("linear", "x", 0.25), "drives 4 times as fast as it is told"),
     (commands("linear", "x", -1), "drives -1 times as fast as it is told (-0.15 for 0.15 m/s)"),

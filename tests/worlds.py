@@ -2,6 +2,7 @@
 
 import copy
 import io
+import math
 from functools import cache
 
 import torch
@@ -62,6 +63,16 @@ def carts(*transforms, categorical=True) -> TransformedEnv:
 
     guide = TensorDictModule(lean, in_keys=["observation"], out_keys=["action"])
     return TransformedEnv(SerialEnv(2, make), Compose(GuideActions({"lean": guide}), *transforms))
+
+
+def road(left, right, steering=0.0, slots=16):
+    """Return the arguments of `steer` of a guide of cones, for one car."""
+    cones = torch.zeros(1, 2, slots, 2, dtype=torch.float64)
+    for side, points in enumerate((left, right)):
+        for slot, point in enumerate(sorted(points, key=lambda p: math.hypot(*p))):
+            cones[0, side, slot] = torch.tensor(point, dtype=torch.float64)
+    count = torch.tensor([[len(left), len(right)]])
+    return cones, count, torch.full((1, 1), steering, dtype=torch.float64)
 
 
 def perturbed(policy, seed):

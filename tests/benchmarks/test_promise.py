@@ -85,18 +85,19 @@ def test_reward_that_is_nan_is_no_part_of_a_mean(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("cases", "settings", "seed", "message"),
+    ("label", "cases", "settings", "seed", "message"),
     [
-        ("ab", {}, 0, "are both coil_intact with seed 0; remove one of them"),
-        ("cd", {}, 2, "has other cases than .*; train the runs of a task with the same cases"),
-        ("ab", {"budget": {"frames": 9}}, 2, "differ in budget.frames; keep those of one"),
+        ("coil_intact", "ab", {}, 0, "are both coil_intact with seed 0; remove one of them"),
+        ("coil_intact", "cd", {}, 2, "has other cases than .*; train the runs of a task with the"),
+        ("coil_intact", "ab", {"budget": {"frames": 9}}, 2, "differ in budget.frames; keep those"),
+        ("sac_intact", "ab", {}, 2, "sac_intact has no seed of ppo_alone; train both"),
     ],
-    ids=["seed twice", "cases", "configuration"],
+    ids=["seed twice", "cases", "configuration", "no common seed"],
 )
-def test_runs_that_cannot_be_compared_are_refused(cases, settings, seed, message, tmp_path):
+def test_runs_that_cannot_be_compared_are_refused(label, cases, settings, seed, message, tmp_path):
     small(tmp_path, {"ppo_alone": 10.0, "coil_intact": 5.0}, seeds=2)
-    rows = [row for who in ("guide", "coil_intact") for row in driven(who, dict.fromkeys(cases, 9))]
-    make_run(tmp_path / "further", "coil_intact", seed, rows, settings=settings)
+    rows = [row for who in ("guide", label) for row in driven(who, dict.fromkeys(cases, 9))]
+    make_run(tmp_path / "further", label, seed, rows, settings=settings)
     with pytest.raises(UserError, match=message):
         rows_of(read_runs([tmp_path]))
 
@@ -111,27 +112,17 @@ def test_all_columns_are_of_the_seeds_that_ppo_has_too(tmp_path):
     assert (row["seeds"], row["guide"], row["alone"], row["end"]) == (2, 100.25, 15.0, 5.25)
 
 
-def test_arm_and_ppo_without_a_common_seed_are_refused(tmp_path):
-    small(tmp_path, {"ppo_alone": 10.0})
-    make_run(tmp_path / "1", "coil_intact", 1, driven("coil_intact", {"a": 1.0, "b": 1.0}))
-    with pytest.raises(UserError, match="coil_intact has no seed of ppo_alone; train both"):
-        rows_of(read_runs([tmp_path]))
-
-
-def test_of_several_guides_the_best_one_is_compared(tmp_path):
-    small(tmp_path, {"ppo_alone": 10.0})
-    rows = driven("guide x", {"a": 500.0, "b": 500.0}) + driven("guide y", {"a": 5.0, "b": 5.0})
-    rows += driven("coil_intact", {"a": 90.0, "b": 90.0})
-    make_run(tmp_path / "two", "coil_intact", 0, rows)
-    (row,) = rows_of(read_runs([tmp_path]))
-    assert row["guide"] == 500
-
-
-def test_of_several_learners_alone_the_best_one_is_compared(tmp_path):
+def test_of_several_guides_and_learners_alone_the_best_ones_are_compared(tmp_path):
     arms = {"ppo_alone": 10.0, "sac_alone": 400.0, "coil_intact": 90.0, "coil_random": 5.0}
-    rows = rows_of(read_runs([small(tmp_path, arms, seeds=2)]))
+    rows = rows_of(read_runs([small(tmp_path / "learners", arms, seeds=2)]))
     assert [(row["learner"], row["alone"], row["guide"]) for row in rows] == [("sac", 210, 100)] * 2
     assert rows[0]["difference"] == pytest.approx(100 * (55 - 210) / (210 - 100))
+    small(tmp_path / "guides", {"ppo_alone": 10.0})
+    rows = driven("guide x", {"a": 500.0, "b": 500.0}) + driven("guide y", {"a": 5.0, "b": 5.0})
+    rows += driven("coil_intact", {"a": 90.0, "b": 90.0})
+    make_run(tmp_path / "guides" / "two", "coil_intact", 0, rows)
+    (row,) = rows_of(read_runs([tmp_path / "guides"]))
+    assert row["guide"] == 500
 
 
 @pytest.mark.parametrize(

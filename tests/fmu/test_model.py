@@ -221,7 +221,6 @@ def test_an_fmu_of_which_a_process_holds_one_has_copies() -> None:
         {'OnlyOncePerProcess="false"': 'OnlyOncePerProcess="true"'},
     )
     env = fmu_env(once, num_envs=2, **SETTINGS)
-    folders = {plant.env.unwrapped.instance.folder for plant in env.held.plants}
     env.rollout(3)
     folders = {plant.env.unwrapped.instance.folder for plant in env.held.plants}
     assert len(folders) == 2

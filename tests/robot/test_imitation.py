@@ -1,6 +1,5 @@
 """Imitation of recorded drives by one command, tested in a closed loop."""
 
-import csv
 import math
 import shutil
 
@@ -8,7 +7,7 @@ import odd_recordings as odd
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from programs import called
+from programs import called, read_csv
 from torchrl.envs import TransformedEnv
 
 import coil_rl
@@ -52,11 +51,6 @@ def trained(folder, *arguments, code=0):
     return called("train", *words, cwd=folder, code=code)
 
 
-def table(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.mark.slow
 def test_recorded_steering_is_learned_and_the_imitation_drives(folder):
     done = trained(folder, "recording=[a.mcap,b.mcap,c.mcap]", "hydra.run.dir=three")
@@ -64,9 +58,9 @@ def test_recorded_steering_is_learned_and_the_imitation_drives(folder):
     assert "c.mcap: 12 of 33 scans are learned; left out: 18 without" in done.stdout
     assert "3 of a robot that stands" in done.stdout
     assert "3 recordings: 78 of 99 scans are learned." in done.stdout
-    last = table(folder / "three" / "metrics.csv")[-1]
+    last = read_csv(folder / "three" / "metrics.csv")[-1]
     assert (float(last["learner/samples"]), float(last["learner/left_out"])) == (78.0, 21.0)
-    assert {row["driver"] for row in table(folder / "three" / "evaluation.csv")} == {"oil"}
+    assert {row["driver"] for row in read_csv(folder / "three" / "evaluation.csv")} == {"oil"}
     assert "laps" in (folder / "three" / "evaluation.md").read_text()
 
     samples = checkpoint.load(folder / "three" / "dataset.pt")
@@ -101,7 +95,7 @@ def test_data_set_is_the_first_round_of_dagger(folder):
     arguments += ["budget.num_envs=2", "budget.steps=5", "budget.frames=20", "logger=none"]
     arguments += ["learner.dataset=two/dataset.pt", "hydra.run.dir=dagger"]
     called("train", *arguments, cwd=folder)
-    rows = table(folder / "dagger" / "metrics.csv")
+    rows = read_csv(folder / "dagger" / "metrics.csv")
     assert [float(row["learner/samples"]) for row in rows[1:]] == [76.0, 86.0]
 
 
@@ -109,7 +103,7 @@ def test_data_set_is_the_first_round_of_dagger(folder):
 def test_run_is_evaluated_and_replayed_like_any_other(folder):
     trained(folder, "recording=[a.mcap,b.mcap]", "hydra.run.dir=again")
     called("evaluate", "run=again", "hydra.run.dir=evaluated", cwd=folder)
-    assert table(folder / "evaluated" / "evaluation.csv")[0]["driver"] == "oil"
+    assert read_csv(folder / "evaluated" / "evaluation.csv")[0]["driver"] == "oil"
     arguments = ["recording=a.mcap", "runs=[again]", "hydra.run.dir=replayed"]
     assert "| oil " in called("replay", *arguments, cwd=folder).stdout
 
@@ -183,6 +177,6 @@ def test_imitation_of_three_drives_completes_its_laps(tmp_path):
     record_drives(env, SplineGuide(), files)
     arguments = ["method=oil", "env=mcap_replay", "recording=[a.mcap,b.mcap,c.mcap]"]
     called("train", *arguments, "logger=none", "hydra.run.dir=run", cwd=tmp_path)
-    drives = table(tmp_path / "run" / "episodes.csv")
+    drives = read_csv(tmp_path / "run" / "episodes.csv")
     assert len(drives) == 6
     assert sum(float(row["laps"]) for row in drives) >= 10

@@ -72,32 +72,25 @@ class Node:
 @pytest.fixture
 def ros(monkeypatch):
     """Return the module of the node, with a stub of ROS 2."""
-    for name, classes in MESSAGES.items():
-        package, module = ModuleType(name.partition(".")[0]), ModuleType(name)
-        for each in classes:
-            setattr(module, each, type(each, (), {"__new__": lambda cls, **kw: message(**kw)}))
-        monkeypatch.setitem(sys.modules, package.__name__, package)
-        monkeypatch.setitem(sys.modules, name, module)
-    rclpy = ModuleType("rclpy")
-    rclpy.try_shutdown = lambda: None
-    parts = {
-        "clock": {
-            "Clock": SimpleNamespace,
-            "ClockType": SimpleNamespace(STEADY_TIME="steady"),
-        },
-        "node": {"Node": Node},
-        "qos": {
-            "DurabilityPolicy": SimpleNamespace(TRANSIENT_LOCAL="latched"),
-            "QoSProfile": SimpleNamespace,
-            "ReliabilityPolicy": SimpleNamespace(BEST_EFFORT="best effort", RELIABLE="reliable"),
-        },
-        "signals": {"SignalHandlerOptions": SimpleNamespace(NO="none")},
-    }
-    monkeypatch.setitem(sys.modules, "rclpy", rclpy)
-    for name, values in parts.items():
-        module = ModuleType(f"rclpy.{name}")
+
+    def stub(name, **values):
+        module = ModuleType(name)
         vars(module).update(values)
-        monkeypatch.setitem(sys.modules, module.__name__, module)
+        monkeypatch.setitem(sys.modules, name, module)
+
+    for name, classes in MESSAGES.items():
+        stub(name.partition(".")[0])
+        kinds = {"__new__": lambda cls, **values: message(**values)}
+        stub(name, **{each: type(each, (), kinds) for each in classes})
+    stub("rclpy", try_shutdown=lambda: None)
+    steady = SimpleNamespace(STEADY_TIME="steady")
+    stub("rclpy.clock", Clock=SimpleNamespace, ClockType=steady)
+    stub("rclpy.node", Node=Node)
+    latched = SimpleNamespace(TRANSIENT_LOCAL="latched")
+    reliable = SimpleNamespace(BEST_EFFORT="best effort", RELIABLE="reliable")
+    quality = {"DurabilityPolicy": latched, "ReliabilityPolicy": reliable}
+    stub("rclpy.qos", QoSProfile=SimpleNamespace, **quality)
+    stub("rclpy.signals", SignalHandlerOptions=SimpleNamespace(NO="none"))
     monkeypatch.delitem(sys.modules, "coil_robot.ros_node", raising=False)
     yield importlib.import_module("coil_robot.ros_node")
     sys.modules.pop("coil_robot.ros_node")

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from worlds import driving_measures
+from worlds import driving_measures, road
 
 from coil_rl.envs import ConeTrackEnv, random_tracks, shipped_tracks
 from coil_rl.guides import RacingLineGuide, SplineGuide
@@ -28,12 +28,8 @@ def steps():
 
 
 def advice(left, right, steering=0.0, **kwargs):
-    cones = torch.zeros(1, 2, 16, 2, dtype=torch.float64)
-    for side, points in enumerate((left, right)):
-        for slot, point in enumerate(sorted(points, key=lambda p: math.hypot(*p))):
-            cones[0, side, slot] = torch.tensor(point)
-    count, current = torch.tensor([[len(left), len(right)]]), torch.full((1, 1), steering)
-    return RacingLineGuide(spacing=1.0, **kwargs).steer(cones, count, current.double()).item()
+    guide = RacingLineGuide(spacing=1.0, **kwargs)
+    return guide.steer(*road(left, right, steering)).item()
 
 
 def arc(x, y, turn=1.4):

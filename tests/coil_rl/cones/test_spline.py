@@ -7,6 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from oracle import guide_action
+from worlds import road
 
 from coil_rl.guides import RacingLineGuide, SplineGuide, SplineMemoryGuide
 
@@ -19,18 +20,8 @@ every_guide = pytest.mark.parametrize(
 )
 
 
-def inputs(left, right, steering=0.0):
-    """Arguments of `SplineGuide.steer` for one car."""
-    cones = torch.zeros(1, 2, SLOTS, 2, dtype=torch.float64)
-    for side, points in enumerate((left, right)):
-        for slot, point in enumerate(sorted(points, key=lambda p: math.hypot(*p))):
-            cones[0, side, slot] = torch.tensor(point, dtype=torch.float64)
-    count = torch.tensor([[len(left), len(right)]])
-    return cones, count, torch.full((1, 1), steering, dtype=torch.float64)
-
-
 def advice(left, right, steering=0.0, **kwargs):
-    return SplineGuide(**kwargs).steer(*inputs(left, right, steering)).item()
+    return SplineGuide(**kwargs).steer(*road(left, right, steering)).item()
 
 
 def roads(seed, cars, dtype=torch.float64):
@@ -127,7 +118,7 @@ points = st.lists(st.tuples(coordinates, coordinates), max_size=SLOTS)
 def test_advice_is_an_action_for_any_cones(guide, left, right, duplicated, steering):
     if duplicated:
         left, right = (left + left)[:SLOTS], (right + left)[:SLOTS]
-    cones, count, current = inputs(left, right, steering)
+    cones, count, current = road(left, right, steering)
     for dtype in (torch.float32, torch.float64):
         action = guide.steer(cones.to(dtype), count, current.to(dtype))
         assert (action.shape, action.dtype) == ((1, 1), dtype)

@@ -5,23 +5,14 @@ import pytest
 import torch
 from oracle import OneCar, RememberingGuide
 from torchrl.envs import TransformedEnv
+from worlds import AUTHORS
 
 from coil_rl.envs import ConeTrackEnv, random_tracks
 from coil_rl.guides import FollowAdvice, SplineMemoryGuide
 from coil_rl.testing import check_guide
 from coil_rl.transforms import GuideActions
 
-SIGHT = 7.03125
-AUTHORS = {
-    "rate": 60.0,
-    "spline": "quadratic",
-    "cone_bonus": "every_sighting",
-    "held_steps": 2,
-    "sight": SIGHT,
-    "hold_boundary": True,
-    "finish_in_sight": True,
-}
-ODD = {"oddities": True, "sight": SIGHT, "gain": 80 / 120}
+ODD = {"oddities": True, "sight": AUTHORS["sight"], "gain": 80 / 120}
 both_guides = pytest.mark.parametrize(
     ("world", "options"), [({}, {}), (AUTHORS, ODD)], ids=["default", "authors"]
 )

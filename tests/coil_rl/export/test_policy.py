@@ -8,9 +8,8 @@ import torch
 from exported_sums import model, write
 from torchrl.data import Bounded, Categorical, Unbounded
 
-import coil_rl
 from coil_rl.errors import UserError
-from coil_rl.export.contract import CONTRACT, ONNX, VERSION, checksum
+from coil_rl.export.contract import CONTRACT, ONNX, VERSION
 from coil_rl.export.guide import ExportedGuide
 from coil_rl.export.policy import ExportedPolicy
 from coil_rl.transforms.action_space import ActionSpace
@@ -24,41 +23,42 @@ def test_state_goes_from_step_to_step_until_a_reset(tmp_path):
     assert policy.act([0.0, 0.0], 0.0) == 17.0
     policy.load_state_dict(saved)
     assert policy.act([1.0, 0.0], 0.0) == 18.0
+    with pytest.raises(ValueError, match="the state has other, but this policy remembers state"):
+        policy.load_state_dict({"other": [[1.0]]})
     policy.reset()
     action = policy.act([0.0, 0.0], 0.0)
     assert (action.dtype, action.shape, action[0]) == (np.float64, (1,), 1.0)
 
 
+def inside(contract):
+    contract["guide"] = {"place": "inside", "names": ["sum"]}
+
+
+def named(contract):
+    contract["inputs"][0]["from"] = {"path": ["observation"], "choices": [], "start": []}
+
+
+def whole(contract):
+    contract["inputs"][0]["from"] = {"path": [], "choices": [], "start": []}
+
+
 @pytest.mark.parametrize(
-    ("observation", "advice", "message"),
+    ("change", "observation", "advice", "message"),
     [
-        ([1.0, 2.0, 3.0], 0.0, r"observation has the shape \[3\], but must have \[2\]"),
-        ([1.0, np.nan], 0.0, "observation holds a number that is not finite"),
-        (["a", "b"], 0.0, "observation holds <U1, but must hold numbers"),
-        ({"other": [1.0, 2.0]}, 0.0, "the observation lacks observation"),
-        ({"guide_action": [1.0]}, 0.0, "the observation lacks observation"),
-        ([1.0, 2.0], None, "the guide of this policy is outside"),
-        ([1.0, 2.0], [1.0, 2.0], r"guide_action has the shape \[2\], but must have \[1\]"),
+        (whole, [1.0, 2.0, 3.0], 0.0, r"observation has the shape \[3\], but must have \[2\]"),
+        (whole, [1.0, np.nan], 0.0, "observation holds a number that is not finite"),
+        (whole, ["a", "b"], 0.0, "observation holds <U1, but must hold numbers"),
+        (named, {"other": [1.0, 2.0]}, 0.0, "the observation lacks observation"),
+        (whole, {"guide_action": [1.0]}, 0.0, "the observation lacks observation"),
+        (whole, [1.0, 2.0], None, "the guide of this policy is outside"),
+        (whole, [1.0, 2.0], [1.0, 2.0], r"guide_action has the shape \[2\], but must have \[1\]"),
+        (inside, [1.0, 2.0], [1.0], "takes no guide_action: its guide is inside; leave"),
     ],
 )
-def test_observation_that_does_not_fit_is_refused(observation, advice, message, tmp_path):
-    def names_both(contract):
-        contract["inputs"][0]["from"] = {"path": [], "choices": [], "start": []}
-        if isinstance(observation, dict) and "other" in observation:
-            contract["inputs"][0]["from"]["path"] = ["observation"]
-
-    policy = ExportedPolicy(write(tmp_path, names_both))
+def test_what_does_not_fit_is_refused(change, observation, advice, message, tmp_path):
+    policy = ExportedPolicy(write(tmp_path, change))
     with pytest.raises(ValueError, match=message):
         policy.act(observation, advice)
-
-
-def test_advice_for_a_guide_inside_is_refused(tmp_path):
-    def inside(contract):
-        contract["guide"] = {"place": "inside", "names": ["sum"]}
-
-    policy = ExportedPolicy(write(tmp_path, inside))
-    with pytest.raises(ValueError, match="takes no guide_action: its guide is inside; leave"):
-        policy.act([1.0, 2.0], [1.0])
 
 
 def matrix(guides):
@@ -103,12 +103,6 @@ def test_choices_are_encoded_as_the_contract_says(tmp_path):
     assert policy.act({"gear": 6}, 0.0) == 2.0
     with pytest.raises(ValueError, match=r"observation is \[7\], which are no choices of \[2\]"):
         policy.act({"gear": 7}, 0.0)
-
-
-def test_state_of_another_policy_is_refused(tmp_path):
-    policy = ExportedPolicy(write(tmp_path))
-    with pytest.raises(ValueError, match="the state has other, but this policy remembers state"):
-        policy.load_state_dict({"other": [[1.0]]})
 
 
 MISSING = object()
@@ -156,57 +150,47 @@ def changed(place, value):
     ],
 )
 def test_file_must_be_what_its_contract_says(place, value, message, tmp_path):
-    with pytest.raises(coil_rl.UserError, match=message):
+    with pytest.raises(UserError, match=message):
         ExportedPolicy(write(tmp_path, changed(place, value)))
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (model(batch=4), r"it reads observation \[4, 2\], not any rows of \[2\]"),
-        (model(seen="x"), "it reads x, which the contract has not"),
-    ],
-)
-def test_file_that_takes_something_else_is_refused(content, message, tmp_path):
-    with pytest.raises(coil_rl.UserError, match=message):
-        ExportedPolicy(write(tmp_path, content=content))
 
 
 def test_file_that_needs_more_memory_than_any_policy_is_refused(tmp_path):
     policy = ExportedPolicy(write(tmp_path, content=model(zeros=4_000_000_000)))
-    with pytest.raises(coil_rl.UserError, match=r"it fails with .*ConstantOfShape"):
+    with pytest.raises(UserError, match=r"it fails with .*ConstantOfShape"):
         policy.act([0.0, 0.0], 0.0)
 
 
-@pytest.mark.parametrize("name", [ONNX, CONTRACT])
-def test_missing_file_is_named(name, tmp_path):
-    write(tmp_path)
-    (tmp_path / name).unlink()
-    with pytest.raises(coil_rl.UserError, match=f"{name} does not exist"):
+def lost(name):
+    return lambda folder: (folder / name).unlink()
+
+
+def replaced(content):
+    """Return a change of a folder: another file, which its contract does not know."""
+    return lambda folder: (folder / ONNX).write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("content", "change", "message"),
+    [
+        (b"", lost(ONNX), f"{ONNX} does not exist"),
+        (b"", lost(CONTRACT), f"{CONTRACT} does not exist"),
+        (b"", replaced(model() + b"\0"), r"is not the file that .* is about: its SHA-256"),
+        (b"no model", None, "no file that onnxruntime can read"),
+        (model(batch=4), None, r"it reads observation \[4, 2\], not any rows of \[2\]"),
+        (model(seen="x"), None, "it reads x, which the contract has not"),
+    ],
+)
+def test_file_that_takes_something_else_is_refused(content, change, message, tmp_path):
+    write(tmp_path, content=content)
+    if change is not None:
+        change(tmp_path)
+    with pytest.raises(UserError, match=message):
         ExportedPolicy(tmp_path / ONNX)
-
-
-def test_file_of_another_export_is_refused(tmp_path):
-    write(tmp_path)
-    (tmp_path / ONNX).write_bytes(model() + b"\0")
-    with pytest.raises(coil_rl.UserError, match=r"is not the file that .* is about: its SHA-256"):
-        ExportedPolicy(tmp_path)
-
-
-def test_file_that_is_no_onnx_is_refused(tmp_path):
-    write(tmp_path)
-    content = b"no model"
-    contract = json.loads((tmp_path / CONTRACT).read_text("utf-8"))
-    contract["files"][ONNX]["sha256"] = checksum(content)
-    (tmp_path / CONTRACT).write_text(json.dumps(contract), "utf-8")
-    (tmp_path / ONNX).write_bytes(content)
-    with pytest.raises(coil_rl.UserError, match="no file that onnxruntime can read"):
-        ExportedPolicy(tmp_path)
 
 
 def test_missing_package_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setattr("coil_rl.extras.find_spec", lambda name: None)
-    with pytest.raises(coil_rl.UserError, match=r"onnxruntime: .*pip install 'coil-rl\[export\]'"):
+    with pytest.raises(UserError, match=r"onnxruntime: .*pip install 'coil-rl\[export\]'"):
         ExportedPolicy(write(tmp_path))
 
 

@@ -23,6 +23,7 @@ from coil_rl.run.delivery import GUIDE
 
 METHODS = shipped("method")
 OBSERVATIONS = 30
+MEMORY = {f"guide_state.controller.{name}" for name in ("integral", "wish")}  # of BatchedPI
 
 
 @pytest.fixture(autouse=True)
@@ -63,8 +64,7 @@ def test_torch_guide_with_memory_is_inside(tmp_path):
     assert found["settings"]["controller"]["of"] == guide
     assert [entry["name"] for entry in policy.contract["inputs"]] == ["observation"]
     states = {entry["input"] for entry in policy.contract["state"]}
-    memory = {f"state.guide_state.controller.{name}" for name in ("integral", "wish")}
-    assert states == memory | {"state.last_action"}
+    assert states == {f"state.{name}" for name in MEMORY | {"last_action"}}
     same_actions(run, policy, rooms())
 
 
@@ -141,11 +141,48 @@ def test_every_method_is_exported(method, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["coil", "residual", "jump_start"])
-def test_memory_of_a_policy_goes_in_and_out(method, tmp_path):
-    words = ["network=gru", "learner.minibatches=1"]
-    run, policy = exported(tmp_path, method, *words, guide="thermostat.control:Feedforward")
-    assert "state.policy_state" in policy.state
+def test_controller_beside_its_env_is_outside(tmp_path):
+    words = ["+env.controllers.day=thermostat.control:KnowsTheDay"]
+    words += ["guide.entry.key=[controller,day]"]
+    _, policy = exported(tmp_path, "coil", *words, guide="entry")
+    found = policy.contract["guide"]
+    assert found["place"] == "outside"
+    assert re.search("draws|Python|beside", found["reason"])
+
+
+PAST = ["+transform=last_action", "method.transforms.last_action.steps=3"]
+GRU = ["network=gru", "learner.minibatches=1"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "guide", "overrides", "remembered"),
+    [
+        ("coil", "Feedforward", ["learner.squash=false"], set()),
+        ("coil", "Feedforward", ["learner=sac"], set()),
+        ("coil", "Feedforward", ["action=choices"], set()),
+        ("coil", "Feedforward", ["action=choices", "learner=dqn"], set()),
+        ("coil", "Feedforward", ["degrade=[biased]"], set()),
+        ("coil", "Feedforward", ["network=mlp"], set()),
+        *((method, "Feedforward", GRU, {"policy_state"}) for method in ("coil", "residual")),
+        ("jump_start", "Feedforward", GRU, {"policy_state"}),
+        ("ppo", None, [*PAST, "method.observes=[last_action]"], {"past.last_action"}),
+        # The memory of this guide reads the executed action.
+        (
+            "residual",
+            "BatchedPI",
+            [*PAST, "method.observes=[guide_action,last_action]"],
+            {"past.last_action", "last_action"} | MEMORY,
+        ),
+    ],
+)
+def test_other_heads_and_memories_are_exported(method, guide, overrides, remembered, tmp_path):
+    options = REPLAY if overrides[-1] in ("learner=sac", "learner=dqn") else ON_POLICY
+    guide = guide and f"thermostat.control:{guide}"
+    run, policy = exported(tmp_path, method, *overrides, options=options, guide=guide)
+    state = {entry["input"]: entry["shape"] for entry in policy.contract["state"]}
+    assert set(state) == {f"state.{name}" for name in remembered}
+    assert state.get("state.past.last_action", [3]) == [3]
     same_actions(run, policy, rooms())
     before = policy.state_dict()
     action = policy.act(rooms(1)[0])
@@ -154,68 +191,10 @@ def test_memory_of_a_policy_goes_in_and_out(method, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("guide", "place", "reason"),
-    [
-        ("proportional", "inside", ""),
-        ("KnowsTheDay", "outside", "draws|Python|beside"),
-    ],
-)
-def test_place_of_a_guide_depends_on_what_it_is(guide, place, reason, tmp_path):
-    words, parts = [], {"guide": f"thermostat.control:{guide}"}
-    if guide == "KnowsTheDay":
-        words = ["+env.controllers.day=thermostat.control:KnowsTheDay"]
-        words += ["guide.entry.key=[controller,day]"]
-        parts = {"guide": "entry"}
-    _, policy = exported(tmp_path, "coil", *words, **parts)
-    found = policy.contract["guide"]
-    assert found["place"] == place
-    assert re.search(reason, found.get("reason", ""))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("options", "overrides"),
-    [
-        (ON_POLICY, ["learner.squash=false"]),
-        (REPLAY, ["learner=sac"]),
-        (ON_POLICY, ["action=choices"]),
-        (REPLAY, ["action=choices", "learner=dqn"]),
-        (ON_POLICY, ["degrade=[biased]"]),
-        (ON_POLICY, ["network=mlp"]),
-    ],
-)
-def test_other_heads_are_exported(options, overrides, tmp_path):
-    guide = "thermostat.control:Feedforward"
-    run, policy = exported(tmp_path, "coil", *overrides, options=options, guide=guide)
-    same_actions(run, policy, rooms())
-
-
-@pytest.mark.slow
 def test_delayed_advice_is_refused(tmp_path):
     run = coil_rl.open_run(learned(tmp_path / "run", "coil", "degrade=[delayed]"))
     with pytest.raises(coil_rl.UserError, match="DelayedAdvice degrades the advice"):
         coil_rl.export_policy(run, tmp_path / "exported", observations=5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("method", "guide", "observed"),
-    [
-        ("ppo", None, "last_action"),
-        # The memory of this guide reads the executed action.
-        ("residual", "BatchedPI", "guide_action,last_action"),
-    ],
-)
-def test_last_actions_of_the_agent_go_in_and_out(method, guide, observed, tmp_path):
-    words = ["+transform=last_action", "method.transforms.last_action.steps=3"]
-    words += [f"method.observes=[{observed}]"]
-    guide = guide and f"thermostat.control:{guide}"
-    run, policy = exported(tmp_path, method, *words, guide=guide)
-    state = {entry["input"]: entry["shape"] for entry in policy.contract["state"]}
-    assert state["state.past.last_action"] == [3]
-    assert ("state.last_action" in state) == (guide is not None)
-    same_actions(run, policy, rooms())
 
 
 class OwnPast(Transform):

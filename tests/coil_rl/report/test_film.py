@@ -51,12 +51,15 @@ def frames(folder):
         return shown
 
 
-def test_film_shows_every_so_many_steps_of_the_first_episode(tmp_path):
-    filmed(Screen(), 50, every=3, width=30).draw({"agent": drive()}, tmp_path)
+@pytest.mark.parametrize(("most", "count", "drawn"), [(600, 10, 17), (4, 4, 4)])
+def test_film_shows_every_so_many_steps_of_the_first_episode(most, count, drawn, tmp_path):
+    screen = Screen()
+    filmed(screen, 50, every=3, width=30, frames=most).draw({"agent": drive()}, tmp_path)
     shown = frames(tmp_path)
     # The episode of the first case has 30 steps.
-    assert len(shown) == 10
+    assert len(shown) == count
     assert shown[0].shape == (20 + CAPTION, 30, 3)
+    assert screen.drawn == drawn, "the env is not drawn more often"
 
 
 @pytest.mark.parametrize(("rate", "every"), [(50.0, 4), (30.0, 2), (1.0, 1), (float("nan"), 2)])
@@ -91,13 +94,6 @@ def test_episode_that_has_ended_keeps_its_last_frame_faint(tmp_path):
     assert len(shown) == 20
     before, after = shown[4][CAPTION + 20, 30], shown[-1][CAPTION + 20, 30]
     assert after.sum() > before.sum() + 100
-
-
-def test_film_has_a_largest_number_of_frames(tmp_path):
-    screen = Screen()
-    filmed(screen, 50, every=1, frames=4).draw({"agent": drive()}, tmp_path)
-    assert len(frames(tmp_path)) == 4
-    assert screen.drawn == 4, "the env is not drawn more often"
 
 
 def test_a_second_evaluation_has_a_film_of_its_own(tmp_path):

@@ -90,21 +90,17 @@ def test_guide_of_one_configuration_with_other_returns_in_another_label_is_said(
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("settings", "said"),
     [
-        {"guide": {"spline": {"gain": 2.0}}},
-        {"degrade": {"noisy": {"sigma": 1.0}}},
-        {"env": {"rate": 10.5}},
-        {"evaluation": {"env": {"first_seed": 7}}},
-        {"method": {"learner": "guides", "needs_guide": True}},
+        ({"guide": {"spline": {"gain": 2.0}}}, 0),
+        ({"degrade": {"noisy": {"sigma": 1.0}}}, 0),
+        ({"env": {"rate": 10.5}}, 0),
+        ({"evaluation": {"env": {"first_seed": 7}}}, 0),
+        ({"method": {"learner": "guides", "needs_guide": True}}, 0),
+        # Batch and training of a label are no other configuration of its guide.
+        ({"env": {"num_envs": 3}, "learner": {"gamma": 0.5}, "evaluation": {"repeats": 9}}, 1),
     ],
 )
-def test_guides_of_different_configurations_may_have_other_returns(runs, settings):
+def test_guides_of_different_configurations_may_have_other_returns(runs, settings, said):
     runs({0: -14.0, 1: -14.0}, "coil")
-    assert of_guides_of_labels(runs({0: -28.0}, "ppo", settings=lambda _: settings)) == []
-
-
-def test_batch_and_training_of_a_label_are_no_other_configuration_of_its_guide(runs):
-    settings = {"env": {"num_envs": 3}, "learner": {"gamma": 0.5}, "evaluation": {"repeats": 9}}
-    runs({0: -14.0, 1: -14.0}, "coil")
-    assert len(of_guides_of_labels(runs({0: -28.0}, "ppo", settings=lambda _: settings))) == 1
+    assert len(of_guides_of_labels(runs({0: -28.0}, "ppo", settings=lambda _: settings))) == said

@@ -124,27 +124,26 @@ def test_runs_without_a_test_at_their_end_are_counted_apart():
 
 def test_frames_of_other_runs_are_said():
     """A policy or data to begin with cost frames, which are in no column of this run."""
-    own = Run(Path(), "own", 0, True, settings={"init": None, "learner": {"dataset": None}})
-    init = Run(Path(), "init", 0, True, settings={"init": "outputs/first"})
-    data = Run(Path(), "data", 0, True, settings={"learner": {"dataset": "dataset.pt"}})
-    assert page.begun([own]) == []
-    assert page.begun([own, init, init, data]) == [
-        "Runs of init began with the policy of outputs/first, whose frames are not among theirs.",
-        "Runs of data began with the data of dataset.pt, whose frames are not among theirs.",
+
+    def runs(label, *settings):
+        return [Run(Path(), label, seed, True, settings=each) for seed, each in enumerate(settings)]
+
+    def begun(*settings):
+        """Return what is said of runs of a label, whose seeds are there twice."""
+        return page.begun(2 * runs("own", *({"init": name} for name in settings)))
+
+    of_data = runs("data", {"learner": {"dataset": "dataset.pt"}})
+    end = ", whose frames are not among theirs."
+    assert page.begun(runs("own", {"init": None, "learner": {"dataset": None}})) == []
+    assert page.begun([*runs("init", {"init": "outputs/first"}), *of_data]) == [
+        f"Runs of init began with the policy of outputs/first{end}",
+        f"Runs of data began with the data of dataset.pt{end}",
     ]
-
-
-def test_all_policies_that_the_seeds_of_a_label_began_with_are_named():
-    def begun(seeds):
-        settings = [{"init": f"outputs/first_seed{seed}"} for seed in range(seeds)]
-        runs = [Run(Path(), "own", seed, True, settings=each) for seed, each in enumerate(settings)]
-        return page.begun([*runs, *runs])
-
-    two = "the policy of outputs/first_seed0, the policy of outputs/first_seed1"
-    assert begun(2) == [f"Runs of own began with {two}, whose frames are not among theirs."]
-    (sentence,) = begun(5)
-    assert sentence.startswith(f"Runs of own began with {two}, the policy of outputs/first_seed2 ")
-    assert sentence.endswith("_seed2 and 2 more, whose frames are not among theirs.")
+    assert begun("a", "b") == [f"Runs of own began with the policy of a, the policy of b{end}"]
+    (sentence,) = begun(*"abcde")
+    assert sentence.endswith(
+        f"with the policy of a, the policy of b, the policy of c and 2 more{end}"
+    )
 
 
 def test_envs_are_counted_by_sign(tmp_path):

@@ -6,16 +6,6 @@ from jinja2 import UndefinedError
 from coil_rl.report.sentences import REPORT, listed, returns
 
 
-def test_macro_returns_its_paragraphs_in_one_line_each():
-    labels = [("a", 1, [("last", 2)]), ("b", 0, [("guide", 3), ("last", 1)]), ("c", 0, [])]
-    assert [text.split(":")[-1] for text in REPORT.said("handed_over", labels=labels)] == [
-        " last 2.",
-        "Of the runs of a 1 had no frames left for a test and handed over their last policy.",
-        " guide 3, last 1.",
-    ]
-    assert REPORT.said("handed_over", labels=[]) == []
-
-
 def test_text_of_a_run_is_no_template():
     (said,) = REPORT.said("begun", labels={"{{ 1 + 1 }}": ["<b> & {% x %}"]})
     assert said.startswith("Runs of {{ 1 + 1 }} began with <b> & {% x %}, whose frames")

@@ -1,9 +1,9 @@
-import csv
 import math
 
 import numpy as np
 import pytest
 import torch
+from programs import read_csv
 
 from coil_rl.report.table import AUTO_FORMAT, markdown_table, write_csv
 
@@ -88,8 +88,7 @@ def test_csv_has_full_precision(tmp_path):
     rows = [{"a": 1 / 3, "b": None}, {"a": torch.tensor(2.0), "c": "x,y"}]
     rows.append({"a": math.nan, "b": True})
     write_csv(rows, tmp_path / "table.csv")
-    with (tmp_path / "table.csv").open(newline="") as file:
-        read = list(csv.DictReader(file))
+    read = read_csv(tmp_path / "table.csv")
     assert list(read[0]) == ["a", "b", "c"]
     assert float(read[0]["a"]) == 1 / 3
     assert [row["b"] for row in read] == ["", "", "True"]

@@ -103,13 +103,12 @@ def test_command_long_after_the_last_scan_before_a_gap_does_not_belong_to_it(goo
     assert recording.commands_of_scans(0.15)[4, 1] == recording.commands[0][3, 1]
 
 
-@pytest.mark.parametrize(
-    "change", [odd.ackermann_on_another_topic, odd.stamped_ackermann_on_another_topic]
-)
-def test_ackermann_commands_are_steering_angles(good, change, tmp_path):
+@pytest.mark.parametrize("stamped", [False, True])
+def test_ackermann_commands_are_steering_angles(good, stamped, tmp_path):
     twists = read_recording(good)
+    path = odd.changed(good, odd.ackermann("/drive", stamped=stamped), tmp_path)
     with pytest.warns(UserWarning, match="those on /drive are read instead"):
-        angles = read_recording(odd.changed(good, change, tmp_path))
+        angles = read_recording(path)
     assert (angles.steered, twists.steered) == (True, False)
     expected = twists.commands[0][:, 1]
     found = 0.15 * np.sin(angles.commands[0][:, 1]) / (2 / 7)
@@ -118,7 +117,7 @@ def test_ackermann_commands_are_steering_angles(good, change, tmp_path):
 
 def test_poses_of_ackermann_commands_are_those_of_the_turn_rates(good, tmp_path):
     twists = read_recording(good, odometry=None)
-    angles = read_recording(odd.changed(good, odd.ackermann, tmp_path), odometry=None)
+    angles = read_recording(odd.changed(good, odd.ackermann(), tmp_path), odometry=None)
     assert angles.remarks == []
     np.testing.assert_allclose(angles.poses(2 / 7)[:, :2], twists.poses()[:, :2], atol=1e-5)
 

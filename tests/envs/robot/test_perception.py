@@ -1,5 +1,7 @@
 """The cone classifier, the cones in view, and the memory of the boundaries."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -40,22 +42,36 @@ def test_clusters_larger_than_any_cone_are_no_cones(feature):
     assert (simulated_cone_classifier().classify([[1e6, 1e6, 1e6], [0, 0, 1e9]]) == -1).all()
 
 
-@pytest.mark.parametrize(
-    ("changed", "words"),
-    [
-        ({"weights": [[1.0], [2.0], [3.0]]}, "shapes"),
-        ({"intercept": -0.5}, "shapes"),
-        ({"support": [1.0, 2.0]}, "shapes"),
-        ({"gamma": -1.0}, "more than 0"),
-        ({"scale": [1.0, 0.0]}, "more than 0"),
-        ({"intercept": [0.0, np.nan]}, "intercept of a cone classifier contains"),
-    ],
-)
-def test_invalid_classifiers_are_refused(changed, words):
+def classifier(**changed):
     machines = {"support": [[3.0, 4]], "weights": [[1.0], [0.5]]}
     machines |= {"intercept": [-0.5, -0.1], "gamma": 0.5}
+    return ConeClassifier(**{"mean": [0.0, 0], "scale": [0.01, 0.01], **machines, **changed})
+
+
+def perception(**options):
+    return Perception(simulated_cone_classifier(), **options)
+
+
+@pytest.mark.parametrize(
+    ("make", "changed", "words"),
+    [
+        (classifier, {"weights": [[1.0], [2.0], [3.0]]}, "shapes"),
+        (classifier, {"intercept": -0.5}, "shapes"),
+        (classifier, {"support": [1.0, 2.0]}, "shapes"),
+        (classifier, {"gamma": -1.0}, "more than 0"),
+        (classifier, {"scale": [1.0, 0.0]}, "more than 0"),
+        (classifier, {"intercept": [0.0, np.nan]}, "intercept of a cone classifier contains"),
+        (perception, {"range_max": 0}, "range_max="),
+        *((perception, {"range_min": value}, "range_min=") for value in (0, 2)),
+        (perception, {"bearing_max": 181}, "bearing_max="),
+        (perception, {"scale": -7}, "scale="),
+        (perception, {"margin": -1}, "margin="),
+        (partial(BoundaryMemory, 1), {"spline": "linear"}, "='linear' must be 'cubic' or 'quadra"),
+    ],
+)
+def test_invalid_arguments_are_refused(make, changed, words):
     with pytest.raises(ValueError, match=words):
-        ConeClassifier(**{"mean": [0.0, 0], "scale": [0.01, 0.01], **machines, **changed})
+        make(**changed)
 
 
 def scan_of(*cones: tuple[float, float, float]):
@@ -118,12 +134,12 @@ def test_laser_yaw_rotates_the_view():
 
 
 def test_missing_cones_are_zero():
-    perception = Perception(simulated_cone_classifier(), kept_cones=2)
-    cones, count = perception(*scan_of((0.4, 30, THIN), (0.6, 0, THIN), (0.9, -20, THIN)))
+    two = perception(kept_cones=2)
+    cones, count = two(*scan_of((0.4, 30, THIN), (0.6, 0, THIN), (0.9, -20, THIN)))
     assert count.tolist() == [[2, 0]]
     assert not cones[0, 1].any()
     assert np.hypot(*cones[0, 0].T).round(0).tolist() == [3, 4]
-    cones, count = perception(np.zeros((0, 360)), EXACT.angles.numpy())
+    cones, count = two(np.zeros((0, 360)), EXACT.angles.numpy())
     assert (cones.shape, count.shape) == ((0, 2, 2, 2), (0, 2))
 
 
@@ -145,20 +161,6 @@ def test_scans_are_perceived_independently_in_any_order_of_the_beams():
         alone = perception(ranges[row : row + 1, ::-1], angles[::-1] + 2 * np.pi)
         np.testing.assert_allclose(alone[0][0], cones[row], atol=1e-5)
         assert alone[1][0].tolist() == count[row].tolist()
-
-
-OUTSIDE = {"range_max": 0, "range_min": 0, "bearing_max": 181, "scale": -7, "margin": -1}
-
-
-@pytest.mark.parametrize(("option", "value"), [*OUTSIDE.items(), ("range_min", 2)])
-def test_invalid_options_are_refused(option, value):
-    with pytest.raises(ValueError, match=f"{option}="):
-        Perception(simulated_cone_classifier(), **{option: value})
-
-
-def test_unknown_spline_is_refused():
-    with pytest.raises(ValueError, match="spline='linear' must be 'cubic' or 'quadratic'"):
-        BoundaryMemory(1, spline="linear")
 
 
 def view(left=(), right=(), batch=1):

@@ -1,6 +1,5 @@
 """coil-replay."""
 
-import csv
 import functools
 import hashlib
 import json
@@ -15,7 +14,7 @@ from drives import PERIOD, START, by_another_library, drive, rosbag_of, scan, un
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from programs import called
+from programs import called, read_csv
 from run_folders import make_untrained_run
 
 from coil_paper.reproduce.robot import Table6
@@ -59,8 +58,7 @@ def done(folder):
 
 @pytest.fixture(scope="module")
 def rows(done):
-    with (done[1] / "steering.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
+    return read_csv(done[1] / "steering.csv")
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +189,7 @@ def test_recorded_steering_is_that_of_table_6(tmp_path):
     out = called("replay", *arguments.split(), cwd=tmp_path).stdout
     [row] = [line.split("|") for line in out.splitlines() if line.startswith("| recorded")]
     Table6(recordings=[str(tmp_path / "results" / "annotated.mcap")]).make(tmp_path / "table")
-    [measured] = csv.DictReader((tmp_path / "table.csv").open(newline=""))
+    [measured] = read_csv(tmp_path / "table.csv")
     assert float(measured["smoothness"]) == pytest.approx(float(row[2]), abs=5e-4) != 0
     panels = json.loads((tmp_path / "results" / "foxglove_layout.json").read_text())["configById"]
     assert "/cmd_vel.twist.angular.z" in [path["value"] for path in panels["Plot!omega"]["paths"]]

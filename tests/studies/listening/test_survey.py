@@ -1,4 +1,3 @@
-import numpy as np
 import pytest
 import torch
 from ovals import oval_track
@@ -61,19 +60,11 @@ def rows(found):
 
 
 @pytest.mark.slow
-def test_every_state_of_every_episode_is_measured(found):
-    assert found.guides == ["spline", "random"]
+def test_every_state_of_every_episode_has_its_section(found):
     assert all(episode["completed"] for episode in found.result.episodes)
-    assert [episode["case"] for episode in found.result.episodes] == [
-        track.name for track in TRACKS
-    ] * 2
-    steps = np.array([episode["steps"] for episode in found.result.episodes])
-    assert np.bincount(found.step).tolist() == [(steps > step).sum() for step in range(max(steps))]
-    count = steps.sum()
+    count = sum(episode["steps"] for episode in found.result.episodes)
     assert found.advice.shape == (count, 2, 1)
     assert all(values.shape == (count, 2) for values in found.measures.values())
-    assert found.measures["agreement"].mean(0)[0] == 0
-    assert found.measures["intervention"].mean(0)[1] == 0
     for index, line in enumerate(TRACK_SECTIONS.lines):
         on_track = found.place["track"] == index
         points = found.place["point"][on_track]
