@@ -111,12 +111,13 @@ class Delivery:
         return max(self._affordable(), self._first_episodes() * self.cases.longest)
 
     def _fits(self) -> bool:
-        """Return whether there is a test: its first cases fit into the frames, or a guide is held.
+        """Return whether there is a test: because its first cases fit, or because one is owed.
 
         Episodes are taken to be as long as in the start test, and without one as in the training. A
-        run that holds a guide is always tested, as it promises to be no worse than this guide.
+        run that holds a guide, or found one ahead without enough cases to hold it, is always
+        tested, as it promises to be no worse than this guide.
         """
-        if self._holds():
+        if self._holds() or self.cases.guide_ahead:
             return True
         if self.cases.episodes:
             length = self.cases.steps / self.cases.episodes
@@ -150,8 +151,8 @@ class Delivery:
     def _left(self) -> int:
         """Return the number of frames that the start test has left for the test at the end.
 
-        If it found a guide ahead but had too few cases to hold it, its own frames do not count:
-        what is handed over must not be worse than that guide, so there must be a test.
+        If it found a guide ahead but had too few cases to hold it, its own frames do not count, so
+        that the test has more cases.
         """
         taken = 0 if self.cases.guide_ahead else self.cases.steps
         return max(2 * self._share() - taken, 0)
