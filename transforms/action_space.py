@@ -32,8 +32,8 @@ from coil_rl.transforms.link import Link
 from coil_rl.transforms.normalised_action import ActionUnits, given_units, units_of
 
 Key = TypeVar("Key", NestedKey, NestedKey | None)
-# What converts one-hot entries of an env to its own numbering, by entry.
-OwnChoices: TypeAlias = Mapping[NestedKey, Callable[[Tensor], Tensor]]
+# What converts entries of an env to whole numbers as it gives them, by entry.
+OwnNumbers: TypeAlias = Mapping[NestedKey, Callable[[Tensor], Tensor]]
 
 
 def nested_key(key: Key) -> Key:
@@ -364,9 +364,9 @@ def own_shape(env: EnvBase) -> Sequence[int] | None:
     return getattr(env, "own_shape", None)
 
 
-def observed_choices(env: EnvBase) -> OwnChoices:
-    """Return what converts one-hot entries of an env to its own numbering, by entry."""
-    return getattr(env, "observed_choices", {})
+def own_numbers(env: EnvBase) -> OwnNumbers:
+    """Return what converts entries to whole numbers as the env gives them, by entry."""
+    return getattr(env, "own_numbers", {})
 
 
 def space_of(env: EnvBase, action_key: NestedKey) -> ActionSpace:

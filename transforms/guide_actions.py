@@ -21,9 +21,9 @@ from torchrl.data import Composite, TensorSpec
 from coil_rl.transforms.action_space import (
     ActionSpace,
     ActionTransform,
-    OwnChoices,
+    OwnNumbers,
     nested_key,
-    observed_choices,
+    own_numbers,
     space_of,
 )
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
@@ -201,16 +201,16 @@ class Guides(TensorDictModuleBase):
         action: Tensor = data[self.action_key]
         return action if convert is None else convert(name, action, tensordict.batch_size)
 
-    def tell(self, space: ActionSpace, choices: OwnChoices) -> None:
+    def tell(self, space: ActionSpace, own: OwnNumbers) -> None:
         """Tell the guides that ask for it about their env.
 
         Args:
             space: of the actions of the guides.
-            choices: what converts one-hot entries to the numbering of the env, by entry.
+            own: what converts entries to whole numbers as the env gives them, by entry.
         """
         for guide in self.guides.values():
             if isinstance(guide, ToldGuide):
-                guide.meet(space, choices)
+                guide.meet(space, own)
 
     def match_dtypes(self, tensordict: TensorDictBase) -> None:
         """Convert from here on what a guide reads to the dtype of its parameters.
@@ -447,7 +447,7 @@ class GuideActions(ActionTransform):
             return torch.zeros(shape, dtype=space.dtype, device=tensordict.device)
         if not self._checked:
             self.guides.match_dtypes(tensordict)
-            self.guides.tell(self.guide_space, observed_choices(self.parent.base_env))
+            self.guides.tell(self.guide_space, own_numbers(self.parent.base_env))
         return self.guides.advice(tensordict, self._fitted, memory, ended)
 
     def _fitted(self, name: str, action: Tensor, batch: torch.Size) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from coil_rl.transforms.action_space import ActionSpace, OwnChoices
+from coil_rl.transforms.action_space import ActionSpace, OwnNumbers
 
 
 def guide_of(thing: Any) -> TensorDictModuleBase:
@@ -22,11 +22,11 @@ def guide_of(thing: Any) -> TensorDictModuleBase:
 class ToldGuide(TensorDictModuleBase):
     """A guide that is told which actions there are, and how its env numbers what it shows."""
 
-    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
+    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
         """Take what an env says about itself.
 
         Args:
-            choices: what converts one-hot entries to the numbering of the env, by entry.
+            own: what converts entries to whole numbers as the env gives them, by entry.
         """
 
 

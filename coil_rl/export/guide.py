@@ -16,7 +16,7 @@ from torchrl.envs import TensorDictPrimer
 from coil_rl.errors import UserError
 from coil_rl.export.contract import ADVICE
 from coil_rl.export.policy import ExportedPolicy
-from coil_rl.transforms.action_space import ActionRange, ActionSpace, OwnChoices
+from coil_rl.transforms.action_space import ActionRange, ActionSpace, OwnNumbers
 from coil_rl.transforms.guide_memory import primer_of
 from coil_rl.transforms.hosted import ToldGuide
 
@@ -53,15 +53,15 @@ class ExportedGuide(ToldGuide):
         self.in_keys = [*self.read, *self.memory]
         self.out_keys: list[NestedKey] = ["action", *(("next", name) for name in self.memory)]
 
-    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
+    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
         """Check the action of an env.
 
         Raises:
             UserError: if the policy acts in another one.
         """
-        own = _range(self.exported.contract["outputs"][0])
-        if not own.same_as(space.range):
-            raise self._unfit(f"its action goes {space.range}, not {own}")
+        exported = _range(self.exported.contract["outputs"][0])
+        if not exported.same_as(space.range):
+            raise self._unfit(f"its action goes {space.range}, not {exported}")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action, and what is remembered."""

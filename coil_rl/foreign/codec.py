@@ -74,27 +74,31 @@ class Fineness:
             )
 
 
-class Choices:
-    """Conversion of one-hot vectors side by side to the choices of a space, in its numbering.
+class WholeNumbers:
+    """Conversion of an entry to the whole numbers of its space, as the env gives them.
 
     Args:
-        space: a Discrete or MultiDiscrete space.
+        space: of whole numbers or of choices, which are one-hot vectors side by side.
     """
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         self.sizes, self.shape = _choices(space), tuple(space.shape or ())
         self.first = torch.as_tensor(np.ravel(_start(space)).astype(np.int64))
 
-    def __call__(self, vectors: torch.Tensor) -> torch.Tensor:
-        """Return the choices, [*batch, *shape] with the shape of the space, as whole numbers.
+    def __call__(self, entry: torch.Tensor) -> torch.Tensor:
+        """Return the numbers, [*batch, *shape] with the shape of the space.
 
         Args:
-            vectors: [*batch, n].
+            entry: [*batch, n] for choices, else [*batch, *shape], with a dimension more for a
+                single number.
         """
-        parts = vectors.split(self.sizes, -1)
+        if not self.sizes:
+            batch = entry.shape[: entry.ndim - max(1, len(self.shape))]
+            return entry.long().reshape((*batch, *self.shape))
+        parts = entry.split(self.sizes, -1)
         indices = torch.stack([part.argmax(-1) for part in parts], -1)
         own = indices + self.first.to(indices.device)
-        return own.reshape((*vectors.shape[:-1], *self.shape))
+        return own.reshape((*entry.shape[:-1], *self.shape))
 
 
 class Entry:
@@ -138,6 +142,7 @@ class Entry:
                 "wrapper"
             )
         self.given = tuple(self.spec.shape)
+        self.whole = np.dtype(space.dtype).kind in "iub" and self.spec.dtype == dtype
         self.id, self.fineness = id, Fineness(f"the env {id}", self.title, self.dtype)
 
     def __call__(self, observation: Any) -> NDArray[Any]:
@@ -458,9 +463,10 @@ class Codec:
         self.largest = float(np.finfo(self.floats).max)  # number of a reward
 
     @property
-    def choices(self) -> dict[NestedKey, Choices]:
-        """What converts an entry to its choices as the env gives them, by key."""
-        return {entry.key: Choices(entry.space) for entry in self.entries if entry.choices}
+    def whole_numbers(self) -> dict[NestedKey, WholeNumbers]:
+        """What converts an entry to whole numbers where the env gives such, by key."""
+        own = [entry for entry in self.entries if entry.choices or entry.whole]
+        return {entry.key: WholeNumbers(entry.space) for entry in own}
 
     def read(self, observation: Any) -> dict[NestedKey, NDArray[Any]]:
         """Return copies of the entries of an observation, by their keys.

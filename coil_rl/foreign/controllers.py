@@ -26,7 +26,7 @@ from coil_rl.foreign.guard import NUMBERS, Guard, hold
 from coil_rl.foreign.host import Host, Predictor, asks_for_env, called, check_call, role_of
 from coil_rl.foreign.remembered import copied, maker_of_rows, state_of
 from coil_rl.foreign.shared import FunctionGuide, NetworkGuide
-from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key, written_key
+from coil_rl.transforms.action_space import ActionSpace, OwnNumbers, nested_key, written_key
 from coil_rl.transforms.hosted import HostedGuide, ToldGuide
 
 
@@ -34,9 +34,9 @@ class PerRow(HostedGuide):
     """Python controllers as a guide, one object for each row of the env.
 
     An object is made when its row first acts, and is not asked after the end of an episode, see
-    `Guides`. `act(observation)` gets one NumPy array for each of `in_keys`, or choices in the
-    numbering of the env, as a Gymnasium env gives them. It returns an action: numbers, an index or
-    a one-hot vector. `reset()`, if there is one, is called at the start of each episode; without it
+    `Guides`. `act(observation)` gets one NumPy array for each of `in_keys`; whole numbers and
+    choices are as a Gymnasium env gives them. It returns an action: numbers, an index or a one-hot
+    vector. `reset()`, if there is one, is called at the start of each episode; without it
     each episode gets a new object. Objects with `state_dict()` and `load_state_dict(state)` are
     part of a checkpoint; without these, and for networks that remember more than `state_dict()`
     has, new episodes begin when a run is resumed. They are called one after the other: a batched
@@ -76,14 +76,14 @@ class PerRow(HostedGuide):
         self.make, self.hosts = make, dict[int, Host]()
         self.guard = Guard()
         self.title = title or getattr(getattr(make, "func", make), "__name__", repr(make))
-        self.choices: OwnChoices = {}
+        self.own: OwnNumbers = {}
         self.asked: list[int] = []  # rows of the last call
         # whether the last restored state held those of the objects; else new episodes begin
         self.continues = True
 
-    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
-        """Read choices as the env gives them from here on, not as one-hot vectors."""
-        self.choices = choices
+    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
+        """Read whole numbers and choices as the env gives them from here on."""
+        self.own = own
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
@@ -95,7 +95,7 @@ class PerRow(HostedGuide):
             entry = flat[key]
             if is_tensor_collection(entry):
                 raise ForeignError(_parts_of(key, entry))
-            entry = self.choices[key](entry) if key in self.choices else entry
+            entry = self.own[key](entry) if key in self.own else entry
             columns.append(entry.cpu().numpy().copy())
         observations = zip(*columns, strict=True)
         actions: list[NDArray[Any]] = []
@@ -234,10 +234,10 @@ class ControllerGuide(HostedGuide):
         """Whether there is one object for each row, see `Guides`."""
         return isinstance(self.guide, PerRow)
 
-    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
+    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
         """Tell the controller about its env, if it asks for that."""
         if isinstance(self.guide, ToldGuide):
-            self.guide.meet(space, choices)
+            self.guide.meet(space, own)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action; what the controller raises is a `ForeignError`."""

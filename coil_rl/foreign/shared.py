@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from coil_rl.foreign.faults import ForeignError, action_array, foreign, shown
 from coil_rl.foreign.guard import Guard
-from coil_rl.transforms.action_space import ActionSpace, OwnChoices, nested_key
+from coil_rl.transforms.action_space import ActionSpace, OwnNumbers, nested_key
 from coil_rl.transforms.hosted import HostedGuide
 
 # Share of the largest number of the actions by which they may differ: for the same question; in a
@@ -147,7 +147,7 @@ class _Shared(HostedGuide):
     """
 
     space: ActionSpace | None = None  # unknown outside of an env
-    choices: OwnChoices = {}  # noqa: RUF012  replaced, never changed
+    own: OwnNumbers = {}  # noqa: RUF012  replaced, never changed
     for_batch: bool | None = None  # unknown before the first call
     each: Ask | None = None  # asks for one row after the other, if that is possible
 
@@ -179,9 +179,9 @@ class _Shared(HostedGuide):
             return action  # checked on its device by `GuideActions`
         return torch.as_tensor(action_array(action), device=entries[0].device)
 
-    def meet(self, space: ActionSpace, choices: OwnChoices) -> None:
+    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
         """Take the space of the actions, which decides what has the form of actions."""
-        self.space, self.choices = space, choices
+        self.space, self.own = space, own
 
     def unfit(
         self, action: Tensor, batch: torch.Size, space: ActionSpace, problem: str
@@ -254,8 +254,8 @@ class FunctionGuide(_Shared):
     It gets the observations of all rows at once, or of one row after the other.
 
     A function for a batch gets tensors [B, N] and returns actions [B, A]. One for a single
-    observation gets NumPy arrays [N] and returns an action [A], a number or an index. Choices are
-    in the numbering of the env, as a Gymnasium env gives them. Which of the two it is, is found out
+    observation gets NumPy arrays [N] and returns an action [A], a number or an index. Whole
+    numbers and choices are as a Gymnasium env gives them. Which of the two it is, is found out
     at its first call: it is for a batch if it gives the same for a row beside quite other ones as
     for the row alone, in the form of actions, or if it cannot take a row alone. A function that
     remembers something would mix the rows: `takes_batch` finds it.
@@ -280,7 +280,7 @@ class FunctionGuide(_Shared):
     def _as_given(self, entries: Sequence[Tensor]) -> list[Tensor]:
         """Return entries as the env gives them, [*batch, ...]."""
         named = zip(self.in_keys, entries, strict=True)
-        return [self.choices[key](entry) if key in self.choices else entry for key, entry in named]
+        return [self.own[key](entry) if key in self.own else entry for key, entry in named]
 
     def _asked(self, entries: Sequence[Tensor]) -> Any:
         return self.function(*(entry.clone() for entry in self._as_given(entries)))

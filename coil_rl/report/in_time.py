@@ -18,7 +18,7 @@ from coil_rl.foreign.gymnasium_env import NOT_OBSERVED
 from coil_rl.report import style
 from coil_rl.report.pictures import Picture
 from coil_rl.report.statistics import Array
-from coil_rl.transforms.action_space import ActionSpace, observed_choices, space_of
+from coil_rl.transforms.action_space import ActionSpace, own_numbers, space_of
 from coil_rl.transforms.discrete_actions import DiscreteActions
 from coil_rl.transforms.normalised_action import given_units
 
@@ -84,13 +84,13 @@ def _observed(env: EnvBase, before: TensorDictBase) -> dict[str, Tensor]:
     the numbering of the env.
     """
     base, left = _base(env), MOST_OBSERVED
-    choices, shown = observed_choices(base), dict[str, Tensor]()
+    own, shown = own_numbers(base), dict[str, Tensor]()
     keys = list(base.observation_spec.keys(True, True))
     for key in ["observation"] if "observation" in keys else keys:
         value = None if key[0] in NOT_OBSERVED else before.get(key, None)
         if value is None or value.dtype == torch.uint8 or not left:
             continue
-        numbers = choices[key](value) if key in choices else value
+        numbers = own[key](value) if key in own else value
         numbers = numbers.reshape(*env.batch_size, -1)[..., :left]
         shown[key if isinstance(key, str) else ".".join(key)] = numbers
         left -= numbers.shape[-1]

@@ -312,6 +312,7 @@ def first_two(numbers):
 class Reader:
     def act(self, observation):
         assert isinstance(observation, (np.ndarray, np.int64))
+        assert observation.dtype.kind == "i"  # it may be an index
         return first_two(observation)
 
 
@@ -321,6 +322,10 @@ class Reader:
         spaces.Discrete(5, start=-2),
         spaces.MultiDiscrete([7, 4], start=[-3, 1]),
         spaces.MultiDiscrete([[3, 2], [2, 4]]),
+        spaces.MultiBinary(3),
+        spaces.Box(-3, 8, (2,), np.int16),
+        spaces.Box(0, 9, (2, 2), np.uint8),
+        spaces.Box(-3, 9, (), np.int64),
     ],
     ids=str,
 )
@@ -329,7 +334,7 @@ class Reader:
     [Reader, Reader(), first_two, lambda batch: batch.view(len(batch), -1)[:, [0, -1]]],
     ids=["class", "object", "function", "batch"],
 )
-def test_controller_reads_choices_as_the_env_numbers_them(space, controller):
+def test_controller_reads_whole_numbers_as_the_env_gives_them(space, controller):
     plant = Plant(space, TWO)
     env = GymnasiumEnv(lambda: plant, max_steps=9)
     advised = TransformedEnv(env, GuideActions({"reader": ControllerGuide(controller)}))
