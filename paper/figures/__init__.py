@@ -1,1 +1,1 @@
-"""Illustrations of the docs: `python -m coil_paper.figures.world`, and `lines`."""
+"""Illustration of the docs: `python -m coil_paper.figures.world`."""
