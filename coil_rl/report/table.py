@@ -28,7 +28,7 @@ Counts = Sequence[Mapping[str, int]]
 def return_format(returns: Iterable[float]) -> str:
     """Return the number format of returns of one env, of which the largest has three digits.
 
-    At least one decimal is shown.
+    At least one decimal is shown, but from 100,000 on none, and commas.
 
     Args:
         returns: that are shown beside each other.
@@ -38,6 +38,8 @@ def return_format(returns: Iterable[float]) -> str:
         ('-36.4', '0.120')
     """
     largest = max((abs(each) for each in returns if math.isfinite(each)), default=0.0)
+    if largest >= 100_000:
+        return ",.0f"
     if largest == 0 or largest >= 10:
         return ".1f"
     # From the text, in which 9.999 is 1.00e+01.
