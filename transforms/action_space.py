@@ -32,7 +32,7 @@ from coil_rl.transforms.link import Link
 from coil_rl.transforms.normalised_action import ActionUnits, given_units, units_of
 
 Key = TypeVar("Key", NestedKey, NestedKey | None)
-# What converts entries of an env to whole numbers as it gives them, by entry.
+# What converts entries of an env to what it gives, where that is another thing, by entry.
 OwnNumbers: TypeAlias = Mapping[NestedKey, Callable[[Tensor], Tensor]]
 
 
@@ -365,7 +365,7 @@ def own_shape(env: EnvBase) -> Sequence[int] | None:
 
 
 def own_numbers(env: EnvBase) -> OwnNumbers:
-    """Return what converts entries to whole numbers as the env gives them, by entry."""
+    """Return what converts entries to what the env gives, by entry."""
     return getattr(env, "own_numbers", {})
 
 

@@ -206,7 +206,7 @@ class Guides(TensorDictModuleBase):
 
         Args:
             space: of the actions of the guides.
-            own: what converts entries to whole numbers as the env gives them, by entry.
+            own: what converts entries to what the env gives, by entry.
         """
         for guide in self.guides.values():
             if isinstance(guide, ToldGuide):

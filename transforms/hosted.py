@@ -26,7 +26,7 @@ class ToldGuide(TensorDictModuleBase):
         """Take what an env says about itself.
 
         Args:
-            own: what converts entries to whole numbers as the env gives them, by entry.
+            own: what converts entries to what the env gives, by entry.
         """
 
 

@@ -37,7 +37,7 @@ class OneRow:
         self.guides = Guides({"it": ControllerGuide(guide)})
         actions = self.codec.actions
         space = ActionSpace(actions.spec, 0, actions.first, actions.own_shape)
-        self.guides.tell(space, self.codec.whole_numbers)
+        self.guides.tell(space, self.codec.own_forms)
         self.reset()
 
     def reset(self) -> None:

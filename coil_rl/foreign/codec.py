@@ -74,15 +74,16 @@ class Fineness:
             )
 
 
-class WholeNumbers:
-    """Conversion of an entry to the whole numbers of its space, as the env gives them.
+class OwnForm:
+    """Conversion of an entry to what the env gives: whole numbers, and a number without dimension.
 
     Args:
-        space: of whole numbers or of choices, which are one-hot vectors side by side.
+        space: of the entry, in which choices are one-hot vectors side by side.
     """
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         self.sizes, self.shape = _choices(space), tuple(space.shape or ())
+        self.whole = _is_whole(space)
         self.first = torch.as_tensor(np.ravel(_start(space)).astype(np.int64))
 
     def __call__(self, entry: torch.Tensor) -> torch.Tensor:
@@ -94,7 +95,7 @@ class WholeNumbers:
         """
         if not self.sizes:
             batch = entry.shape[: entry.ndim - max(1, len(self.shape))]
-            return entry.long().reshape((*batch, *self.shape))
+            return (entry.long() if self.whole else entry).reshape((*batch, *self.shape))
         parts = entry.split(self.sizes, -1)
         indices = torch.stack([part.argmax(-1) for part in parts], -1)
         own = indices + self.first.to(indices.device)
@@ -142,7 +143,7 @@ class Entry:
                 "wrapper"
             )
         self.given = tuple(self.spec.shape)
-        self.whole = np.dtype(space.dtype).kind in "iub" and self.spec.dtype == dtype
+        self.whole = _is_whole(space) and self.spec.dtype == dtype
         self.id, self.fineness = id, Fineness(f"the env {id}", self.title, self.dtype)
 
     def __call__(self, observation: Any) -> NDArray[Any]:
@@ -263,6 +264,11 @@ def _is_picture(space: spaces.Space[Any]) -> bool:
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
         return False
     return len(space.shape) == 3 or bool((space.high == 255).all())
+
+
+def _is_whole(space: spaces.Space[Any]) -> bool:
+    """Return whether the numbers of a space are whole."""
+    return np.dtype(space.dtype).kind in "iub"
 
 
 def _choices(space: spaces.Space[Any]) -> list[int]:
@@ -463,10 +469,10 @@ class Codec:
         self.largest = float(np.finfo(self.floats).max)  # number of a reward
 
     @property
-    def whole_numbers(self) -> dict[NestedKey, WholeNumbers]:
-        """What converts an entry to whole numbers where the env gives such, by key."""
-        own = [entry for entry in self.entries if entry.choices or entry.whole]
-        return {entry.key: WholeNumbers(entry.space) for entry in own}
+    def own_forms(self) -> dict[NestedKey, OwnForm]:
+        """What converts entries to what the env gives, by key, where that is another thing."""
+        own = [each for each in self.entries if each.whole or each.given != each.shape]
+        return {entry.key: OwnForm(entry.space) for entry in own}
 
     def read(self, observation: Any) -> dict[NestedKey, NDArray[Any]]:
         """Return copies of the entries of an observation, by their keys.

@@ -311,7 +311,9 @@ def first_two(numbers):
 
 class Reader:
     def act(self, observation):
-        assert isinstance(observation, (np.ndarray, np.int64))
+        assert isinstance(observation, (np.ndarray, np.int64, np.float32))
+        if observation.dtype.kind == "f":
+            return [float(observation)] * 2  # a number, not an array with one
         assert observation.dtype.kind == "i"  # it may be an index
         return first_two(observation)
 
@@ -326,6 +328,7 @@ class Reader:
         spaces.Box(-3, 8, (2,), np.int16),
         spaces.Box(0, 9, (2, 2), np.uint8),
         spaces.Box(-3, 9, (), np.int64),
+        spaces.Box(-3, 9, (), np.float32),
     ],
     ids=str,
 )
@@ -334,7 +337,7 @@ class Reader:
     [Reader, Reader(), first_two, lambda batch: batch.view(len(batch), -1)[:, [0, -1]]],
     ids=["class", "object", "function", "batch"],
 )
-def test_controller_reads_whole_numbers_as_the_env_gives_them(space, controller):
+def test_controller_reads_an_observation_as_the_env_gives_it(space, controller):
     plant = Plant(space, TWO)
     env = GymnasiumEnv(lambda: plant, max_steps=9)
     advised = TransformedEnv(env, GuideActions({"reader": ControllerGuide(controller)}))
