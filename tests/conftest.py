@@ -14,6 +14,7 @@ from hydra._internal.config_repository import ConfigRepository
 from hydra.core.config_store import ConfigStore
 from hypothesis import settings
 from omegaconf import base
+from outside_package.install import SOURCE
 from package_entries import find_entry_points
 from torch._export import utils
 
@@ -141,6 +142,12 @@ def levels() -> list[Track]:
             f"{missing[0]} does not exist: the levels of the authors are not in the repository"
         )
     return [load_track(LEVELS / f"MAP_{k}.csv", start=(7, -10, 0)) for k in (1, 2, 3)]
+
+
+@pytest.fixture
+def thermostat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the package of a user importable, as one that is installed."""
+    monkeypatch.syspath_prepend(SOURCE)
 
 
 @pytest.fixture(scope="session")

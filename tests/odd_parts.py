@@ -1,5 +1,7 @@
 """Envs and controllers of other people, each with something unusual."""
 
+from typing import ClassVar
+
 import gymnasium
 import numpy as np
 from gymnasium import spaces
@@ -10,6 +12,7 @@ class Plain(gymnasium.Env):
 
     observation_space = spaces.Box(-1, 1, (2,))
     action_space = spaces.Box(-1, 1, (1,))
+    last = 10
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -19,7 +22,7 @@ class Plain(gymnasium.Env):
     def step(self, action):
         reward = -abs(float(self.seen[0]) - float(np.sum(np.asarray(action, np.float64))))
         self.steps += 1
-        return self.look(), reward, False, self.steps >= 10, {}
+        return self.look(), reward, False, self.steps >= self.last, {}
 
     def look(self):
         self.seen = self.np_random.uniform(-1, 1, 2).astype(np.float32)
@@ -44,8 +47,90 @@ class Acts(Plain):
         space: the name.
     """
 
+    taken: ClassVar = []
+
     def __init__(self, space="wide"):
         self.action_space = SPACES[space]
+
+    def step(self, action):
+        self.taken.append(np.ravel(action).astype(float).item(0))
+        return super().step(np.zeros(1))
+
+
+class Lasting(Plain):
+    """Its episodes are longer than a trial."""
+
+    last = 12
+
+
+class Told(Lasting):
+    """Its info says from the second step on whether it is late."""
+
+    def step(self, action):
+        *rest, _ = super().step(action)
+        late = {"late": self.steps > 5} if self.steps > 1 else {}
+        return *rest, {"time": self.steps} | late
+
+
+class Raises(Lasting):
+    def step(self, action):
+        assert self.steps < 11, "the pump is off"
+        return super().step(action)
+
+
+class TrainingOnly(Lasting):
+    """An answer in each episode of a training is incomplete."""
+
+    def is_odd(self):
+        return self.np_random_seed < 10**9
+
+    def step(self, action):
+        answer = super().step(action)
+        return answer[:4] if self.is_odd() and self.steps == 11 else answer
+
+
+class TableOnly(TrainingOnly):
+    """An answer in each episode of a table is incomplete."""
+
+    def is_odd(self):
+        return self.np_random_seed in range(10**9, 11 * 10**8)
+
+
+class Unseeded(Lasting):
+    """It draws what no seed reaches, and its pictures are not of bytes."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 10}
+    numbers = np.random.default_rng()
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def look(self):
+        self.seen = self.numbers.uniform(-1, 1, 2).astype(np.float32)
+        return self.seen
+
+    def render(self):
+        return np.zeros((4, 4, 3))
+
+
+class Gain:
+    """A controller with a state of its own."""
+
+    def __init__(self, gain=0.1, of=0):
+        self.gain, self.of = gain, of
+
+    def act(self, observation):
+        return [self.gain * float(observation[self.of])]
+
+
+class Late:
+    """A controller without an answer in its eleventh step."""
+
+    calls = 0
+
+    def act(self, observation):
+        self.calls += 1
+        return None if self.calls == 11 else observation[:1]
 
 
 def first(observation):

@@ -1,6 +1,5 @@
 """`coil-compare` and `coil_rl.compare`: a pendulum, in the smallest trainings there are."""
 
-import csv
 import json
 import shlex
 import sys
@@ -9,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from programs import called
+from programs import called, read_csv
 
 import coil_rl
 from coil_rl.comparison import jobs, timing
@@ -23,11 +22,6 @@ TUNE = "tune={gain: [0.1, 10, log]}"
 PENDULUM = ["env=pendulum", *SMALL, "minutes=0.01"]
 
 
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compare") / "a b,c=[d]{\u00e9}"
@@ -38,7 +32,7 @@ def compared(tmp_path_factory):
 @pytest.mark.slow
 def test_table_has_everything_that_acts(compared):
     folder, _ = compared
-    rows = {row["policy"]: row for row in rows_of(folder / "compare.csv")}
+    rows = {row["policy"]: row for row in read_csv(folder / "compare.csv")}
     without = ["guide", "opposite", "zero", "random", "first network"]
     learned = ["tune", "ppo", "coil_anchored", "sac", "coil_anchored_sac"]
     assert list(rows) == [*without, *learned]
@@ -64,7 +58,7 @@ def test_verdict_is_a_file_for_programs(compared):
     found = json.loads((folder / "verdict.json").read_text())
     lines = (folder / "compare.md").read_text().splitlines()
     assert found["sentences"] == [line[3:] for line in lines[:3]]
-    assert found["use"] in {row["policy"] for row in rows_of(folder / "compare.csv")} | {"nothing"}
+    assert found["use"] in {row["policy"] for row in read_csv(folder / "compare.csv")} | {"nothing"}
     assert found["command"].startswith("coil-train env=pendulum")
 
 
@@ -129,7 +123,7 @@ def test_comparison_that_was_stopped_ends_with_the_same_table(compared, tmp_path
     assert "continue with: coil-compare" in called("compare", *words, code=130).stderr
     monkeypatch.undo()
     called("compare", *words)
-    first, second = (rows_of(each / "compare.csv") for each in (folder, tmp_path / "it"))
+    first, second = (read_csv(each / "compare.csv") for each in (folder, tmp_path / "it"))
     for one, other in zip(first, second, strict=True):
         for key in ("policy", "return", "worst", "frames", "calls"):
             assert one[key] == other[key]
@@ -174,7 +168,7 @@ def test_failed_training_is_one_failed_training(tmp_path):
     words += ["env=gym", "env.id=Pendulum-v1", *SMALL, "minutes=0.01", f"folder={tmp_path / 'it'}"]
     sys.path.insert(0, "tests/coil_rl/programs")
     done = called("compare", *words)
-    rows = {row["policy"]: row for row in rows_of(tmp_path / "it" / "compare.csv")}
+    rows = {row["policy"]: row for row in read_csv(tmp_path / "it" / "compare.csv")}
     assert rows["ppo"]["seeds"] == "2"
     assert "no more" in done.stderr
     assert any("failed: " in row["note"] for row in rows.values())
@@ -195,16 +189,9 @@ def test_failed_training_is_one_failed_training(tmp_path):
         (["env=pendulum", "minutes=0"], "minutes=0 must be above 0"),
         (["env=pendulum", "minutes"], "minutes: give minutes=VALUE"),
         (["env=pendulum", "seed=1.5"], "seed=1.5 must be a whole number"),
-        (["env=pendulum", "guide=swing_upp"], "swing_upp"),
         (["env=pendulum", "learner.gama=1"], "learner.gama"),
-        (["env=pendulum", "tune={gian: [0, 1]}"], "tune.gian is no number of the guide"),
         (["env=pendulum", "tune={gain: ["], "tune="),
         (["env=pendulum", "proxy.seed=3"], "nothing in this run reads proxy.seed"),
-        (["env=pendulum", "recording=a.mcap"], "nothing in this run reads recording (method="),
-        (
-            ["env=cart_pole", "training.noise_correlation=0.5"],
-            "noise_correlation=0.5 has no effect",
-        ),
     ],
 )
 def test_mistake_is_one_sentence_and_writes_nothing(words, sentence, tmp_path):

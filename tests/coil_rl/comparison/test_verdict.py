@@ -23,42 +23,86 @@ def entries(seeds=2, **means):
     return made
 
 
-ANCHORED = "coil_anchored"
-RULES = {
-    "less than a percent is no gain": ("guide", {"guide": 98.5, "ppo": 0.0, ANCHORED: 99.0}),
-    "a policy is better than a tuned guide": (ANCHORED, {"tune": 60, "ppo": 20, ANCHORED: 80}),
-    "another mean is higher": (ANCHORED, {"ppo": [10, 200], ANCHORED: [80, 82], "residual": 70}),
-    "doing nothing is better than the guide only": ("ppo", {"guide": 20, "zero": 60, "ppo": 90}),
-}
+NAMES = {"A": "coil_anchored", "S": "coil_anchored_sac", "N": "first network", "-": ""}
+NAMES |= {"nothing": NOTHING}
+BAD = "random=-160 guide=-40 opposite=-150 ppo=-90,-80"
+LOW = "random=-200 opposite=-190 zero=0 N=0"
+WORSE = "random=-200 opposite=-220 zero=-100 N=-210"
+CLEAR = "1 40.0) is clearly better than everything else here; your guide has -40.0, at 0.6"
+# Means, of each seed where there are several; what is used and trained; and what a sentence says:
+# its number, and a text, in which bars are begin and end. What it does not say begins with "!".
+RULES = [
+    # What costs nothing is used unless something is clearly better; a percent is no gain.
+    ("guide=98.5 ppo=0 A=99", "guide A", "1 guide"),
+    ("guide=99.3 ppo=40 A=100", "guide A", "1 |Leave it: your guide is at 0.99 of what was"),
+    ("guide=99.3 ppo=40 A=100", "guide A", "2 +59.3"),
+    ("guide=80 ppo=40,120 A=70,100", "guide A", "1 |Keep your guide (80.0): it is at 0.94"),
+    ("guide=80 ppo=40,120 A=70,100", "guide A", "3 coil_anchored"),
+    ("guide=60 ppo=-20,180 A=50,61", "guide A", "3 whether ppo"),  # one bad seed
+    ("guide=60 ppo=-20,180 A=50,61", "guide A", "score 0.75"),
+    ("ppo=10,200 A=80,82 residual=70", "A A", "1 coil_anchored"),  # another mean is higher
+    ("tune=95 ppo=60 A=70", "tune tune", "1 tuned numbers: 95.0 instead of 50.0"),
+    ("tune=60 ppo=20 A=80", "A A", "1 coil_anchored"),
+    # A reversed guide is the wrong way round, and a policy may be better than its opposite.
+    (
+        "guide=-90 opposite=89 ppo=0 A=88",
+        "opposite A",
+        "1 |Your guide is the wrong way round. T",
+    ),
+    ("guide=-90 opposite=89 ppo=0 A=88", "opposite A", "1 the opposite has 89.0, the guide -90.0"),
+    ("guide=-90 opposite=89 ppo=0 A=95", "A A", "1 |Your guide is the wrong way round. Use coil_a"),
+    # A policy is best: over what, and how much its seeds say.
+    ("guide=20 ppo=90,92 A=70,71 S=20", "ppo S", "2 over the guide"),
+    ("guide=20 ppo=90,92 A=70,71 S=20", "ppo S", "2 !over PPO"),
+    ("ppo=10,20 A=90,92 residual=80,85", "A A", "2 +41.0"),
+    ("ppo=10,20 A=90,92 residual=80,85", "A A", "2 +76.0"),
+    ("ppo=10,20 A=90,92 residual=80,85", "A A", "3 those of ppo differ by 10.0, the most"),
+    ("ppo=88,91 A=90,92", "A A", "3 !whether ppo would be as good or better"),
+    ("ppo=93,88 A=90,92", "A A", "3 whether ppo would be as good or better"),
+    ("A=90 failed=ppo", "A A", "3 what ppo would have reached, which failed"),
+    ("failed=ppo,A", "guide -", "3 which failed. No training finished.|"),
+    # Doing nothing is used where it is clearly better than everything else.
+    ("guide=20 zero=60 ppo=90", "ppo -", "1 ppo"),
+    (f"{BAD} zero=40 N=-130", "zero -", CLEAR),
+    (f"{BAD} zero=40 N=-130", "zero -", "1 |Doing nothing"),
+    (f"{BAD} zero=40 N=-130", "zero -", "2 +80.0"),
+    (f"{BAD} zero=40 N=-130", "zero -", "score 0.6"),
+    (f"{BAD} zero=-120 N=40", "N -", CLEAR),
+    (f"{BAD} zero=-120 N=40", "N -", "1 |The un"),
+    (f"{BAD} zero=-120 N=40", "N -", "2 +80.0"),
+    (f"{LOW} guide=-80 ppo=-90", "zero -", "1 everything else here but"),
+    ("guide=50 ppo=40,30 zero=50.1,", "guide -", "3 zero"),
+    (
+        f"{WORSE} guide=-230 ppo=-300,0",
+        "zero -",
+        "1 (-200.0), which no guide and no trained policy",
+    ),
+    # Nothing is better than random actions.
+    ("guide=-5 opposite=-6 ppo=-1,1 A=0.3,-4", "nothing A", "1 clearly better than random actions"),
+    ("guide=-5 opposite=-6 failed=ppo", "nothing -", "1 no training finished"),
+    ("guide=-5 opposite=-6 failed=ppo", "nothing -", "3 what made the trainings fail"),
+]
 
 
-@pytest.mark.parametrize("rule", RULES)
-def test_what_costs_nothing_wins_unless_something_is_clearly_better(rule):
-    use, means = RULES[rule]
-    found = verdict(entries(**means))
-    assert (found.use, found.train) == (use, ANCHORED if ANCHORED in means else "")
-
-
-def test_guide_at_99_percent_of_what_was_reached_is_left():
-    found = verdict(entries(guide=99.3, ppo=40.0, coil_anchored=100.0))
-    assert (found.use, found.train) == ("guide", "coil_anchored")
-    assert found.sentences[0].startswith("Leave it: your guide is at 0.99 of what was reached")
-    assert "+59.3" in found.sentences[1]
-
-
-def test_guide_is_kept_where_nothing_is_clearly_better():
-    found = verdict(entries(guide=80.0, ppo=[40.0, 120.0], coil_anchored=[70.0, 100.0]))
-    assert found.use == "guide"
-    assert found.sentences[0].startswith("Keep your guide (80.0): it is at 0.94 of what")
-    assert "coil_anchored" in found.sentences[2]
-
-
-def test_guide_that_is_reversed_is_said_to_be_the_wrong_way_round():
-    found = verdict(entries(guide=-90.0, opposite=89.0, ppo=0.0, coil_anchored=88.0))
-    assert found.wrong_way_round
-    assert (found.use, found.train) == ("opposite", "coil_anchored")
-    assert found.sentences[0].startswith("Your guide is the wrong way round. Turn its action round")
-    assert "the opposite has 89.0, the guide -90.0" in found.sentences[0]
+@pytest.mark.parametrize(("means", "decided", "said"), RULES)
+def test_rule_decides_what_is_used_and_trained_and_says_why(means, decided, said):
+    given, failed = {}, []
+    for name, text in (word.split("=") for word in means.split()):
+        if name == "failed":
+            failed = [NAMES.get(each, each) for each in text.split(",")]
+        else:
+            values = [float(each) for each in text.split(",") if each]
+            given[NAMES.get(name, name)] = values if "," in text else values[0]
+    found = verdict(entries(**given), failed=failed)
+    assert [found.use, found.train] == [NAMES.get(each, each) for each in decided.split()]
+    assert len(found.sentences) == 3
+    assert found.wrong_way_round or "wrong way round" not in found.sentences[0]
+    number, _, text = said.partition(" ")
+    if number == "score":
+        assert found.score == pytest.approx(float(text))
+    else:
+        shown = f"|{found.sentences[int(number) - 1]}|"
+        assert (text.removeprefix("!") in shown) != text.startswith("!")
 
 
 @pytest.mark.parametrize(("opposite", "is_reversed"), [(55.2, False), (56.2, True)])
@@ -67,81 +111,6 @@ def test_opposite_must_be_better_by_a_tenth_of_the_way_from_random_to_the_best(
 ):
     found = verdict(entries(guide=50.0, opposite=opposite))
     assert (found.use == "opposite") == found.wrong_way_round == is_reversed
-
-
-def test_policy_may_be_better_than_the_opposite_of_a_reversed_guide():
-    found = verdict(entries(guide=-90.0, opposite=89.0, ppo=0.0, coil_anchored=95.0))
-    assert found.use == "coil_anchored"
-    assert found.sentences[0].startswith("Your guide is the wrong way round. Use coil_anchored")
-
-
-def test_ppo_is_recommended_where_it_is_best_and_anchored_sac_is_to_be_trained():
-    learned = {"coil_anchored": [70.0, 71.0], "coil_anchored_sac": 20.0}
-    found = verdict(entries(guide=20.0, ppo=[90.0, 92.0], **learned))
-    assert (found.use, found.train) == ("ppo", "coil_anchored_sac")
-    assert "over the guide" in found.sentences[1]
-    assert "over PPO" not in found.sentences[1]
-
-
-def test_anchored_policy_is_recommended_where_it_is_best():
-    found = verdict(entries(ppo=[10.0, 20.0], coil_anchored=[90.0, 92.0], residual=[80.0, 85.0]))
-    assert found.use == found.train == "coil_anchored"
-    assert "+41.0" in found.sentences[1]
-    assert "+76.0" in found.sentences[1]
-    assert "those of ppo differ by 10.0, the most here" in found.sentences[2]
-
-
-def test_what_is_not_clearly_worse_is_undecided():
-    found = verdict(entries(ppo=[88.0, 91.0], coil_anchored=[90.0, 92.0]))
-    assert found.use == "coil_anchored"
-    assert "whether ppo would be as good or better" not in found.sentences[2]
-    found = verdict(entries(ppo=[93.0, 88.0], coil_anchored=[90.0, 92.0]))
-    assert "whether ppo would be as good or better" in found.sentences[2]
-
-
-def test_nothing_is_recommended_where_nothing_is_better_than_random_actions():
-    found = verdict(entries(guide=-5.0, opposite=-6.0, ppo=[-1.0, 1.0], coil_anchored=[0.3, -4.0]))
-    assert found.use == NOTHING
-    assert "clearly better than random actions" in found.sentences[0]
-    assert len(found.sentences) == 3
-
-
-def test_tuned_guide_is_recommended_where_it_is_clearly_better():
-    found = verdict(entries(tune=95.0, ppo=60.0, coil_anchored=70.0))
-    assert (found.use, found.train) == ("tune", "tune")
-    assert "tuned numbers: 95.0 instead of 50.0" in found.sentences[0]
-
-
-def test_failed_arms_are_named_as_undecided():
-    found = verdict(entries(coil_anchored=90.0), failed=["ppo"])
-    assert "what ppo would have reached, which failed" in found.sentences[2]
-    found = verdict(entries(), failed=["ppo", "coil_anchored"])
-    assert found.use == "guide"
-    assert found.sentences[2].endswith("which failed. No training finished.")
-
-
-def test_good_guide_is_kept_where_the_best_mean_is_of_a_policy_with_one_bad_seed():
-    found = verdict(entries(guide=60.0, ppo=[-20.0, 180.0], coil_anchored=[50.0, 61.0]))
-    assert (found.use, found.train) == ("guide", "coil_anchored")
-    assert found.score == pytest.approx(0.75)
-    assert "whether ppo" in found.sentences[2]
-
-
-@pytest.mark.parametrize(
-    ("name", "words"), [("zero", "Doing nothing"), ("first network", "The un")]
-)
-def test_doing_nothing_is_used_where_it_is_clearly_better_than_everything_else(name, words):
-    low = {"zero": -120.0, "first network": -130.0}
-    given = {"random": -160.0, "guide": -40.0, "opposite": -150.0, "ppo": [-90.0, -80.0]}
-    found = verdict(entries(**(low | given | {name: 40.0})))
-    assert (found.use, found.train) == (name, "")
-    assert found.score == pytest.approx(0.6)
-    first, second, _ = found.sentences
-    assert first.startswith(words)
-    assert (
-        "40.0) is clearly better than everything else here; your guide has -40.0, at 0.6" in first
-    )
-    assert "+80.0" in second
 
 
 @pytest.mark.parametrize(
@@ -160,23 +129,6 @@ def test_only_zero_actions_are_called_doing_nothing(action, words):
 
     assert said(zero=40.0, guide=-40.0, random=-160.0, ppo=-90.0)[0].startswith(words)
     assert f"nor {action} (-7.00), nor what was" in said(zero=-7.0, guide=-5.0, ppo=-2.0)[0]
-
-
-def test_guide_is_not_called_the_best_where_doing_nothing_is_as_good():
-    given = {"random": -200.0, "opposite": -190.0, "zero": 0.0, "first network": 0.0}
-    found = verdict(entries(guide=-80.0, ppo=-90.0, **given))
-    assert found.use in ("zero", "first network")
-    assert "everything else here but" in found.sentences[0]
-    found = verdict(entries(guide=50.0, ppo=[40.0, 30.0], zero=[50.1]))
-    assert found.use == "guide"
-    assert "zero" in found.sentences[2]
-
-
-def test_doing_nothing_may_be_all_that_is_better_than_random_actions():
-    given = {"random": -200.0, "opposite": -220.0, "zero": -100.0, "first network": -210.0}
-    found = verdict(entries(guide=-230.0, ppo=[-300.0, 0.0], **given))
-    assert (found.use, found.train) == ("zero", "")
-    assert "random actions (-200.0), which no guide and no trained policy" in found.sentences[0]
 
 
 def variable(made, name, mean, spread):
@@ -217,10 +169,3 @@ def test_nothing_is_recommended_on_one_case_and_it_is_said_why():
     assert found.use == NOTHING
     assert "no interval: one case" in found.sentences[1]
     assert "give more cases than one" in found.sentences[2]
-
-
-def test_nothing_is_to_be_trained_where_no_training_finished():
-    found = verdict(entries(guide=-5.0, opposite=-6.0), failed=["ppo"])
-    assert (found.use, found.train) == (NOTHING, "")
-    assert "no training finished" in found.sentences[0]
-    assert "what made the trainings fail" in found.sentences[2]

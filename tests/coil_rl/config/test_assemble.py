@@ -22,10 +22,10 @@ from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.testing import check_guide
 from coil_rl.transforms.action_space import ActionSpace
 
+METHODS = ["ppo", "coil action=choices", "residual_coil", "jump_start"]
 
-@pytest.fixture(
-    scope="module", params=["ppo", "coil action=choices", "residual_coil", "jump_start"]
-)
+
+@pytest.fixture(scope="module", params=METHODS)
 def run(request, tmp_path_factory):
     return make_untrained_run(
         tmp_path_factory.mktemp("runs") / "run", *ONE_SECOND, *f"method={request.param}".split()
@@ -34,21 +34,6 @@ def run(request, tmp_path_factory):
 
 def rewards(env, policy):
     return [row["reward"] for row in evaluate_policy(env, policy).episodes]
-
-
-def rewards_of_both(run, *words):
-    """Return the rewards of a policy in the env of its run, and as a guide in an env of words."""
-    opened = open_run(run)
-    env = opened.make_env(3, "evaluation", count=3)
-    guided = ["method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"]
-    as_guide = env_maker(composed(*words, *guided)).guided(3, "evaluation", count=3)
-    return rewards(env, opened.policy(env)), rewards(*as_guide)
-
-
-@pytest.mark.slow
-def test_guide_drives_as_the_policy_in_its_own_env(run):
-    own, as_guide = rewards_of_both(run, *ONE_SECOND)
-    assert as_guide == own
 
 
 @pytest.mark.slow
@@ -72,18 +57,32 @@ def test_run_without_an_agent_is_refused(tmp_path):
         LearnedGuide(str(run))
 
 
+PASTS = ["method=coil guide=recorded guide.recorded.file=FILE", "network=gru"]
+PASTS += ["method=coil guide=spline_memory"]
+LAST = "method=ppo +transform=last_action method.transforms.last_action.steps=2"
+LAST += " method.observes=[last_action]"
+SIX_STEPS = ["env=gym", "env.max_steps=6"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "options",
-    [["guide=recorded", "method=coil"], ["guide=spline_memory", "method=coil"], ["network=gru"]],
+    ("env", "words", "tolerance"),
+    [
+        *((ONE_SECOND, f"method={method}", {"rel": 0, "abs": 0}) for method in METHODS),
+        *((ONE_SECOND, words, {"abs": 1e-5}) for words in PASTS),
+        ([*SIX_STEPS, "env.id=Pendulum-v1"], LAST, {"rel": 1e-5}),
+        ([*SIX_STEPS, "env.id=MountainCarContinuous-v0"], LAST, {"rel": 1e-5}),
+    ],
 )
-def test_policy_with_a_past_acts_as_in_its_own_env(options, tmp_path):
+def test_guide_acts_as_the_policy_does_in_its_own_env(env, words, tolerance, tmp_path):
     (tmp_path / "actions.csv").write_text("0.1\n0.2\n-0.3\n")
-    if "guide=recorded" in options:
-        options = [*options, f"guide.recorded.file={tmp_path / 'actions.csv'}"]
-    run = make_untrained_run(tmp_path / "run", *ONE_SECOND, "learner.action_gain=3", *options)
-    own, as_guide = rewards_of_both(run, *ONE_SECOND)
-    assert as_guide == pytest.approx(own, abs=1e-5)
+    words = words.replace("FILE", str(tmp_path / "actions.csv")).split()
+    run = make_untrained_run(tmp_path / "run", *env, *words, "learner.action_gain=3")
+    opened = open_run(run)
+    own = opened.make_env(3, "evaluation", count=3)
+    guided = ["method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"]
+    as_guide = env_maker(composed(*env, *guided)).guided(3, "evaluation", count=3)
+    assert rewards(*as_guide) == pytest.approx(rewards(own, opened.policy(own)), **tolerance)
 
 
 def guided_by(run, guide):
@@ -106,17 +105,6 @@ def test_run_that_is_its_own_guide_is_refused(length, tmp_path):
     for _ in range(2):  # the first refusal leaves nothing behind
         with pytest.raises(UserError, match=message):
             LearnedGuide(str(tmp_path / "0"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", ["Pendulum-v1", "MountainCarContinuous-v0"])
-def test_policy_that_observes_its_last_actions_acts_as_in_its_own_env(env_id, tmp_path):
-    words = ["env=gym", f"env.id={env_id}", "env.max_steps=6"]
-    own = ["method=ppo", "+transform=last_action", "method.observes=[last_action]"]
-    own.append("method.transforms.last_action.steps=2")
-    run = make_untrained_run(tmp_path / "run", *words, *own, "learner.action_gain=3")
-    own, as_guide = rewards_of_both(run, *words)
-    assert as_guide == pytest.approx(own, rel=1e-5)
 
 
 def test_env_with_another_action_is_refused(tmp_path):

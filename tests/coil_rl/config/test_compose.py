@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
+from package_entries import declare
 from programs import CONF, ROOT, called, environment, shipped
 
 from coil_rl import Measure, UserError
@@ -246,14 +247,12 @@ with initialize_config_dir("FOLDER", version_base="1.3"):
 
 @pytest.mark.slow
 def test_files_of_an_installed_package_are_found_and_only_by_programs_of_coil_rl(tmp_path):
-    package, info = tmp_path / "stranger" / "conf", tmp_path / "stranger-1.dist-info"
+    package = tmp_path / "stranger" / "conf"
     (package / "guide").mkdir(parents=True)
     for folder in (package.parent, package):
         (folder / "__init__.py").write_text("")
     (package / "guide" / "wise.yaml").write_text("# @package guide.wise\n_target_: stranger.Wise\n")
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[coil_rl.conf]\nstranger = stranger.conf\n")
+    declare(tmp_path, "stranger", "1", "coil_rl.conf", {"stranger": "stranger.conf"})
     (tmp_path / "own.yaml").write_text("a: 1\n")
     command = [sys.executable, "-c", SCRIPT.replace("FOLDER", str(tmp_path))]
     done = subprocess.run(

@@ -9,12 +9,14 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal, Protocol
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from programs import composed
 from torch import nn
 
-from coil_rl.config.nodes import build, check_arguments, identity_of
+from coil_rl.config.nodes import build, check_arguments, code_of_run, identity_of
 from coil_rl.envs import Track
 from coil_rl.errors import UserError
 
@@ -203,11 +205,15 @@ def test_functions_differ_by_their_code():
 
 
 CODE = """
+import gymnasium
 GAIN = {k}
 class Base:
     def act(self, observation): return GAIN * observation
 class Rule(Base): pass
 def function(observation): return GAIN * observation
+class Plant(gymnasium.Env):
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
+gymnasium.register("Mine-v0", Plant)
 """
 
 
@@ -215,6 +221,7 @@ def imported(folder, monkeypatch, number):
     """Return a module of a user with a number in its file."""
     monkeypatch.syspath_prepend(folder)
     sys.modules.pop("mine", None)
+    gymnasium.registry.pop("Mine-v0", None)
     shutil.rmtree(folder / "__pycache__", ignore_errors=True)
     (folder / "mine.py").write_text(CODE.format(k=number))
     importlib.invalidate_caches()
@@ -242,6 +249,34 @@ def test_code_of_a_user_is_told_apart_by_its_file_in_any_process(name, tmp_path,
         check=True,
     )
     assert printed.stdout.strip() == identity_of(sys.modules["mine"].__dict__[name])
+    sys.modules.pop("mine")
+
+
+PLANT = "{_target_: mine.Plant, _partial_: true}"
+
+
+@pytest.mark.fast(3)
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["env.id=mine:Plant"],
+        ["env.id=mine:Mine-v0"],
+        ["env.id=Pendulum-v1", f"+env.controllers.mine={PLANT}"],
+        ["env.id=Pendulum-v1", f"env.wrappers=[{PLANT}]"],
+        ["env.id=Pendulum-v1", "guide=controller", "guide.controller.of=mine:Rule"],
+        ["env.id=Pendulum-v1", "guide=controller", "guide.controller.of=mine:function"],
+    ],
+    ids=["class", "registered", "beside", "wrapper", "controller", "function"],
+)
+def test_code_of_a_run_is_that_of_the_files_which_its_parts_are_defined_in(
+    words, tmp_path, monkeypatch
+):
+    config, found = composed("env=gym", "guide=constant", *words, "run_dir=unused"), []
+    for number in (1, 1, 2):
+        imported(tmp_path, monkeypatch, number)
+        found.append(code_of_run(config))
+    assert found[0] == found[1] != found[2]
+    assert found[0].keys() == {"mine"}
     sys.modules.pop("mine")
 
 

@@ -1,13 +1,12 @@
 """The parts of a configuration are those that it describes, and its proxies are trained once."""
 
 import shutil
-import sys
 from itertools import product
 from pathlib import Path
 
-import gymnasium
 import pytest
 import torch
+from odd_parts import Gain
 from omegaconf import OmegaConf
 from programs import ONE_SECOND, composed, shipped
 from torchrl.envs import RenameTransform, TransformedEnv
@@ -224,39 +223,32 @@ def beside(env):
 
 
 @pytest.mark.parametrize(
-    ("method", "kept"),
-    [("ppo", []), ("coil", ["leaning"]), ("coil_rfc", ["leaning"]), ("kickstart", ["leaning"])],
-)
-def test_agent_has_the_controllers_that_its_guide_reads(method, kept):
-    assert beside(env_maker(composed_beside(f"method={method}"))(2)) == kept
-
-
-def test_guide_alone_has_its_controllers_whatever_the_method():
-    env, _ = env_maker(composed_beside("method=ppo")).guided(2, TEST)
-    assert "leaning" in beside(env)
-
-
-@pytest.mark.parametrize(
-    "reader",
+    ("words", "read"),
     [
-        "observes=[observation,[controller,other]]",
-        "+watch.step.other=[controller,other]",
-        "evaluation.measures.completed.entry=[controller,other]",
+        ("method=ppo", []),
+        ("method=ppo label=others observes=[observation,leaning_more]", []),  # in other words
+        *((f"method={method}", ["leaning"]) for method in ("coil", "coil_rfc", "kickstart")),
+        ("method=ppo observes=[observation,[controller,other]]", ["other"]),
+        ("method=ppo +watch.step.other=[controller,other]", ["other"]),
+        ("method=ppo evaluation.measures.completed.entry=[controller,other]", ["other"]),
     ],
 )
-def test_controller_that_is_observed_logged_or_measured_stays(reader):
-    assert beside(env_maker(composed_beside("method=ppo", reader))(2)) == ["other"]
+def test_controllers_that_nothing_reads_are_known(words, read):
+    unread = unread_controllers(composed_beside(*words.split()))
+    assert unread == {"leaning", "other"} - {*read}
+
+
+def test_env_has_the_controllers_that_are_read():
+    assert beside(env_maker(composed_beside("method=ppo"))(2)) == []
+    assert beside(env_maker(composed_beside("method=coil"))(2)) == ["leaning"]
+    alone, _ = env_maker(composed_beside("method=ppo")).guided(2, TEST)
+    assert "leaning" in beside(alone)
 
 
 def test_controller_that_a_transform_reads_stays(monkeypatch):
     transform = RenameTransform([("controller", "leaning")], ["leaning"])
     monkeypatch.setattr(parts, "build_transforms", lambda *_: [transform])
     assert unread_controllers(composed_beside("method=ppo")) == {"other"}
-
-
-def test_name_inside_of_another_word_is_no_reader():
-    config = composed_beside("method=ppo", "label=others", "observes=[observation,leaning_more]")
-    assert unread_controllers(config) == {"leaning", "other"}
 
 
 TINY = [
@@ -270,16 +262,6 @@ TINY = [
 
 def composed_of_proxy(*overrides, name="train"):
     return composed(*TINY, *overrides, name=name)
-
-
-class Gain:
-    """A controller with a state of its own."""
-
-    def __init__(self, gain):
-        self.gain = gain
-
-    def act(self, observation):
-        return [self.gain * observation[0]]
 
 
 @pytest.fixture(scope="module")
@@ -334,7 +316,7 @@ def folder_of_proxy(guide):
     given = named("Pendulum-v1", guide, "place")
     words = [*given.words, "method=dynamic_coil_sequential"]
     config = composed_in_python(Named(words, given.nodes), "unused").config
-    return proxy_config(config, "controller").run_dir
+    return proxy_config(config, next(iter(config.guide))).run_dir
 
 
 def test_proxies_of_other_objects_are_other_ones():
@@ -342,52 +324,10 @@ def test_proxies_of_other_objects_are_other_ones():
     assert folder_of_proxy(one) == folder_of_proxy(Gain(1.0)) != folder_of_proxy(other)
 
 
-CODE = """
-import gymnasium
-
-class Plant(gymnasium.Env):
-    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
-    gain = {gain}
-
-class Controller:
-    def act(self, observation):
-        return [{gain} * observation[0]]
-
-def rule(observation):
-    return [{gain} * observation[0]]
-
-gymnasium.register("Changing-v0", Plant)
-"""
-PLANT = "{_target_: changing.Plant, _partial_: true}"
-
-
-@pytest.mark.fast(3)
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["env.id=changing:Plant", "guide=constant"],
-        ["env.id=changing:Changing-v0", "guide=constant"],
-        ["env.id=Pendulum-v1", f"+env.controllers.mine={PLANT}", "guide=constant"],
-        ["env.id=Pendulum-v1", f"env.wrappers=[{PLANT}]", "guide=constant"],
-        ["env.id=Pendulum-v1", "guide=controller", "guide.controller.of=changing:Controller"],
-        ["env.id=Pendulum-v1", "guide=controller", "guide.controller.of=changing:rule"],
-    ],
-    ids=["class", "registered", "beside", "wrapper", "controller", "function"],
-)
-def test_proxy_is_another_one_after_a_change_of_the_code_that_it_imitates(
-    words, tmp_path, monkeypatch
-):
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    folders = []
-    for gain in (1.0, 1.0, 2.0):
-        (tmp_path / "changing.py").write_text(CODE.format(gain=gain))
-        monkeypatch.delitem(sys.modules, "changing", raising=False)
-        monkeypatch.delitem(gymnasium.registry, "Changing-v0", raising=False)
-        given = ["env=gym", *words, "method=dynamic_coil_sequential", "run_dir=unused"]
-        config = composed(*given)
-        folders.append(proxy_config(config, next(iter(config.guide))).run_dir)
-    assert folders[0] == folders[1] != folders[2]
+def test_proxies_of_other_code_are_other_ones(monkeypatch):
+    before = folder_of_proxy("random")
+    monkeypatch.setattr(parts, "code_of_run", lambda config: {"mine": "a hash of its file"})
+    assert folder_of_proxy("random") != before
 
 
 def distilled(folder):
@@ -453,12 +393,6 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
     state = torch.load(used[0] / "policy_last.pt", weights_only=True)
     assert all(torch.equal(value, state[key]) for key, value in network.state_dict().items())
     assert open_run(run).policy()[0].names == ["spline", "zero"]
-
-
-def test_degraded_advice_is_refused_for_guides_that_learn():
-    config = composed_of_proxy("method=dynamic_coil_joint", "degrade=[noisy]", "run_dir=unused")
-    with pytest.raises(UserError, match="has no effect on guides that are trained"):
-        check(config)
 
 
 def test_proxies_are_copied_whole_or_not_at_all(tmp_path):

@@ -6,14 +6,14 @@ from functools import partial
 
 import gymnasium
 import numpy as np
-import pandas as pd
 import pytest
 import torch
-from outside_package.install import SOURCE
+from odd_parts import Gain
 from programs import called, read_csv
 from torchrl.envs import PendulumEnv
 
 import coil_rl
+from coil_rl import Run
 from coil_rl.config import nodes
 from coil_rl.errors import UserError
 from coil_rl.run import checkpoint
@@ -27,42 +27,9 @@ OF_A_LEARNER = ("budget.", "learner", "checkpoint_every=")
 
 
 @pytest.fixture(autouse=True)
-def package(monkeypatch, tmp_path):
-    """Make the user's package importable, as one that is installed, and work in a folder."""
-    monkeypatch.syspath_prepend(SOURCE)
+def place(thermostat, monkeypatch, tmp_path):
+    """Work in a folder."""
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.mark.slow
-def test_nine_lines_of_the_docs(tmp_path):
-    from thermostat.control import PI
-
-    observation = np.array([-6.0, 3.0], np.float32)
-    small = ["learner.anchor.share=0", *SHORT]
-
-    options = {"method": "coil_anchored", "frames": 64, "seed": 0, "overrides": small}
-    run = coil_rl.train(ENV, guide=PI, folder="outputs/room", **options)
-    table = run.evaluate(cases=3)
-    controller = coil_rl.open_run("outputs/room").controller()
-    controller.reset()
-    action = controller.act(observation)
-    run.train(frames=96)
-
-    assert isinstance(table, pd.DataFrame)
-    deterministic = table[table["actions"] == "deterministic"]
-    assert list(deterministic["case"]) == ["0", "1", "2", "mean"] * 2
-    assert action.shape == (1,)
-    assert 0 <= action[0] <= 1
-    metrics = read_csv(tmp_path / "outputs" / "room" / "metrics.csv")
-    assert [int(float(row["frames/rollout"])) for row in metrics] == [0, 32, 64]
-    parts = [float(metrics[-1][f"frames/{part}"]) for part in ("before", "rollout", "tests")]
-    assert float(metrics[-1]["frames"]) == sum(parts), "the tests are frames too"
-    # A run that was made in Python is a run for every program.
-    trusting = "trust=[thermostat]"
-    called("evaluate", "run=outputs/room", "evaluation.cases=2", trusting, "hydra.run.dir=again")
-    called("report", "folder=outputs")
-    called("train", "resume=outputs/room", trusting)
-    assert "coil-train" in called("info", "run=outputs/room").stdout
 
 
 class Held:
@@ -179,35 +146,40 @@ def alone(tmp_path):
     return coil_rl.prepare(ENV, guide=proportional, method="guide", folder=tmp_path / "run")
 
 
-@pytest.mark.fast(2)
-@pytest.mark.parametrize("number", [0, -1, 2.5, True, "3"])
-def test_number_that_is_none_is_refused_by_its_name(number, alone):
-    for argument, use in {"cases": alone.evaluate, "frames": alone.train}.items():
-        with pytest.raises(UserError, match=rf"^{argument}={number!r} must be a whole number of"):
-            use(**{argument: number})
-    assert not (alone.folder / "config.yaml").exists()
-
-
-def test_other_name_of_a_policy_is_refused(alone):
-    with pytest.raises(UserError, match="which='best' must be handed_over or last; with del"):
-        alone.controller("best")
-
-
-def test_run_is_no_env(alone):
-    with pytest.raises(UserError, match=r"^env is Run; .* a Run is trained by its train\(\)"):
-        coil_rl.train(alone, frames=32)
-
-
-@pytest.mark.slow
-def test_maker_of_an_env_is_an_env(tmp_path):
-    from thermostat.room import Room
-
-    for number, env in enumerate((Room, lambda: Room())):
-        folder = tmp_path / str(number)
-        run = coil_rl.prepare(env, method="ppo", frames=32, folder=folder, overrides=SHORT)
-        run.begin()
-        run.learn()
-        assert run.controller().act(np.zeros(2, np.float32)).shape == (1,)
+@pytest.mark.fast(4)
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        *(
+            (partial(use, **{name: number}), rf"^{name}={number!r} must be a whole number of")
+            for name, use in (("cases", Run.evaluate), ("frames", Run.train))
+            for number in (0, -1, 2.5, True, "3")
+        ),
+        (lambda run: run.controller("best"), "which='best' must be handed_over or last; with del"),
+        (
+            lambda run: coil_rl.train(run, folder=run.folder),
+            r"^env is Run; .* a Run is trained by its train\(\)",
+        ),
+        (
+            lambda run: coil_rl.train(3, folder=run.folder),
+            "env is int; give the id of a Gymnasium env",
+        ),
+        (
+            lambda run: coil_rl.train(ENV, method="coill", folder=run.folder),
+            "there is no method=coill",
+        ),
+        (
+            lambda run: coil_rl.train("NoSuchEnv-v3", folder=run.folder),
+            "NoSuchEnv-v3 cannot be made",
+        ),
+    ],
+)
+def test_mistake_is_one_sentence(call, message, tmp_path):
+    alone = coil_rl.prepare(ENV, guide=proportional, method="guide", folder=tmp_path / "run")
+    with pytest.raises(UserError, match=message) as refusal:
+        call(alone)
+    assert "\n" not in str(refusal.value)
+    assert not [*tmp_path.rglob("config.yaml")]
 
 
 @pytest.mark.slow
@@ -215,20 +187,6 @@ def test_torchrl_env_is_an_env(tmp_path):
     words = [*SMALL, "observes=[th,thdot]", "env.max_steps=10"]
     run = coil_rl.prepare(PendulumEnv, method="ppo", folder=tmp_path / "run", overrides=words)
     assert run.make_env(3).batch_size == (3,)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"env": 3}, "env is int; give the id of a Gymnasium env"),
-        ({"env": ENV, "method": "coill"}, "there is no method=coill"),
-        ({"env": "NoSuchEnv-v3"}, "NoSuchEnv-v3 cannot be made"),
-    ],
-)
-def test_mistake_is_one_sentence(arguments, message, tmp_path):
-    with pytest.raises(UserError, match=message) as refusal:
-        coil_rl.train(**arguments, folder=tmp_path / "run")
-    assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.slow
@@ -253,6 +211,8 @@ def test_longer_run_goes_on_and_says_what_its_schedules_mean(tmp_path, capsys):
     opened = coil_rl.open_run(folder, trust=["thermostat"])
     assert (opened.budget.frames, list(opened.budget.stages)) == (128, [64])
     error = called("train", f"resume={folder}", "budget.frames=160", "trust=[thermostat]").stderr
+    called("evaluate", f"run={folder}", "trust=[thermostat]", "hydra.run.dir=again")
+    assert "coil-train" in called("info", f"run={folder}").stdout
     assert "goes on from 128 to 160 frames" in error
     assert "schedules over the run, such as a learning rate, go on at 80% of their way" in error
 
@@ -273,7 +233,7 @@ def test_run_begins_from_the_policy_and_normaliser_of_another(tmp_path):
 
 
 def test_run_from_parts_is_trained_resumed_and_reported(tmp_path):
-    from coil_rl import PPO, Budget, EnvMaker, Evaluation, GymnasiumEnv, Run, Trial
+    from coil_rl import PPO, Budget, EnvMaker, Evaluation, GymnasiumEnv, Trial
 
     def bare(rows, cases, count):
         if cases == "train":
@@ -312,21 +272,11 @@ def test_edited_configuration_of_a_finished_run_is_refused(tmp_path):
     assert (run.folder / "evaluation.csv").exists()
 
 
-class Proportional:
-    """A controller with one gain."""
-
-    def __init__(self, gain=0.1):
-        self.gain = gain
-
-    def act(self, observation):
-        return [self.gain * float(observation[2])]
-
-
 @pytest.mark.slow
 def test_numbers_of_a_class_are_tuned(tmp_path):
     words = [word for word in SHORT if not word.startswith(OF_A_LEARNER)]
     options = {"method": "tune", "tune": {"gain": [-2, 2]}, "frames": 700, "overrides": words}
-    run = coil_rl.train("Pendulum-v1", guide=Proportional, folder=tmp_path / "run", **options)
+    run = coil_rl.train("Pendulum-v1", guide=Gain, folder=tmp_path / "run", **options)
     assert set(json.loads((run.folder / "tuned.json").read_text())) == {"gain"}
     assert run.controller().act(np.zeros(3, np.float32)).shape == (1,)
 

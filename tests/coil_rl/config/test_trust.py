@@ -11,6 +11,7 @@ import hydra.utils
 import pytest
 import yaml
 from omegaconf import OmegaConf
+from package_entries import declare
 from programs import CONF, composed, shipped
 
 from coil_rl.config import assemble as assembling
@@ -332,26 +333,24 @@ def test_folder_cannot_grant_itself_trust_and_a_run_does_not_save_it(package, sa
 
 
 def test_installed_package_with_an_entry_point_is_trusted(package, saved, tmp_path):
-    info = package / "their_package-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their_package\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(
-        "[coil_rl.trusted]\ntheir_package = their_package\nos = os\n"
-    )
+    trusted = {"their_package": "their_package", "os": "os"}
+    declare(package, "their_package", "1.0", "coil_rl.trusted", trusted)
     assert read(tmp_path, with_target(saved, "their_package.TheirGuide")).guide.theirs
     with pytest.raises(UserError, match="which is no part of a run"):
         read(tmp_path, with_target(saved, "os.system"))
 
 
-@pytest.mark.parametrize("name", ["os", "builtins", "torch", "hydra", "coil_rl"])
-def test_package_that_runs_any_code_is_never_trusted(name):
-    with pytest.raises(UserError, match=rf"functions of {name} run any code"):
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        *((name, rf"functions of {name} run any code") for name in ("os", "builtins", "torch")),
+        *((name, rf"functions of {name} run any code") for name in ("hydra", "coil_rl")),
+        ("a.b", r"trust=\[a.b\] must be a list of names of installed"),
+    ],
+)
+def test_package_that_cannot_be_trusted_is_refused(name, message):
+    with pytest.raises(UserError, match=message):
         trust.trust_packages([name])
-
-
-def test_trust_is_a_list_of_packages():
-    with pytest.raises(UserError, match=r"trust=\[a.b\] must be a list of names of installed"):
-        trust.trust_packages(["a.b"])
 
 
 @pytest.mark.slow
@@ -386,37 +385,30 @@ def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatc
             go_on()
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_shipped_logger_is_taken_by_its_class(name):
-    assert shipped_logger({"_target_": SHIPPED[name]["_target_"]}) == SHIPPED[name]
-    assert shipped_logger(SHIPPED[name]) == SHIPPED[name]
-
-
-def test_plain_names_and_flags_of_a_folder_are_kept():
-    changed = SHIPPED["wandb"] | {"project": "cones-2", "offline": False}
-    assert shipped_logger(changed) == changed
-
-
 @pytest.mark.parametrize(
-    ("name", "key", "value"),
+    ("name", "changes", "taken"),
     [
-        ("wandb", "project", "../elsewhere"),
-        ("wandb", "project", "${oc.env:HOME}"),
-        ("wandb", "project", {"_target_": "os.system", "command": "ls"}),
-        ("wandb", "project", 7),
-        ("wandb", "offline", "false"),
-        ("wandb", "save_dir", "elsewhere"),
-        ("wandb", "base_url", "elsewhere"),
-        ("wandb", "settings", {"_target_": "os.system"}),
-        ("mlflow", "tracking_uri", "elsewhere"),
-        ("mlflow", "artifact_location", "elsewhere"),
-        ("csv", "log_dir", "elsewhere"),
-        ("csv", "video_format", "mp4"),
-        ("tensorboard", "log_dir", "/tmp/elsewhere"),
+        *((name, {}, {}) for name in NAMES),
+        ("wandb", {"project": "cones-2"}, {"project": "cones-2"}),
+        ("wandb", {"offline": False}, {"offline": False}),
+        ("wandb", {"project": "../elsewhere"}, {}),
+        ("wandb", {"project": "${oc.env:HOME}"}, {}),
+        ("wandb", {"project": {"_target_": "os.system", "command": "ls"}}, {}),
+        ("wandb", {"project": 7}, {}),
+        ("wandb", {"offline": "false"}, {}),
+        ("wandb", {"save_dir": "elsewhere"}, {}),
+        ("wandb", {"base_url": "elsewhere"}, {}),
+        ("wandb", {"settings": {"_target_": "os.system"}}, {}),
+        ("mlflow", {"tracking_uri": "elsewhere"}, {}),
+        ("mlflow", {"artifact_location": "elsewhere"}, {}),
+        ("csv", {"log_dir": "elsewhere"}, {}),
+        ("csv", {"video_format": "mp4"}, {}),
+        ("tensorboard", {"log_dir": "/tmp/elsewhere"}, {}),
     ],
 )
-def test_nothing_else_of_a_folder_is_taken(name, key, value):
-    assert shipped_logger(SHIPPED[name] | {key: value}) == SHIPPED[name]
+def test_plain_names_and_flags_of_a_shipped_logger_are_taken_and_nothing_else(name, changes, taken):
+    for given in (SHIPPED[name], {"_target_": SHIPPED[name]["_target_"]}):
+        assert shipped_logger(given | changes) == SHIPPED[name] | taken
 
 
 @pytest.mark.parametrize(

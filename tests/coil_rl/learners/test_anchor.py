@@ -203,16 +203,6 @@ def test_steps_in_which_the_guide_acts_are_learned_from():
     torch.testing.assert_close(sac.buffer[:]["action"], executed)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"reach": 0}, {"gains": [1.5]}, {"gains": [0.0]}, {"choice_weight": 0}, {"share": 2}],
-    ids=str,
-)
-def test_value_out_of_range_is_refused(options):
-    with pytest.raises(ValueError, match=next(iter(options))):
-        Anchor(**options)
-
-
 class Returns:
     """Cases in which the return of a policy depends on its weights alone, plus a number a case.
 
@@ -318,18 +308,23 @@ def test_useless_guides_are_rarely_held():
     assert held <= 3
 
 
-def test_start_test_ends_when_it_would_take_more_than_its_share():
-    cases = Returns(lambda weights: -5.0 * abs(weights[0]), frames=20_000)
-    weights, numbers, _ = decided(None, cases=cases, share=0.05)
-    assert weights == [0]
-    assert numbers["start/cases"] == 2, "the next two cases would take 600 steps more"
-    assert cases.steps == 600
-
-
-def test_start_test_has_its_least_cases_whatever_they_take():
-    cases = Returns(lambda weights: -5.0 * abs(weights[0]), frames=1_500)
-    _, numbers, _ = decided(None, cases=cases, share=0.05, least_cases=4)
-    assert (numbers["start/cases"], cases.steps) == (4, 1_200)
+@pytest.mark.parametrize(
+    ("of", "given", "options", "held", "count"),
+    [
+        # The next two cases would take 600 steps more than the share.
+        (lambda weights: -5.0 * abs(weights[0]), {"frames": 20_000}, {"share": 0.05}, 0, 2),
+        # Its least cases are taken whatever they take.
+        (lambda weights: -5.0 * abs(weights[0]), {"frames": 1_500}, {"least_cases": 4}, 0, 4),
+        # Two equal differences are not enough where the returns of two cases lie about 10 apart.
+        (lambda weights: 20.0 * weights[0], {"noise": 10.0, "spread": 0.0}, {"gains": ()}, 1, 4),
+    ],
+    ids=["share", "least cases", "equal differences"],
+)
+def test_start_test_takes_some_cases(of, given, options, held, count):
+    cases = Returns(of, **given)
+    weights, numbers, _ = decided(None, cases=cases, **options)
+    assert (weights, numbers["start/cases"]) == ([held], count)
+    assert cases.steps == (2 if held else 3) * 100 * count
 
 
 @pytest.mark.parametrize("frames", [1_000, 12_000, 18_000, 30_000, 50_000, 200_000])
@@ -350,14 +345,6 @@ def test_guide_that_is_ahead_in_every_case_gets_more_cases():
         most = max(most, cases.steps)
     assert held >= 15
     assert 0.05 * 24_000 < most <= 0.08 * 24_000
-
-
-def test_two_equal_differences_are_not_enough():
-    """The lead is always 20, and the returns of two cases lie about 10 apart."""
-    cases = Returns(lambda weights: 20 * weights[0], noise=10.0, spread=0.0)
-    weights, numbers, _ = decided(None, cases=cases)
-    assert weights == [1]
-    assert numbers["start/cases"] == 4
 
 
 def test_lower_gains_are_not_tried_where_the_share_does_not_allow_for_them():

@@ -2,11 +2,11 @@
 
 from functools import partial
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from odd_parts import Plain
 from tensordict import TensorDict
 
 import coil_rl
@@ -17,28 +17,16 @@ TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation
 TINY += ["checkpoint_every=1", "learner.minibatches=2"]
 
 
-class Reactor(gymnasium.Env):
+class Reactor(Plain):
     """A temperature and a height: in kelvin and metres, or in units of their own."""
 
-    action_space = Box(-1, 1, (1,), np.float32)
     observation_space = Box(-np.inf, np.inf, (2,), np.float32)
 
-    def __init__(self, offset=(0.0, 0.0), unit=(1.0, 1.0), render_mode=None):
+    def __init__(self, offset=(0.0, 0.0), unit=(1.0, 1.0)):
         self.offset, self.unit = np.array(offset), np.array(unit)
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state, self.steps = self.np_random.normal(size=2), 0
-        return self.seen(), {}
-
-    def seen(self):
-        return (self.offset + self.unit * self.state).astype(np.float32)
-
-    def step(self, action):
-        self.state = 0.9 * self.state + 0.3 * self.np_random.normal(size=2)
-        self.steps += 1
-        reward = -float(np.square(action - 0.5 * self.state[:1]).sum())
-        return self.seen(), reward, False, self.steps >= 10, {}
+    def look(self):
+        return (self.offset + self.unit * super().look()).astype(np.float32)
 
 
 PHYSICAL = partial(Reactor, (322.0, 7000.0), (0.5, 900.0))
@@ -100,8 +88,8 @@ class Drifting(Reactor):
         self.begun += 1
         return super().reset(seed=seed)
 
-    def seen(self):
-        return (10.0 ** min(self.begun - 1, 4) * self.state).astype(np.float32)
+    def look(self):
+        return (10.0 ** min(self.begun - 1, 4) * super().look()).astype(np.float32)
 
 
 @pytest.mark.slow
@@ -112,16 +100,6 @@ def test_observations_that_leave_their_scale_later_are_named_once(tmp_path):
     named = [text for text in texts if "far out of scale for a network: [0] mean" in text]
     assert len(named) == 1
     assert named[0].endswith("; use learner.normalise=true")
-
-
-@pytest.mark.slow
-def test_cone_world_and_robot_are_not_normalised():
-    from coil_rl import compose_train
-
-    for env in ("cone_track", "driving_tasks", "simulated_robot"):
-        assert compose_train([f"env={env}"]).learner.normalise is False
-    for env in ("lunar_lander", "cart_pole", "babyai"):
-        assert compose_train([f"env={env}", "method=ppo"]).learner.normalise == "auto"
 
 
 @pytest.mark.parametrize(

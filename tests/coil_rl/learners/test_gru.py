@@ -1,26 +1,18 @@
-"""Policies with a memory solve what needs one, and train, resume and are evaluated as any other."""
+"""Policies with a memory solve what needs one, and are trained as any other."""
 
 import copy
-import csv
-import shutil
 
 import pytest
 import torch
 import worlds
 from any_env import AnyEnv, check_same_update
-from run_folders import make_untrained_run
-from tiny_runs import TINY, composed, trained
 from torchrl.data import Bounded, Categorical, MultiCategorical, Unbounded
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.config.parts import build_guides, env_maker
-from coil_rl.config.python import open_run
 from coil_rl.learners import A2C, PPO, Gru, KickstartLoss, Mlp, Reinforce
 from coil_rl.learners.policy import Entries
-from coil_rl.programs.train import resume
 from coil_rl.run.evaluation import evaluate_policy
-from coil_rl.run.parts import TEST
 from coil_rl.run.policy_batch import OnRows, policy_batch
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
@@ -184,42 +176,3 @@ def test_batch_of_kept_policies_acts_and_remembers_like_each_of_them():
                 )
     assert (together["policy_state"][:, 1] != 0).any()
     assert (together["policy_state"][:, 5] == 0).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["ppo", "coil", "jump_start"])
-def test_run_resumes_to_the_bit_and_is_evaluated_in_a_new_env(method, tmp_path):
-    run, stopped = trained(tmp_path / "run", method, "network=gru"), tmp_path / "stopped"
-    shutil.copytree(run, stopped)
-    for name in ("evaluation.csv", "policy_last.pt", "checkpoint.pt"):
-        (stopped / name).unlink()
-    resume(stopped)
-    for name in ("policy_last.pt", "metrics.csv", "evaluation.csv", "episodes.csv"):
-        assert (run / name).read_bytes() == (stopped / name).read_bytes(), name
-    opened = open_run(run)
-    env = opened.make_env(2, TEST)
-    mean = evaluate_policy(env, opened.policy(env)).mean_reward
-    with (run / "evaluation.csv").open(newline="") as file:
-        (row,) = (
-            row
-            for row in csv.DictReader(file)
-            if (row["driver"], row["actions"], row["case"]) == (method, "deterministic", "mean")
-        )
-    assert float(row["reward"]) == pytest.approx(mean)
-
-
-@pytest.mark.slow
-def test_policy_with_a_memory_is_a_guide(tmp_path):
-    words = ["method=ppo", "network=gru", "learner.action_gain=3"]
-    run = make_untrained_run(tmp_path / "run", *TINY, *words)
-    guided = composed("guide", "unused", "guide=learned", f"guide.learned.run={run}")
-    opened = open_run(run)
-    env = opened.make_env(3, "evaluation", count=3)
-    policy = evaluate_policy(env, opened.policy(env))
-    learned = evaluate_policy(*env_maker(guided).guided(3, "evaluation", count=3))
-    assert [row["reward"] for row in learned.episodes] == pytest.approx(
-        [row["reward"] for row in policy.episodes]
-    )
-    assert not any(
-        parameter.requires_grad for parameter in build_guides(guided)["learned"].parameters()
-    )

@@ -1,7 +1,7 @@
 import pytest
 import torch
 import worlds
-from any_env import AnyEnv
+from any_env import AnyEnv, learning
 from torch.distributions import AffineTransform, Normal, TanhTransform, TransformedDistribution
 from torch.nn import functional as F
 from torchrl.data import MultiCategorical
@@ -77,24 +77,14 @@ def test_loss_of_several_choices_is_their_cross_entropy():
     torch.testing.assert_close(loss, -policy.get_dist(data).log_prob(advised).mean())
 
 
-def replay(auxiliary, **options):
+def replay(auxiliary):
     """SAC with critics that differ, and a minibatch of its steps."""
     torch.manual_seed(0)
-    env = worlds.cones()
-    sac = SAC(
-        env,
-        critics=3,
-        starts=0,
-        batch_size=32,
-        updates_per_step=0.0625,
-        auxiliary=[auxiliary],
-        action_gain=1.0,
-        **options,
-    )
+    options = {"critics": 3, "auxiliary": [auxiliary], "action_gain": 1.0}
+    sac, rollout = learning(SAC, worlds.cones(), **options)
     with torch.no_grad():
         vector = sac.of_critics.vector
         vector.add_(torch.randn_like(vector), alpha=0.3)
-    rollout = Rollout(env, sac.policy, 16, sac.keys)
     return sac, rollout, rollout.collect().reshape(-1)
 
 

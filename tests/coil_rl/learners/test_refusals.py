@@ -71,6 +71,9 @@ OUT_OF_RANGE = [
     (TRPO, {"max_kl": 0, "damping": -1, "iterations": 0, "backtracks": -1, "shrink": 1.5}),
     (DQN, COMMON | REPLAY | {"max_grad_norm": 0, "epsilon": Linear(0.5, 2.0)}),
     (SAC, COMMON | REPLAY | {"max_grad_norm": 0, "temperature": 0, "action_scale": 0}),
+    (lambda env, **options: Anchor(**options), {"reach": 0, "choice_weight": 0, "share": 2}),
+    (lambda env, **options: Anchor(**options), {"gains": [1.5]}),
+    (lambda env, **options: Anchor(**options), {"gains": [0.0]}),
     (dynamic, {"shrink": 0, "critic_phases": "never", "guide_learning_rate": math.nan}),
 ]
 

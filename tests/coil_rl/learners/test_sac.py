@@ -76,37 +76,38 @@ def soft_target(sac, data, action, log_prob, value):
     return data["next", "reward"].squeeze(-1) + 0.9 * live * soft
 
 
-@pytest.mark.parametrize("norm", [True, False])
-def test_critics_learn_the_soft_value_of_the_next_state(norm):
-    """y = r + gamma (min Q'(s', b) - alpha log pi(b | s')); y = r where an episode terminated."""
-    sac, rollout = make(gamma=0.9, temperature=0.5, critic_layer_norm=norm)
+@pytest.mark.parametrize(
+    "options",
+    [{"critic_layer_norm": norm} for norm in (True, False)] + [{"critics": 5, "target_critics": 2}],
+    ids=["normalised", "plain", "drawn"],
+)
+def test_losses_of_critics_policy_and_temperature(options):
+    """y = r + gamma (min Q'(s', b) - alpha log pi(b | s')); y = r where an episode terminated.
+
+    The loss of the policy is alpha log pi(a | s) - min Q(s, a), that by log alpha -(log pi +
+    target). Of many critics some are drawn for the target, and the policy maximises their mean.
+    """
+    sac, rollout = make(gamma=0.9, temperature=0.5, target_entropy=-2.0, **options)
     spread(sac)
-    data = minibatch_of(sac, rollout)
+    data, many = minibatch_of(sac, rollout), "critics" in options
+    torch.manual_seed(1)
     with torch.no_grad():
-        torch.manual_seed(1)
         action, log_prob = sample(sac, after(data))
-        value = values_of(sac.target, after(data), action).amin(0).squeeze(-1)
-        target = soft_target(sac, data, action, log_prob, value)
+        following = values_of(sac.target, after(data), action)
+        if many:
+            following = following[torch.randperm(5)[:2]]
+        target = soft_target(sac, data, action, log_prob, following.amin(0).squeeze(-1))
         values = values_of(sac.critics, data, data["action"]).squeeze(-1)
         expected = (values - target).square().sum(0).mean()
-        torch.manual_seed(1)
-    torch.testing.assert_close(sac.losses(data)["loss_qvalue"].detach(), expected)
-
-
-def test_policy_and_temperature_learn_from_actions_of_the_policy():
-    """The loss is alpha log pi(a | s) - min Q(s, a), that by log alpha -(log pi + target)."""
-    sac, rollout = make(temperature=0.5, target_entropy=-2.0)
-    spread(sac)
-    data = minibatch_of(sac, rollout)
-    torch.manual_seed(1)
-    sample(sac, after(data))  # the target of the critics is sampled first
-    action, log_prob = sample(sac, data)
-    value = values_of(sac.critics, data, action).amin(0).squeeze(-1)
+        action, log_prob = sample(sac, data)
+        own = values_of(sac.critics, data, action).squeeze(-1)
+        value = own.mean(0) if many else own.amin(0)
     torch.manual_seed(1)
     losses = sac.losses(data)
-    torch.testing.assert_close(losses["loss_actor"], (0.5 * log_prob - value).mean())
+    torch.testing.assert_close(losses["loss_qvalue"].detach(), expected)
+    torch.testing.assert_close(losses["loss_actor"].detach(), (0.5 * log_prob - value).mean())
     slope = torch.autograd.grad(losses["loss_alpha"], sac.temperature["log_alpha"])[0]
-    torch.testing.assert_close(slope, 2.0 - log_prob.detach().mean())
+    torch.testing.assert_close(slope, 2.0 - log_prob.mean())
 
 
 def test_each_loss_has_gradients_for_its_own_networks_only():
@@ -193,26 +194,6 @@ def test_swings_the_pendulum_up(kind):
     # A random policy gets -1200, a good one -150. Single starts differ by 100, so the standard
     # error is 25.
     assert sum(returns) / 20 > -250
-
-
-def test_some_of_many_critics_are_drawn_for_the_target_and_the_policy_maximises_their_mean():
-    sac, rollout = make(critics=5, target_critics=2, gamma=0.9, temperature=0.5)
-    spread(sac)
-    data = minibatch_of(sac, rollout)
-    torch.manual_seed(1)
-    with torch.no_grad():
-        action, log_prob = sample(sac, after(data))
-        drawn = torch.randperm(5)[:2]
-        value = values_of(sac.target, after(data), action)[drawn].amin(0).squeeze(-1)
-        target = soft_target(sac, data, action, log_prob, value)
-        values = values_of(sac.critics, data, data["action"]).squeeze(-1)
-        error = (values - target).square().sum(0).mean()
-        action, log_prob = sample(sac, data)
-        mean = values_of(sac.critics, data, action).mean(0).squeeze(-1)
-    torch.manual_seed(1)
-    losses = sac.losses(data)
-    torch.testing.assert_close(losses["loss_qvalue"].detach(), error)
-    torch.testing.assert_close(losses["loss_actor"].detach(), (0.5 * log_prob - mean).mean())
 
 
 def test_crossq_normalises_both_states_together_and_has_no_target_networks():

@@ -9,7 +9,7 @@ import time
 
 import kill_and_resume
 import pytest
-from programs import called, composed, read_csv, shipped
+from programs import TINY_ARM, called, composed, read_csv, shipped
 
 from coil_rl.config.parts import env_maker
 
@@ -24,8 +24,16 @@ OTHERS = {
     ),
 }
 SMALL_CASES = shlex.split("evaluation.cases=3 evaluation.curve.num_envs=2 evaluation.gif=false")
-# Those that are not installed for every test.
-PACKAGES = {"babyai": "minigrid", "bipedal": "Box2D", "lunar_lander": "Box2D", "swimmer": "mujoco"}
+# Those of Gymnasium: what each needs, and the least mean reward of its public controller.
+OF_GYMNASIUM = {
+    "lunar_lander": ("Box2D", 200),
+    "bipedal": ("Box2D", -200),
+    "mountain_car": ("gymnasium", 88),
+    "pendulum": ("gymnasium", -400),
+    "cart_pole": ("gymnasium", 500),
+    "swimmer": ("mujoco", 300),
+    "babyai": ("minigrid", 0.5),
+}
 TRACKED = ["cone_track", "driving_tasks", "simulated_robot"]
 TINY = shlex.split(
     "evaluation.repeats=1 logger=none checkpoint_every=1 "
@@ -61,25 +69,30 @@ def kill(folder, overrides, mark):
     assert not (folder / "evaluation.csv").exists()
 
 
-def trained(env, learner, folder):
-    """Train to the end, evaluate the run again, and return the arguments of the training."""
-    overrides = [f"env={env}", *LEARNERS[learner], *TINY, *OWN[env]]
-    called("train", *overrides, f"hydra.run.dir={folder}", cwd=folder.parent)
+def words_of(env, learner):
+    return [f"env={env}", *LEARNERS[learner], *TINY, *OWN[env]]
+
+
+def check_evaluation(env, folder):
+    """Check that the evaluation of a finished run gives its table again."""
     assert (folder / ("lines.gif" if env in TRACKED else "returns.png")).exists()
     again = ["evaluation.repeats=1", "evaluation.gif=false", "trust=[torchrl]"]
-    again += ["hydra.run.dir=again"]
-    called("evaluate", f"run={folder}", *again, cwd=folder.parent)
+    called("evaluate", f"run={folder}", *again, "hydra.run.dir=again", cwd=folder.parent)
     evaluation = (folder.parent / "again" / "evaluation.csv").read_bytes()
     assert evaluation == (folder / "evaluation.csv").read_bytes()
-    return overrides
+
+
+def trained(env, learner, folder):
+    called("train", *words_of(env, learner), f"hydra.run.dir={folder}", cwd=folder.parent)
+    check_evaluation(env, folder)
 
 
 @pytest.mark.fast(4)
 @pytest.mark.parametrize("env", sorted({*FILES} - {*REPLAYS, FMU}))
 def test_env_takes_steps_with_the_advice_of_its_guide(env):
-    """A new YAML file is driven, too. What it cannot do without belongs into OWN or PACKAGES."""
-    if env in PACKAGES:
-        pytest.importorskip(PACKAGES[env])
+    """A new YAML file is driven, too. What it cannot do without belongs into OWN."""
+    if env in OF_GYMNASIUM:
+        pytest.importorskip(OF_GYMNASIUM[env][0])
     overrides = [f"env={env}", *OWN.get(env, [])]
     has_guide = bool(composed(*overrides).guide)
     config = composed(*overrides, f"method={'coil' if has_guide else 'ppo'}")
@@ -88,6 +101,28 @@ def test_env_takes_steps_with_the_advice_of_its_guide(env):
     entries = [*config.observes, "guide_action"] if has_guide else config.observes
     for key in entries:
         assert rollout[key].float().isfinite().all(), key
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env", OF_GYMNASIUM)
+def test_controller_of_an_env_is_evaluated(env, tmp_path):
+    package, least = OF_GYMNASIUM[env]
+    pytest.importorskip(package)
+    called("evaluate", f"env={env}", "evaluation.cases=2", "hydra.run.dir=run", cwd=tmp_path)
+    rows = read_csv(tmp_path / "run" / "evaluation.csv")
+    rewards = {row["case"]: float(row["reward"]) for row in rows}
+    assert rewards["mean"] >= least
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options", [["env.options.continuous=false"], ["guide=none", "method=ppo"]]
+)
+def test_lunar_lander_trains_with_discrete_actions_and_without_a_guide(options, tmp_path):
+    pytest.importorskip("Box2D")
+    short = [*TINY_ARM, "env.max_steps=60", "evaluation.gif=false", "logger=none", *options]
+    called("train", "env=lunar_lander", *short, "hydra.run.dir=run", cwd=tmp_path)
+    assert (tmp_path / "run" / "evaluation.csv").exists()
 
 
 @pytest.mark.slow
@@ -119,30 +154,10 @@ def test_env_without_a_guide_trains_with_replay(env, tmp_path):
 def test_killed_run_of_an_env_ends_like_an_uninterrupted_one(env, learner, tmp_path, monkeypatch):
     monkeypatch.setattr(kill_and_resume, "SMALL", [])
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
-    overrides = trained(env, learner, whole)
-    kill(resumed, overrides, kill_and_resume.marks(whole) // 2)
+    trained(env, learner, whole)
+    kill(resumed, words_of(env, learner), kill_and_resume.marks(whole) // 2)
     called("train", f"resume={resumed}", cwd=tmp_path)
     logs = [name for name in kill_and_resume.LOGS if (whole / name).exists()]
     assert len(logs) == 4
     for name in logs:
         assert (resumed / name).read_bytes() == (whole / name).read_bytes(), name
-
-
-def refusal(folder, *words):
-    """Return the sentence that refuses a training, which leaves no file."""
-    done = called("train", *words, "hydra.run.dir=run", cwd=folder, code=2)
-    (sentence,) = done.stderr.splitlines()
-    assert not any(folder.iterdir())
-    return sentence
-
-
-@pytest.mark.parametrize("env", REPLAYS)
-def test_replay_without_a_recording_is_refused_before_the_training(env, tmp_path):
-    said = refusal(tmp_path, f"env={env}", *LEARNERS["ppo"])
-    assert "give at least one MCAP file or rosbag2 folder: recording=FILE" in said
-
-
-def test_picture_of_what_an_env_does_not_have_is_refused(tmp_path):
-    picture = "{_target_: coil_rl.report.DrivenLines, tracks: []}"
-    words = ["env=gym", *OTHERS["gym"], "method=ppo", f"+evaluation.pictures.lines={picture}"]
-    assert "evaluation.pictures=info.pose is no entry of the env" in refusal(tmp_path, *words)

@@ -1,13 +1,12 @@
 """Training and evaluation on a GPU, where there is one."""
 
-import csv
 import shutil
 
 import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from programs import program
+from programs import program, read_csv
 from tiny_runs import METHODS, PPO, TRACKS, trained
 
 from coil_rl.programs.evaluate import evaluate
@@ -20,8 +19,9 @@ if not torch.cuda.is_available():
 
 def rewards(folder, *, sampled=True):
     """Return the rewards of the table, or those of deterministic actions."""
-    with (folder / "evaluation.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if sampled or row["actions"] != "sampled"]
+    rows = [
+        row for row in read_csv(folder / "evaluation.csv") if sampled or row["actions"] != "sampled"
+    ]
     return np.array([float(row["reward"]) for row in rows])
 
 

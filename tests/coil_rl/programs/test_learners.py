@@ -78,31 +78,6 @@ def test_compatible_method_and_learner_train(method, learner):
     assert method in BY_GUIDE or metrics.get("minibatches", 4) == 4
 
 
-@pytest.mark.fast(2)
-@pytest.mark.parametrize(
-    ("overrides", "sentence"),
-    [
-        ("method=ppo learner=dynamic_coil", "but DynamicCoil is one that improves its guides"),
-        ("method=dynamic_coil_sequential action=choices", "Dynamic COIL needs continuous actions"),
-        ("learner=dqn action.choices=1", "action: choices=1 must be at least 2"),
-        ("learner=dqn budget.frames=500", "ends before learning starts, after learner.starts=500"),
-        ("method=rlpd learner=sac budget.frames=4_999", "=4999 ends before learning starts"),
-        ("method=ppo network=gru learner.minibatches=5", "learner.minibatches=5 are more than the"),
-    ],
-)
-def test_other_incompatible_choices_are_refused(overrides, sentence):
-    with pytest.raises(UserError, match=sentence):
-        check(composed(*TINY, *overrides.split()))
-
-
 def test_learner_with_replay_may_mix_with_a_weight_that_does_not_change():
     words = ["method=mixing", "learner=sac", "method.transforms.mixing.weight=0.5"]
     check(composed(*TINY, *words))
-
-
-def test_off_policy_learners_set_their_action_and_batch():
-    dqn, sac, ppo = (composed(f"learner={name}") for name in ("dqn", "sac", "ppo"))
-    assert (dqn.action.choices, dict(sac.action), dict(ppo.action)) == (5, {}, {})
-    batches = [config.budget.num_envs * config.budget.steps for config in (dqn, sac, ppo)]
-    assert batches == [32, 32, 6_144]
-    assert len({config.budget.frames for config in (dqn, sac, ppo)}) == 1

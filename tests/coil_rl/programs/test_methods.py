@@ -12,6 +12,7 @@ from coil_rl.config.python import open_run
 from coil_rl.errors import UserError
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume
+from coil_rl.record import DELIVERY
 from coil_rl.run import checkpoint
 from coil_studies import Fallback
 
@@ -21,20 +22,26 @@ def proxies(tmp_path_factory):
     return f"proxy.folder={tmp_path_factory.mktemp('proxies')}"
 
 
+TESTED = (DELIVERY.name, "policy_handed_over.pt")
+WITH_MEMORY = [f"{method} network=gru" for method in ("ppo", "coil", "jump_start")]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
-def test_method_ends_with_the_same_files_after_a_resume(method, proxies, tmp_path, capsys):
-    run = trained(tmp_path / "run", method, proxies, "track.test.count=1")
+@pytest.mark.parametrize("words", [*METHODS, *WITH_MEMORY])
+def test_method_ends_with_the_same_files_after_a_resume(words, proxies, tmp_path, capsys):
+    method, *network = words.split()
+    run = trained(tmp_path / "run", method, *network, proxies, "track.test.count=1")
     stopped = tmp_path / "stopped"
     shutil.copytree(run, stopped)
-    for name in ("evaluation.csv", "policy_last.pt", "checkpoint.pt"):
+    for name in ("evaluation.csv", "policy_last.pt", "checkpoint.pt", *TESTED):
         (stopped / name).unlink(missing_ok=True)
     resume(stopped)
-    for name in ("policy_last.pt", "metrics.csv", "evaluation.csv", "episodes.csv"):
-        is_written = method != "guide" or name in ("evaluation.csv", "episodes.csv")
-        assert (run / name).exists() == (stopped / name).exists() == is_written
-        if is_written:
-            assert (run / name).read_bytes() == (stopped / name).read_bytes()
+    names = ["policy_last.pt", "metrics.csv", "evaluation.csv", "episodes.csv", *TESTED]
+    written = [name for name in names if (run / name).exists()]
+    assert ("metrics.csv" in written) == ("policy_last.pt" in written) == (method != "guide")
+    assert (DELIVERY.name in written) == (method in ("coil_anchored", "tune"))
+    for name in {"evaluation.csv", "episodes.csv", *written}:
+        assert (run / name).read_bytes() == (stopped / name).read_bytes(), name
     assert method == "guide" or "continues after " in capsys.readouterr().err
 
 
@@ -60,16 +67,6 @@ def evaluated(run, folder, *words):
 
 
 @pytest.mark.slow
-def test_existing_resume_does_not_repeat_a_finished_run(residual, capsys):
-    before = {file: file.stat().st_mtime_ns for file in residual.iterdir() if file.name != ".lock"}
-    trained(residual, "residual", "label=mine", "existing=resume")
-    assert {file: file.stat().st_mtime_ns for file in before} == before
-    assert "mine: mean test reward" in capsys.readouterr().out
-    with pytest.raises(UserError, match=r"residual holds a run with learner.gamma=0.99, not 0.9"):
-        trained(residual, "residual", "label=mine", "existing=resume", "learner.gamma=0.9")
-
-
-@pytest.mark.slow
 def test_trained_agent_is_evaluated_with_other_advice(residual, tmp_path):
     evaluated(residual, tmp_path, "degrade=[zeroed,adversarial]")
     assert {row["driver"] for row in rows(tmp_path)} == {"guide", "mine"}
@@ -91,20 +88,6 @@ def test_rfc_logs_the_reward_of_the_task_alone(tmp_path, plain):
     assert {key: first[key] for key in same} == {key: other[key] for key in same}
     assert float(first["train/guide_distance"]) > 0
     assert first["learner/loss_critic"] != other["learner/loss_critic"]
-
-
-@pytest.mark.slow
-def test_jump_start_without_steps_is_ppo_to_the_bit(tmp_path, plain):
-    jumped = trained(tmp_path / "jump", "jump_start", "method.transforms.jump_start.horizon=0")
-    first, other = (checkpoint.load(run / "policy_last.pt") for run in (jumped, plain))
-    assert all(torch.equal(first[key], other[key]) for key in other)
-
-
-@pytest.mark.slow
-def test_residual_of_scale_zero_is_the_guide(tmp_path):
-    run = trained(tmp_path / "run", "residual", "method.transforms.residual.scale=0")
-    guide, agent = rows(run, driver="guide"), rows(run, driver="residual", actions="deterministic")
-    assert [row["reward"] for row in agent] == [row["reward"] for row in guide]
 
 
 @pytest.mark.slow

@@ -75,11 +75,3 @@ def test_experiment_that_is_a_sweep_trains_in_an_own_env(tmp_path):
     called("train", *words, cwd=tmp_path)
     folders = sorted(path.parent.name for path in tmp_path.rglob("evaluation.csv"))
     assert folders == ["coil_seed0", "ppo_seed0"]
-
-
-@pytest.mark.slow
-def test_jobs_that_fail_for_one_reason_are_named_with_it_once(tmp_path):
-    words = ["-m", *ENV, "guide=controller", "guide.controller.of=no:thing", "seed=0,1,2"]
-    last = called("train", *words, cwd=tmp_path, code=2).stderr.splitlines()[-1]
-    assert "3 jobs of this sweep failed: jobs 0, 1, 2: guide.controller" in last
-    assert last.count("there is no module no") == 1

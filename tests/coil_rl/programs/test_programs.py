@@ -5,7 +5,7 @@ import time
 from importlib import metadata
 
 import pytest
-from programs import SHORT_LAP, TINY, TRACK, called, command, environment
+from programs import TINY, TRACK, called, command, environment
 
 STILL = "evaluation.gif=false"
 
@@ -35,16 +35,6 @@ def test_evaluate_repeats_the_numbers_of_train(run):
     folder, trained = run
     again = called("evaluate", "run=run", *TRACK, "evaluation.repeats=1", STILL, cwd=folder)
     assert again.stdout.splitlines()[:-1] == trained.stdout.splitlines()[:-2]
-
-
-@pytest.mark.slow
-def test_guide_alone_can_be_trained_and_evaluated(tmp_path):
-    words = [*SHORT_LAP, STILL, "method=guide", "guide=zero", "hydra.run.dir=run"]
-    done = called("train", *words, cwd=tmp_path)
-    assert "guide: mean test reward" in done.stdout
-    assert not (tmp_path / "run" / "metrics.csv").exists()
-    alone = called("evaluate", "guide=zero", *SHORT_LAP, STILL, "hydra.run.dir=alone", cwd=tmp_path)
-    assert alone.stdout.splitlines()[:-1] == done.stdout.splitlines()[:-1]
 
 
 def test_folder_with_a_run_is_refused(run):
@@ -93,22 +83,3 @@ def test_run_stopped_during_its_evaluation_resumes_to_the_same_numbers(run, tmp_
         moved = (tmp_path / "moved" / name).read_bytes()
         assert moved == (folder / "run" / name).read_bytes(), name
     assert not (tmp_path / "run").exists(), "the logger wrote into the old folder"
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments", "words"),
-    [
-        ("evaluate", ["run=/nowhere"], "run=/nowhere is not the folder of a run"),
-        ("train", ["-m", "resume=run,other"], "resume=run,other takes no argument but trust="),
-    ],
-)
-def test_folder_without_a_run_is_refused(name, arguments, words, tmp_path):
-    done = called(name, *arguments, cwd=tmp_path, code=2)
-    assert done.stderr.startswith(f"{name}: {words}")
-    assert not list(tmp_path.iterdir())
-
-
-def test_info_prints_versions(tmp_path):
-    out = called("info", cwd=tmp_path).stdout
-    for name in ("python", "coil-rl", "torch ", "torchrl", "hydra-core", "commit"):
-        assert name in out

@@ -88,9 +88,11 @@ def test_training_imports_no_library_that_it_does_not_use():
     assert printed(script) == "[]"
 
 
-def test_info_imports_nothing_heavy(tmp_path):
-    ((code, _, _, heavy),) = start(tmp_path, ["info"])
+def test_info_prints_versions_and_imports_nothing_heavy(tmp_path):
+    ((code, out, _, heavy),) = start(tmp_path, ["info"])
     assert (code, heavy) == (0, set())
+    for name in ("python", "coil-rl", "torch ", "torchrl", "hydra-core", "commit"):
+        assert name in out
 
 
 BACKENDS = ["nonsense", "module://matplotlib_inline.backend_inline", "module://not.there", "tkagg"]

@@ -118,10 +118,11 @@ def test_failed_job_leaves_the_others_alone_and_the_same_command_goes_on(tmp_pat
 
 
 @pytest.mark.slow
-def test_sweep_whose_jobs_are_all_refused_leaves_no_folder(tmp_path):
-    sweep = ["-m", *SMALL, "learner.gamma=7,8", "hydra.sweep.dir=sweep"]
-    error = called("train", *sweep, cwd=tmp_path, code=2).stderr
-    assert "2 jobs of this sweep failed" in error
+def test_sweep_whose_jobs_are_all_refused_names_the_reason_once_and_leaves_no_folder(tmp_path):
+    sweep = ["-m", *SMALL, "learner.gamma=7", "seed=0,1", "hydra.sweep.dir=sweep"]
+    last = called("train", *sweep, cwd=tmp_path, code=2).stderr.splitlines()[-1]
+    assert "2 jobs of this sweep failed: jobs 0, 1: learner.gamma=7" in last
+    assert last.count("gamma=7 must be at most 1") == 1
     assert not (tmp_path / "sweep").exists()
 
 

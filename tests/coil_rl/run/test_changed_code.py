@@ -10,23 +10,13 @@ from coil_rl import UserError
 from coil_rl.run.folder import CODE, CODE_BEFORE, code_of
 
 PLANT = """
-import gymnasium, numpy as np
-from gymnasium import spaces
+from odd_parts import Plain
 from rewards_of_mine import cost
 
-class Tank(gymnasium.Env):
-    observation_space = spaces.Box(-1, 1, (1,))
-    action_space = spaces.Box(-1, 1, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time, self.level = 0, self.np_random.uniform(-1, 1)
-        return np.array([self.level], np.float32), {}
-
+class Tank(Plain):
     def step(self, action):
-        self.time += 1
-        self.level = float(np.clip(self.level + 0.1 * action[0], -1, 1))
-        return np.array([self.level], np.float32), -cost(self.level), False, self.time >= 8, {}
+        seen, _, *ends = super().step(action)
+        return seen, -cost(seen[0]), *ends
 """
 TINY = ["learner=ppo", "learner.minibatches=1", "budget.num_envs=2", "budget.steps=8"]
 TINY += ["evaluation.cases=2", "evaluation.curve.points=1", "evaluation.curve.num_envs=2"]
@@ -49,7 +39,7 @@ def test_change_of_a_file_is_said_and_refused_where_the_run_would_go_on(place, c
     folder = place / "run"
     run = coil_rl.train("tank_of_mine:Tank", frames=32, folder=folder, overrides=TINY)
     begun = code_of(folder)[CODE]
-    assert set(begun) == {"tank_of_mine", "rewards_of_mine"}
+    assert set(begun) == {"tank_of_mine", "rewards_of_mine", "odd_parts"}
     assert coil_rl.open_run(folder, trust=["tank_of_mine"]).train(frames=48).budget.frames == 48
     run.evaluate(cases=1)
     (place / "rewards_of_mine.py").write_text("def cost(level):\n    return level**2\n")

@@ -7,7 +7,6 @@ import pytest
 import torch
 from any_env import AnyEnv
 from learned_runs import ON_POLICY, OPTIONS, STEPS, TINY, learned
-from outside_package.install import SOURCE
 from programs import shipped
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -25,10 +24,7 @@ WITHOUT_MEMORY = {*OPTIONS, "advisor"} - {"coil_anchored", "guide"}
 WITHOUT_MEMORY |= {method for method in METHODS if method.startswith("dynamic_coil")}
 
 
-@pytest.fixture(autouse=True)
-def package(monkeypatch):
-    """Make the user's package importable, as one that is installed."""
-    monkeypatch.syspath_prepend(SOURCE)
+pytestmark = pytest.mark.usefixtures("thermostat")
 
 
 def executed(run):
@@ -97,16 +93,6 @@ def test_action_is_in_the_numbering_of_the_env(tmp_path):
     _, actions, controller = check_same(folder)
     assert set(actions) <= {0, 1}
     assert controller.act([0.0, 0.0, 0.0, 0.0]) in (0, 1)
-
-
-@pytest.mark.slow
-def test_controller_is_the_guide_of_another_run(tmp_path):
-    first = coil_rl.open_run(learned(tmp_path / "first", "residual"))
-    observations, actions = executed(first)
-    second = learned(tmp_path / "second", "guide", guide=first.controller())
-    guided = coil_rl.open_run(second).controller()
-    sent = [guided.act(observation) for observation in observations]
-    np.testing.assert_allclose(sent, actions, rtol=0, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -226,31 +226,3 @@ def test_run_without_a_guide_in_its_env_compares_its_own_policies(tmp_path):
     folder = trained(tmp_path / "run", "method=ppo", ONCE)
     assert set(report(folder)["returns"]) <= {"last", "earlier"}
     assert math.isnan(float(read_csv(folder / "metrics.csv")[-1]["delivery/guide"]))
-
-
-@pytest.mark.slow
-def test_killed_run_ends_with_the_same_files(tmp_path):
-    overrides = ["method=coil_anchored", "checkpoint_every=2", "budget.frames=2400"]
-    whole = trained(tmp_path / "whole", *overrides)
-    stopped = trained(tmp_path / "stopped", *overrides)
-    for name in ("evaluation.csv", "evaluation.md", DELIVERY.name, "checkpoint.pt"):
-        (stopped / name).unlink()
-    for name in ("handed_over", "last"):
-        (stopped / f"policy_{name}.pt").unlink()
-    called("train", f"resume={stopped}", cwd=tmp_path)
-    for name in ("metrics.csv", DELIVERY.name, "policy_handed_over.pt", "evaluation.csv"):
-        assert (stopped / name).read_bytes() == (whole / name).read_bytes(), name
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("method=guide", "delivery=tested has no effect: method=guide trains no policy"),
-        ("evaluation.policy=last", "a training evaluates what it hands over"),
-        ("delivery=best", "delivery='best' must be 'last' or 'tested'"),
-    ],
-)
-def test_delivery_that_means_nothing_is_refused(override, message, tmp_path):
-    done = called("train", "env=pendulum", "delivery=tested", override, cwd=tmp_path, code=2)
-    assert message in done.stderr
-    assert not any(tmp_path.iterdir())

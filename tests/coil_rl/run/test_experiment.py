@@ -88,14 +88,6 @@ def test_run_writes_its_files_and_a_row_per_update(tmp_path):
     assert {"train/return", "train/crashed", "train/cone", "learner/loss_critic"} <= set(written[0])
 
 
-@pytest.mark.slow
-def test_same_seed_same_metrics(tmp_path):
-    for name, seed in [("first", 1), ("second", 1), ("other", 2)]:
-        experiment(tmp_path / name, seed).run()
-    logs = [(tmp_path / name / "metrics.csv").read_text() for name in ("first", "second", "other")]
-    assert logs[0] == logs[1] != logs[2]
-
-
 def test_tests_that_take_all_frames_leave_one_further_update(tmp_path):
     run = experiment(tmp_path / "run")
     run.reserve, run.updates, run.first = lambda: 10**6, 3, {"frames": 0}
@@ -107,49 +99,57 @@ class Killed(BaseException):
     pass
 
 
-@pytest.mark.fast("SplineMemoryGuide-4-None")
+@pytest.mark.fast("SplineMemoryGuide-learner.update-4-None")
 @pytest.mark.parametrize(
-    ("guide", "last", "anchor"),
+    ("guide", "place", "last", "anchor"),
     [
-        (RandomGuide, 1, None),
-        (RandomGuide, 5, None),
-        (SplineMemoryGuide, 4, None),
-        (SplineGuide, 4, None),
-        (SplineGuide, 1, Anchor()),
+        (RandomGuide, "learner.update", 1, None),
+        (RandomGuide, "learner.update", 5, None),
+        (SplineMemoryGuide, "learner.update", 4, None),
+        (SplineGuide, "learner.update", 4, None),
+        (SplineGuide, "learner.update", 1, Anchor()),
+        (SplineGuide, "curve.evaluate", 2, None),
+        (SplineGuide, "curve.keep", 5, None),  # the last policy of the run
     ],
 )
-def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last, anchor, capsys):
-    frames = 16 * 8 * 5
-    rows = experiment(tmp_path / "whole", frames=frames, guide=guide(), anchor=anchor).run()
+def test_stopped_and_resumed_run_ends_with_the_same_files(
+    tmp_path, guide, place, last, anchor, capsys
+):
+    def make(name, seed=0):
+        options = {"guide": guide(), "anchor": anchor, "frames": 16 * 8 * 5}
+        return experiment(tmp_path / name, seed=seed, **options)
 
-    stopped = experiment(tmp_path / "stopped", frames=frames, guide=guide(), anchor=anchor)
-    update, calls = stopped.learner.update, []
+    rows = make("whole").run()
+    stopped, calls = make("stopped"), []
+    owner, method = place.split(".")
+    called = getattr(getattr(stopped, owner), method)
 
-    def dying(batch, progress):
-        calls.append(progress)
+    def dying(*given):
+        calls.append(given)
         if len(calls) == last:
             # The first update is interrupted at once if its tests are kept.
-            assert STOP.ask() == (anchor is None)
+            assert owner == "curve" or STOP.ask() == (anchor is None)
             raise Killed
-        return update(batch, progress)
+        return called(*given)
 
-    stopped.learner.update = dying
+    setattr(getattr(stopped, owner), method, dying)
     with pytest.raises(Killed):
         stopped.run()
 
     # Once there is a checkpoint, nothing may depend on the seed of the second process.
-    kept, options = last > 2 or anchor is not None, {"guide": guide(), "anchor": anchor}
-    seed = 9 if kept else 0
-    again = experiment(tmp_path / "stopped", seed=seed, frames=frames, **options)
+    kept = owner == "curve" or last > 2 or anchor is not None
+    again = make("stopped", seed=9 if kept else 0)
     again.resume()
     assert as_written(again.run()) == as_written(rows)
-    place = f"after update {(last - 1) // 2 * 2}" if kept else "from the beginning: there is no"
-    assert f"{tmp_path / 'stopped'} continues {place}" in capsys.readouterr().err
+    if owner == "learner":
+        there = f"after update {(last - 1) // 2 * 2}" if kept else "from the beginning: there is no"
+        assert f"{tmp_path / 'stopped'} continues {there}" in capsys.readouterr().err
     whole, resumed = contents(tmp_path / "whole"), contents(tmp_path / "stopped")
     assert whole.keys() == resumed.keys()
-    for name in whole.keys() - {"checkpoint.pt", "checkpoint_previous.pt"}:
+    state = {"checkpoint.pt"} if owner == "learner" else set()
+    for name in whole.keys() - {"checkpoint_previous.pt"} - state:
         assert whole[name] == resumed[name], name
-    finished = experiment(tmp_path / "stopped", seed=9, frames=frames, **options)
+    finished = make("stopped", seed=9)
     finished.resume()
     assert as_written(finished.run()) == as_written(rows)
     assert contents(tmp_path / "stopped") == resumed
@@ -188,30 +188,6 @@ def test_damaged_log_is_refused(tmp_path, damage):
     log.write_bytes(damage(log.read_bytes()))
     with pytest.raises(UserError, match=r"metrics\.csv is damaged .*; put the whole file back"):
         experiment(tmp_path).resume()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["evaluate", "keep"])
-def test_run_stopped_during_its_evaluation_ends_with_the_same_files(tmp_path, method, monkeypatch):
-    rows = experiment(tmp_path / "whole").run()
-    stopped = experiment(tmp_path / "stopped")
-    called, calls = getattr(stopped.curve, method), []
-
-    def dying(frames):
-        calls.append(frames)
-        if len(calls) == (2 if method == "evaluate" else 5):  # the last one of the run
-            raise Killed
-        return called(frames)
-
-    monkeypatch.setattr(stopped.curve, method, dying)
-    with pytest.raises(Killed):
-        stopped.run()
-    again = experiment(tmp_path / "stopped", seed=9)
-    again.resume()
-    assert as_written(again.run()) == as_written(rows)
-    whole, resumed = contents(tmp_path / "whole"), contents(tmp_path / "stopped")
-    differing = {name for name in whole if whole[name] != resumed[name]}
-    assert differing <= {"checkpoint_previous.pt"}
 
 
 class WriteNaN(Transform):

@@ -9,7 +9,6 @@ import pytest
 from omegaconf import OmegaConf
 
 from coil_rl.config.trust import to_trust, trust_packages
-from coil_rl.errors import UserError
 from coil_rl.learners.anchor import StartTest
 from coil_rl.record import DELIVERY
 from coil_rl.run.reasons import handed_over, next_step, start_test, still_rising
@@ -59,12 +58,6 @@ def test_handing_over_is_said_with_its_reason(changes, part, tmp_path):
     (tmp_path / DELIVERY.name).write_text(json.dumps(report))
     (sentence,) = handed_over(tmp_path)
     assert part in sentence
-
-
-def test_damaged_file_is_one_sentence(tmp_path):
-    (tmp_path / DELIVERY.name).write_text("{")
-    with pytest.raises(UserError, match="remove it, and the sentence is left out"):
-        handed_over(tmp_path)
 
 
 def curve_of(*returns):

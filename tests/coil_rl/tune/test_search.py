@@ -1,12 +1,11 @@
 """Runs that tune a guide: a pendulum whose guide swings it up with too small a gain."""
 
-import csv
 import json
 import shutil
 
 import pytest
 import torch
-from programs import LAP, called
+from programs import LAP, called, read_csv
 
 from coil_rl import LearnedGuide, open_run
 from coil_rl.report.runs import read_runs
@@ -43,14 +42,9 @@ def run(tmp_path_factory):
     return folder
 
 
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def mean_rewards(run):
     """Return the mean rewards by driver, which are the last of its rows."""
-    return {row["driver"]: float(row["reward"]) for row in rows_of(run / "evaluation.csv")}
+    return {row["driver"]: float(row["reward"]) for row in read_csv(run / "evaluation.csv")}
 
 
 @pytest.mark.slow
@@ -62,7 +56,7 @@ def test_tuned_guide_is_better_on_cases_that_the_search_did_not_see(run):
 
 @pytest.mark.slow
 def test_every_step_is_a_frame_and_frames_are_bounded(run):
-    rows = rows_of(run / "metrics.csv")
+    rows = read_csv(run / "metrics.csv")
     frames = [int(row["frames"]) for row in rows]
     assert frames == sorted(frames)
     assert frames[0] == 0
@@ -75,7 +69,7 @@ def test_every_step_is_a_frame_and_frames_are_bounded(run):
 def test_budget_that_is_too_small_for_a_generation_and_its_test_is_said(tmp_path):
     folder = tmp_path / "run"
     tuned(folder, *SLOW_SWING, "budget.frames=300")
-    taken = int(rows_of(folder / "metrics.csv")[-1]["frames"])
+    taken = int(read_csv(folder / "metrics.csv")[-1]["frames"])
     assert taken > 300
     sentence = f"The search took {taken:,} frames, more than budget.frames=300"
     assert sentence in (folder / "evaluation.md").read_text()
@@ -115,7 +109,7 @@ def test_policy_may_be_anchored_at_a_tuned_guide(run, tmp_path):
     words = ["method=coil_anchored", "guide=learned", f"guide.learned.run={run}", *SMALL[1:]]
     words += ["budget={frames: 1000, num_envs: 2, steps: 50, minibatches: 2}"]
     called("train", "env=pendulum", "env.max_steps=60", *words, f"hydra.run.dir={folder}")
-    [start, *_] = rows_of(folder / "metrics.csv")
+    [start, *_] = read_csv(folder / "metrics.csv")
     assert float(start["start/guide"]) > -600
 
 
@@ -139,9 +133,9 @@ def test_interrupted_search_ends_with_the_same_files(run, tmp_path, monkeypatch)
 @pytest.mark.slow
 def test_run_that_is_made_longer_searches_on(run, tmp_path):
     shutil.copytree(run, tmp_path / "run")
-    before = rows_of(tmp_path / "run" / "metrics.csv")
+    before = read_csv(tmp_path / "run" / "metrics.csv")
     called("train", f"resume={tmp_path / 'run'}", "budget.frames=10000")
-    after = rows_of(tmp_path / "run" / "metrics.csv")
+    after = read_csv(tmp_path / "run" / "metrics.csv")
     frames = [int(row["frames"]) for row in after]
     assert len(after) > len(before)
     assert frames == sorted(frames)
