@@ -70,14 +70,18 @@ def takes_batch(
 def _agrees(
     title: str, rows: Sequence[Tensor], together: Ask, each: Ask | None, form: Callable[..., bool]
 ) -> bool:
-    """Ask for rows alone, together in two orders, and alone again; see `takes_batch`."""
+    """Ask for rows alone, together in two orders and as a batch of one, and alone again.
+
+    See `takes_batch`.
+    """
     count, single = len(rows[0]), each or together
 
     def alone(row: int) -> Tensor:
         return _numbers(single([entry[row : row + 1].clone() for entry in rows]))
 
     before, batches = list(map(alone, range(count))), []
-    orders = list(range(count)), list(reversed(range(count)))
+    # An array of NumPy takes a tensor of one number as its index, and gives no batch of one then.
+    orders = list(range(count)), list(reversed(range(count))), [0]
     try:
         batches = [together([entry[order].clone() for entry in rows]) for order in orders]
     except Exception:
@@ -94,7 +98,7 @@ def _agrees(
             )
     for batch, order in zip(batches, orders, strict=True):
         row = _other_row(batch, order, before, ROUNDING if each else BESIDE_OTHERS)
-        if each is not None and (row is not None or not form(batch, before[0])):
+        if each is not None and (row is not None or not form(batch, before[0], len(order))):
             return False
         if row is not None:
             beside = shown(_numbers(batch[order.index(row)]))
@@ -213,13 +217,13 @@ class _Shared(HostedGuide):
             action = self.each(rows).to(rows[0].device)
             return action.reshape(*entries[0].shape[:dims], *action.shape[1:])
 
-    def _has_form(self, together: Tensor, alone: Tensor) -> bool:
+    def _has_form(self, together: Tensor, alone: Tensor, count: int) -> bool:
         """Return whether an answer for a batch has the form of actions.
 
         Args:
             alone: the numbers of the first row alone.
+            count: of rows in the batch.
         """
-        count = len(ROWS)
         if together.numel() != count * alone.numel() or not together.isfinite().all():
             return False
         if together.shape == (count, *alone.shape):

@@ -348,6 +348,16 @@ def test_controller_reads_an_observation_as_the_env_gives_it(space, controller):
     assert np.array_equal(advice.numpy(), np.array(expected, np.float32))
 
 
+@pytest.mark.parametrize("rows", [1, 3])
+def test_table_of_numpy_gives_an_action_for_each_row_also_for_one(rows):
+    table = np.arange(10, dtype=np.float32).reshape(5, 2)
+    env = GymnasiumEnv(partial(Plant, spaces.Discrete(5), TWO), rows, max_steps=9)
+    guide = ControllerGuide(lambda place: table[place])
+    data = TransformedEnv(env, GuideActions({"table": guide})).rollout(3)
+    expected = table[data["observation"].argmax(-1).numpy()]
+    assert np.array_equal(data["guide_action"][..., 0, :].numpy(), expected)
+
+
 def test_network_reads_choices_as_one_hot_vectors():
     env = GymnasiumEnv(partial(Plant, spaces.MultiDiscrete([2, 3]), TWO), 2, max_steps=9)
     advised = TransformedEnv(env, GuideActions({"net": ControllerGuide(torch.nn.Linear(5, 2))}))
