@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from drives import drive
+from drives import SplineDriver, drive
 
 from coil_rl.envs import (
     ConeTrackEnv,
@@ -25,16 +25,6 @@ def seen(setup):
     return perception.range_max, perception.bearing_max, perception.scale
 
 
-class Straight:
-    """Steers straight ahead."""
-
-    def reset(self):
-        pass
-
-    def act(self, observation):
-        return np.zeros(1)
-
-
 def test_observations_are_those_of_the_training():
     perception = Perception(simulated_cone_classifier(), **AUTHORS)
     options = {"spline": "quadratic", "max_steering": 60.0, "assignment": "cyclic"}
@@ -42,7 +32,7 @@ def test_observations_are_those_of_the_training():
     setup, moments = setup_of(env), []
     limits, settings = Limits(setup.rate), {"spline": setup.spline, "smoothing": setup.smoothing}
     driver = LiveDriver(
-        Straight(), setup.perception, limits, setup.car, **settings, log=moments.append
+        SplineDriver(), setup.perception, limits, setup.car, **settings, log=moments.append
     )
     assert driver.car.max_steering == pytest.approx(60)
     state = env.reset()

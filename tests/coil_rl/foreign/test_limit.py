@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import torch
 from plants import Plant
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, GymWrapper, StepCounter, TransformedEnv
+from torchrl.envs import GymWrapper, StepCounter, TransformedEnv
+from worlds import Script
 
 from coil_rl import EnvBatch, GymnasiumEnv
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -26,28 +25,12 @@ def few(monkeypatch):
     monkeypatch.setattr("coil_rl.foreign.limit.LIMIT", LIMIT)
 
 
-class Endless(EnvBase):
+class Endless(Script):
     """It is never done; its reward is 1 in each step."""
 
     def __init__(self, *batch):
-        super().__init__(batch_size=batch)
-        self.observation_spec = Composite(observation=Unbounded((*batch, 1)), shape=self.batch_size)
-        self.action_spec = Bounded(-1, 1, (*batch, 1))
-        self.reward_spec = Unbounded((*batch, 1))
-
-    def _set_seed(self, seed):
-        pass
-
-    def _reset(self, tensordict=None):
-        return TensorDict({"observation": torch.zeros(*self.batch_size, 1)}, self.batch_size)
-
-    def _step(self, tensordict):
-        after = {
-            "observation": torch.zeros(*self.batch_size, 1),
-            "reward": torch.ones(*self.batch_size, 1),
-            "done": torch.zeros(*self.batch_size, 1, dtype=torch.bool),
-        }
-        return TensorDict(after, self.batch_size)
+        ones = torch.ones(1, *batch, 1)
+        super().__init__(torch.full(batch, 10**9), ones, observation=0 * ones)
 
 
 def stay(env):
