@@ -6,13 +6,12 @@ import math
 from functools import cache
 
 import torch
-from hydra import compose, initialize_config_module
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, GymEnv, PendulumEnv, SerialEnv, TransformedEnv
 
-from coil_rl.config import schema  # noqa: F401 registers the configuration schema
+from coil_rl import compose_train
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import SplineGuide
 from coil_rl.measures import Measure, measures_of
@@ -33,8 +32,7 @@ AUTHORS = {
 @cache
 def driving_measures(env="cone_track") -> dict[str, Measure]:
     """Return what an evaluation measures in an env of conf/env."""
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return measures_of(compose("train", [f"env={env}"]).evaluation.measures)
+    return measures_of(compose_train([f"env={env}"]).evaluation.measures)
 
 
 def cones(*transforms, cars=6) -> TransformedEnv:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 from drives import SplineDriver
-from hydra import compose, initialize_config_module
 from torchrl.envs import ExplorationType, set_exploration_type
 
+from coil_rl import compose_train
 from coil_rl.config.parts import build_learner, env_maker
 from coil_rl.envs import Perception, SimulatedRobotEnv, simulated_cone_classifier
 from coil_rl.envs.recordings.mcap_files import read_messages
@@ -70,8 +70,7 @@ POLICIES = {
 
 def untrained(words):
     """Return an env, the policy of an untrained run, and its controller."""
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("train", ["env=simulated_robot", *words, "run_dir=unused"])
+    config = compose_train(["env=simulated_robot", *words, "run_dir=unused"])
     make_env = env_maker(config)
     torch.manual_seed(0)
     if config.method.observes is None:

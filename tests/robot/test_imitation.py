@@ -6,7 +6,6 @@ import shutil
 import odd_recordings as odd
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from programs import called, read_csv
 from torchrl.envs import TransformedEnv
 
@@ -76,9 +75,7 @@ def test_the_test_drives_the_car_of_the_recordings():
     words = ["method=oil", "env=mcap_replay", "env.speed=0.3", "env.car_length=0.6"]
     words += ["env.max_steering=40", "env.spline=quadratic", "env.perception.range_max=1.6"]
     words += ["env.perception.scale=5", "env.perception.bearing_max=90", "run_dir=unused"]
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("train", words)
-    env = env_maker(config).bare(1, TEST, None)
+    env = env_maker(coil_rl.compose_train(words)).bare(1, TEST, None)
     assert isinstance(env, SimulatedRobotEnv)
     assert env.step_length * env.rate == pytest.approx(0.3)
     assert (env.car_length, env.max_steering) == (0.6, math.radians(40))

@@ -11,13 +11,11 @@ def given(env, steps=30):
 
     Each is [steps, rows].
     """
-    data, rows = env.reset(), []
-    for _ in range(steps):
-        shown = data["advice_given"][:, 0]
-        assert data["guide_action"][~shown].eq(0).all()
-        step, data = env.step_and_maybe_reset(data.set("action", torch.zeros(len(data), 1)))
-        rows.append((shown, step["guide_action"].abs().sum((1, 2)) > 0, step["next", "done"][:, 0]))
-    return [torch.stack(column) for column in zip(*rows, strict=True)]
+    still = torch.zeros(*env.batch_size, 1)
+    data = env.rollout(steps, lambda td: td.set("action", still), break_when_any_done=False)
+    shown, advice = data["advice_given"].squeeze(-1), data["guide_action"]
+    assert advice[~shown].eq(0).all()
+    return shown.T, (advice.abs().sum((2, 3)) > 0).T, data["next", "done"].squeeze(-1).T
 
 
 def test_advice_is_missing_in_whole_episodes_as_often_as_asked_for():

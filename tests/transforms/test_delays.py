@@ -1,11 +1,11 @@
 """Delays: each row of each episode has its own lag, and nothing else changes."""
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 import worlds
 from gymnasium import spaces
+from plants import Plant
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, Unbounded
 from torchrl.envs import (
@@ -79,11 +79,7 @@ class Counter(EnvBase):
 def driven(env, steps=24):
     """Return what a rollout with resets writes before and after each step, [3, steps]."""
     torch.manual_seed(0)
-    state, rows = env.reset(), []
-    for _ in range(steps):
-        step, state = env.step_and_maybe_reset(env.rand_action(state))
-        rows.append(step)
-    return torch.stack(rows, 1)
+    return env.rollout(steps, break_when_any_done=False)
 
 
 def test_observations_are_those_of_the_lag_of_their_row_and_episode():
@@ -195,35 +191,25 @@ def test_noise_has_its_standard_deviation_and_stays_within_the_bounds():
     assert float((values + noise).abs().max()) <= 1
 
 
-class Ramp(gymnasium.Env):
+class Ramp(Plant):
     """Numbers that rise by 0.1 a step, up to beyond their bounds."""
 
-    observation_space = spaces.Dict(
-        x=spaces.Box(np.float32([0, -np.inf, 0]), np.float32([1, 1, np.inf])),
-        choice=spaces.Discrete(3),
-        pair=spaces.MultiDiscrete([2, 3]),
-        flags=spaces.MultiBinary(2),
-    )
-    action_space = spaces.Discrete(2)
+    def __init__(self):
+        numbers = spaces.Box(np.float32([0, -np.inf, 0]), np.float32([1, 1, np.inf]))
+        choices = {"choice": spaces.Discrete(3), "pair": spaces.MultiDiscrete([2, 3])}
+        seen = spaces.Dict(x=numbers, flags=spaces.MultiBinary(2), **choices)
+        super().__init__(seen, spaces.Discrete(2), end=20)
 
-    def observe(self):
+    def look(self):
         rest = {"choice": 0, "pair": np.zeros(2, int), "flags": np.zeros(2, np.int8)}
-        return {"x": np.full(3, self.place, np.float32), **rest}
-
-    def reset(self, *, seed=None, options=None):
-        self.place = 0.0
-        return self.observe(), {}
-
-    def step(self, action):
-        self.place += 0.1
-        return self.observe(), 0.0, False, False, {}
+        return {"x": np.full(3, 0.1 * self.time, np.float32), **rest}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", [0, 1])
 def test_noise_stays_within_the_bounds_of_a_gymnasium_env(lag):
     def seen(*transforms):
-        env = GymnasiumEnv(Ramp, 64, max_steps=20)
+        env = GymnasiumEnv(Ramp, 64)
         env = TransformedEnv(env, Compose(ObservationDelay(lag, lag), *transforms))
         return env.rollout(18)["x"].unbind(-1)
 
@@ -237,13 +223,13 @@ def test_noise_stays_within_the_bounds_of_a_gymnasium_env(lag):
 
 def test_noise_takes_no_bounds_for_those_of_a_changed_entry():
     changed = Compose(ObservationNorm(0.0, 100.0, in_keys=["x"]), ObservationNoise(0.5, ["x"]))
-    env = TransformedEnv(GymnasiumEnv(Ramp, 64, max_steps=20), changed)
+    env = TransformedEnv(GymnasiumEnv(Ramp, 64), changed)
     assert float(env.reset()["x"].min()) < -1
 
 
 @pytest.mark.parametrize("key", ["choice", "pair", "flags"])
 def test_noise_on_choices_is_refused(key):
-    env = TransformedEnv(GymnasiumEnv(Ramp, max_steps=20), ObservationNoise(0.5, [key]))
+    env = TransformedEnv(GymnasiumEnv(Ramp), ObservationNoise(0.5, [key]))
     with pytest.raises(ValueError, match=f"has '{key}', but .* these real numbers: 'x'"):
         env.reset()
 

@@ -46,9 +46,7 @@ def got(env):
 
 def followed(env, steps=3):
     """Return the actions that the env got while its guide acted."""
-    policy, carrier = FollowAdvice(env), env.reset()
-    for _ in range(steps):
-        _, carrier = env.step_and_maybe_reset(policy(carrier))
+    env.rollout(steps, FollowAdvice(env))
     return got(env)
 
 

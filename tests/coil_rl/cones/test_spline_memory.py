@@ -87,10 +87,7 @@ def test_guide_knows_its_way_from_motion_alone():
     env = guided(tracks, 2, {}, {})
     start = torch.tensor([track.start for track in tracks])
     with torch.no_grad():
-        state = env.reset()
-        for _ in range(100):
-            state["action"] = state["guide_action"][:, 0]
-            state = env.step_mdp(env.step(state))
+        state = env.rollout(100, FollowAdvice(env), break_when_any_done=False)["next"][:, -1]
     x, y, turned = state["guide_state", "memory", "path_pose"].double().unbind(-1)
     cos, sin = start[:, 2].cos(), start[:, 2].sin()
     place = torch.stack(

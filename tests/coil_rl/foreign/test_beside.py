@@ -113,11 +113,8 @@ def in_a_transform(controller):
 
 
 def advice(env, key):
-    seen, carrier = [], env.reset()
-    for _ in range(STEPS):
-        seen.append(carrier[key].flatten())
-        _, carrier = env.step_and_maybe_reset(carrier.set("action", torch.zeros(1, 1)))
-    return torch.stack(seen)
+    still = env.rollout(STEPS, lambda td: td.set("action", torch.zeros(1, 1)))
+    return still[key][0].flatten(1)
 
 
 def in_the_env(controller):

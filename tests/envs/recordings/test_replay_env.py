@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 from drives import blind, drive
-from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-import coil_rl.config.schema  # noqa: F401  registers the typed roots
+from coil_rl import compose_train
 from coil_rl.config.nodes import build
 from coil_rl.envs import (
     McapReplayEnv,
@@ -191,8 +190,7 @@ def test_observation_is_that_of_a_robot_with_the_same_perception(tmp_path, range
 
 def test_configuration_builds_the_env(tmp_path):
     words = [f"recording=[{drive(tmp_path / 'a.mcap', 3)}]", "method=oil", "env=mcap_replay"]
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("train", [*words, "run_dir=unused"])
+    config = compose_train([*words, "run_dir=unused"])
     assert (config.budget.num_envs, config.budget.steps, config.budget.frames) == (1, 3, 3)
     node = OmegaConf.to_container(config.env, resolve=True)
     del node["perception"]

@@ -5,7 +5,6 @@ import pytest
 import torch
 from drives import labelling_drives
 from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import step_mdp
 
 from coil_rl.envs import (
     ConeTrackEnv,
@@ -107,13 +106,7 @@ def robots():
 @pytest.fixture(scope="module")
 def live():
     """The states and actions of two robots in 25 steps of the guide."""
-    env = robots()
-    rows, state = [], env.reset()
-    for _ in range(25):
-        step = env.step(SplineGuide()(state))
-        rows.append(step)
-        state = step_mdp(step)
-    return torch.stack(rows, 1)
+    return robots().rollout(25, SplineGuide(), break_when_any_done=False)
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
 from ovals import ring_track
+from programs import composed
 from worlds import driving_measures
 
 import coil_rl.config.schema  # noqa: F401  registers the typed roots
@@ -158,9 +158,8 @@ def test_no_tracks_are_refused():
 
 
 def test_configuration_agrees_with_the_defaults():
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        words = ["env=simulated_robot", "track=robot", "budget.num_envs=2", "run_dir=unused"]
-        config = compose("evaluate", words)
+    words = ["env=simulated_robot", "track=robot", "budget.num_envs=2", "run_dir=unused"]
+    config = composed(*words, name="evaluate")
     env = env_maker(config)(3, TEST).base_env
     assert isinstance(env, SimulatedRobotEnv)
     plain = SimulatedRobotEnv(num_envs=3, assignment="cyclic")
