@@ -1,12 +1,20 @@
 import full_disk
 import kill_and_resume
 import pytest
+import torch
 
 FMU = ["env=fmu", "env.step=0.01", "env.seconds=0.5", "env.workers=0", "trust=[coil_fmu]"]
 FMU += ["env.setpoints={speed: {low: 50, high: 150, every: 0.1}}"]
 FMU += ["env.parameters={inertia: {low: 0.008, high: 0.012}}"]
 FMU += ["method=ppo", "budget.num_envs=4", "budget.frames=3200"]
 FMU += ["evaluation.cases=4", "evaluation.curve.num_envs=2"]
+
+
+def test_states_are_compared_entry_by_entry_also_in_lists():
+    one, same, other = ({"buffers": [{"steps": torch.arange(n)}]} for n in (3, 3, 4))
+    assert kill_and_resume.same(one, same)
+    assert not kill_and_resume.same(one, other)
+    assert not kill_and_resume.same(one, {"buffers": []})
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from outside_package.install import PROXY, SOURCE, TINY, install
-from programs import ROOT, called, code_blocks
+from programs import ROOT, called, code_blocks, read_csv
 
 PLANT, PATH, FROM_PYTHON = (block for _, block in code_blocks(ROOT / "docs" / "your_env.md"))
 REFERENCE = ROOT / "docs" / "your_env_reference.md"
@@ -116,12 +116,28 @@ def test_several_agents_learn_as_printed():
     assert math.isfinite(found["result"].mean_reward)
 
 
+def means_of(run):
+    """Return the row of the means of each driver with deterministic actions."""
+    rows = [row for row in read_csv(run / "evaluation.csv") if row["case"] == "mean"]
+    return {row["driver"]: row for row in rows if row["actions"] == "deterministic"}
+
+
 @pytest.mark.slow
 def test_commands_run_in_the_order_of_the_page(folder):
     assert len(COMMANDS) == 13
     for name, *arguments in COMMANDS:
         called(name.removeprefix("coil-"), *arguments, *TOY[name], cwd=folder)
     outputs = folder / "outputs"
+    guide, agent = means_of(outputs / "room").values()
+    assert float(guide["reward"]) > 75 > 60 > float(agent["reward"])
+    assert float(guide["in_band"]) > 0.7 > float(agent["in_band"])
+    assert float(guide["completed"]) == 1
+    assert 20 < float(guide["energy"]) < 96
+    rewards = sorted(float(means_of(run)["guide"]["reward"]) for run in outputs.glob("train/*"))
+    assert len(rewards) == 4
+    assert rewards[1] > 75, "of each kind of controller"
+    learned = float(means_of(outputs / "ppo")["ppo"]["reward"])
+    assert rewards[0] == pytest.approx(learned), "of the policy that is a guide"
     pages = {path.relative_to(outputs).parts[0] for path in outputs.rglob("*.md")}
     assert pages >= {"room", "ppo", "sweep"}
     assert (outputs / "sweep" / "report.png").is_file()
