@@ -311,7 +311,7 @@ def not_worse(
         low=found.low,
         high=found.high,
         allowed=allowed,
-        spec=return_format([policy.mean_reward, guide.mean_reward]),
+        spec=return_format([found.low, found.high, allowed]),
     )
 
 

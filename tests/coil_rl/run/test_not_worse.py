@@ -29,8 +29,17 @@ def test_agent_is_not_worse_if_the_whole_interval_is_above_one_percent_less(agen
     (sentence,) = not_worse(result_of(mine), result_of(guide), "guide", chance=zero)
     assert f"Not worse than guide on these 3 cases: {answer} " in sentence
     _, low, high = mean_interval([reward - 100 for reward in agent])
-    spec = return_format([sum(mine) / 3, sum(guide) / 3])
+    spec = return_format([low, high, 1])
     assert f"{low:+{spec}} to {high:+{spec}}" in sentence
+    assert f"above {-1:{spec}}, 1 % of" in sentence
+
+
+def test_small_limit_is_shown_beside_large_returns():
+    (sentence,) = not_worse(result_of([100.1, 90.2]), result_of([100, 90]), "guide", chance=94)
+    assert (
+        "(reward minus the guide's: -0.485 to +0.785, 95 % interval; yes means above -0.010"
+        in sentence
+    )
 
 
 def test_agent_with_the_returns_of_its_guide_has_no_interval():
