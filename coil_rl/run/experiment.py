@@ -26,6 +26,7 @@ from coil_rl.run.reasons import start_test
 from coil_rl.run.rollout import Rollout
 from coil_rl.run.stopping import STOP
 
+REST = 0.1  # of the frames: a larger one that stays unused is said
 PUT_BACK = "put the files of the run back, or train again in another folder"
 
 
@@ -98,7 +99,7 @@ class Experiment(Stateful):
 
         The frames are rounded up to whole batches. What tests have taken, and what is kept for the
         last one, is left out of these, so that a run with tests takes no more frames than one
-        without. At least one further update is left.
+        without. At least one further update is left. A large rest that is no whole batch is said.
         """
         kept = 0 if self.reserve is None else self.reserve()
         batch = self.rollout.frames
@@ -107,6 +108,13 @@ class Experiment(Stateful):
                 whole = math.ceil((frames - self.before) / batch) * batch
                 updates = (whole - self.cases.steps - kept) // batch
                 self.ends[frames] = max(updates, self.updates + 1)
+        rest = self.frames - self.before - self.all_updates * batch - self.cases.steps - kept
+        if rest > REST * self.frames and not self.updates:
+            say(
+                f"train: {rest:,} of {self.frames:,} frames stay unused, because they are no whole "
+                f"batch of {batch:,}; take smaller batches (budget.steps) or more frames",
+                error=True,
+            )
         known = [update for update in self.ends.values() if update <= self.all_updates]
         self.curve.attach(self.metrics, known, self.rollout.frames, int(self.first["frames"]))
 

@@ -95,6 +95,15 @@ def test_tests_that_take_all_frames_leave_one_further_update(tmp_path):
     assert run.all_updates == 4
 
 
+@pytest.mark.parametrize(("kept", "rest"), [(0, None), (30, 98), (70, 58), (90, None)])
+def test_frames_that_are_no_whole_batch_beside_the_tests_are_said(tmp_path, capsys, kept, rest):
+    run = experiment(tmp_path / "run", frames=512)  # batches of 128
+    run.reserve, run.first = lambda: kept, {"frames": 0}
+    run._plan()
+    said = capsys.readouterr().err
+    assert (f"{rest} of 512 frames stay unused" in said) if rest else not said
+
+
 class Killed(BaseException):
     pass
 
