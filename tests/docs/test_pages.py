@@ -6,6 +6,7 @@ import sys
 import tomllib
 from functools import cache
 
+import pandas
 import pytest
 from programs import ROOT, code_blocks, environment
 
@@ -18,6 +19,18 @@ EXECUTED = {
     "robot.md": "from coil_rl.envs",
     "coil.md": "import",
     "export.md": "pretrained",
+}
+# Of the table of methods with replay: its columns, two a task, and the methods of its rows.
+TASKS = ["pendulum", "mountain_car", "serial_inventory", "energy_microgrid"]
+REPLAY = {
+    "coil_anchored": "coil_anchored_sac",
+    "coil": "coil_sac",
+    "ibrl": "ibrl",
+    "cheq": "cheq_sac",
+    "residual": "residual_sac",
+    "SAC alone": "sac",
+    "CrossQ alone": "crossq",
+    "tune": "tune",
 }
 
 
@@ -112,3 +125,18 @@ def test_distributed_collector_runs_a_learner(tmp_path):
     done = subprocess.run(command, env=environment(tmp_path), timeout=600, check=True, **options)
     updates = [line.split(":")[0] for line in done.stdout.splitlines()]
     assert updates == [f"update {number}" for number in range(4)]
+
+
+def test_returns_of_methods_with_replay_are_those_of_the_runs():
+    files = [DOCS / "methods" / f"{name}_runs.csv" for name in ("replay", "promise_sac")]
+    runs = pandas.concat(map(pandas.read_csv, files))
+    means = runs.groupby(["task", "method", "arm"])["end"].mean()
+    part = (DOCS / "learners.md").read_text().partition("### With a guide")[2]
+    for name, method in REPLAY.items():
+        [cells] = re.findall(rf"^\| \[?{name}\b[^|]*\|(.*)\|$", part, flags=re.MULTILINE)
+        for place, shown in enumerate(cells.split("|")):
+            if shown.strip():
+                arm = "alone" if name.endswith("alone") else ("intact", "reversed")[place % 2]
+                digits = len(shown.strip().partition(".")[2])
+                mean = means[TASKS[place // 2], method, arm]
+                assert float(shown) == round(mean, digits), (name, place)
