@@ -32,8 +32,8 @@ from coil_rl.transforms.link import Link
 from coil_rl.transforms.normalised_action import ActionUnits, given_units, units_of
 
 Key = TypeVar("Key", NestedKey, NestedKey | None)
-# What converts entries of an env to what it gives, where that is another thing, by entry.
-OwnNumbers: TypeAlias = Mapping[NestedKey, Callable[[Tensor], Tensor]]
+# What converts entries from the form of networks to that of the env, where it is another, by entry.
+OwnForms: TypeAlias = Mapping[NestedKey, Callable[[Tensor], Tensor]]
 
 
 def nested_key(key: Key) -> Key:
@@ -364,9 +364,9 @@ def own_shape(env: EnvBase) -> Sequence[int] | None:
     return getattr(env, "own_shape", None)
 
 
-def own_numbers(env: EnvBase) -> OwnNumbers:
-    """Return what converts entries to what the env gives, by entry."""
-    return getattr(env, "own_numbers", {})
+def own_forms(env: EnvBase) -> OwnForms:
+    """Return what converts entries from the form of networks to that of the env, by entry."""
+    return getattr(env, "own_forms", {})
 
 
 def space_of(env: EnvBase, action_key: NestedKey) -> ActionSpace:

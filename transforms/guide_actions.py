@@ -21,9 +21,9 @@ from torchrl.data import Composite, TensorSpec
 from coil_rl.transforms.action_space import (
     ActionSpace,
     ActionTransform,
-    OwnNumbers,
+    OwnForms,
     nested_key,
-    own_numbers,
+    own_forms,
     space_of,
 )
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
@@ -201,12 +201,12 @@ class Guides(TensorDictModuleBase):
         action: Tensor = data[self.action_key]
         return action if convert is None else convert(name, action, tensordict.batch_size)
 
-    def tell(self, space: ActionSpace, own: OwnNumbers) -> None:
+    def tell(self, space: ActionSpace, own: OwnForms) -> None:
         """Tell the guides that ask for it about their env.
 
         Args:
             space: of the actions of the guides.
-            own: what converts entries to what the env gives, by entry.
+            own: what converts entries from the form of networks to that of the env.
         """
         for guide in self.guides.values():
             if isinstance(guide, ToldGuide):
@@ -447,7 +447,7 @@ class GuideActions(ActionTransform):
             return torch.zeros(shape, dtype=space.dtype, device=tensordict.device)
         if not self._checked:
             self.guides.match_dtypes(tensordict)
-            self.guides.tell(self.guide_space, own_numbers(self.parent.base_env))
+            self.guides.tell(self.guide_space, own_forms(self.parent.base_env))
         return self.guides.advice(tensordict, self._fitted, memory, ended)
 
     def _fitted(self, name: str, action: Tensor, batch: torch.Size) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from coil_rl.transforms.action_space import ActionSpace, OwnNumbers
+from coil_rl.transforms.action_space import ActionSpace, OwnForms
 
 
 def guide_of(thing: Any) -> TensorDictModuleBase:
@@ -22,11 +22,11 @@ def guide_of(thing: Any) -> TensorDictModuleBase:
 class ToldGuide(TensorDictModuleBase):
     """A guide that is told which actions there are, and how its env numbers what it shows."""
 
-    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
+    def meet(self, space: ActionSpace, own: OwnForms) -> None:
         """Take what an env says about itself.
 
         Args:
-            own: what converts entries to what the env gives, by entry.
+            own: what converts entries from the form of networks to that of the env.
         """
 
 

@@ -41,7 +41,7 @@ from coil_rl.run.parts import TRAIN, EnvMaker
 from coil_rl.run.reasons import about_returns
 from coil_rl.run.run import Budget, Run
 from coil_rl.transforms import GuideActions
-from coil_rl.transforms.action_space import ActionSpace, OwnNumbers, space_of
+from coil_rl.transforms.action_space import ActionSpace, OwnForms, space_of
 from coil_rl.transforms.chain import Chain, links_of
 from coil_rl.transforms.guide_memory import primer_of
 from coil_rl.transforms.hosted import HostedGuide
@@ -242,7 +242,7 @@ class LearnedGuide(HostedGuide):
         self.requires_grad_(False)
         self.eval()
 
-    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
+    def meet(self, space: ActionSpace, own: OwnForms) -> None:
         """Check the action of an env.
 
         Raises:

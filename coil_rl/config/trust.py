@@ -225,9 +225,9 @@ def _check_origin(target: str, package: str, entry: str) -> None:
 def _is_own(thing: Any, target: str, package: str) -> bool:
     """Return whether what a package has under a name is its own.
 
-    A class or function says where it is defined. Other objects, such as a trained model of a
-    library or a `functools.partial`, are own values of a module of the package, which no installed
-    package has too; so is their method `predict`.
+    A class or function says where it is defined. Another object, such as a trained model of a
+    library or a `functools.partial`, is its own if a module of the package holds it, and no module
+    of another installed package. A method `predict` is judged by its object.
     """
     if str(getattr(thing, "__module__", None)).partition(".")[0] == package:
         return True

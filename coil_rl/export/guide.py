@@ -16,7 +16,7 @@ from torchrl.envs import TensorDictPrimer
 from coil_rl.errors import UserError
 from coil_rl.export.contract import ADVICE
 from coil_rl.export.policy import ExportedPolicy
-from coil_rl.transforms.action_space import ActionRange, ActionSpace, OwnNumbers
+from coil_rl.transforms.action_space import ActionRange, ActionSpace, OwnForms
 from coil_rl.transforms.guide_memory import primer_of
 from coil_rl.transforms.hosted import ToldGuide
 
@@ -53,7 +53,7 @@ class ExportedGuide(ToldGuide):
         self.in_keys = [*self.read, *self.memory]
         self.out_keys: list[NestedKey] = ["action", *(("next", name) for name in self.memory)]
 
-    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
+    def meet(self, space: ActionSpace, own: OwnForms) -> None:
         """Check the action of an env.
 
         Raises:

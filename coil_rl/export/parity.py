@@ -121,7 +121,7 @@ def record(
 
 
 class Heard:
-    """What the guides of a controller advised last, at least one of them, by hooks.
+    """The last advice of the guides of a controller, of which there is at least one.
 
     Args:
         guides: of the controller.

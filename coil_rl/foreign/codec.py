@@ -75,7 +75,9 @@ class Fineness:
 
 
 class OwnForm:
-    """Conversion of an entry to what the env gives: whole numbers, and a number without dimension.
+    """Conversion of an entry from the form of networks to that of the env.
+
+    Networks get floats, one-hot vectors for choices, and [1] for a number of the shape ().
 
     Args:
         space: of the entry, in which choices are one-hot vectors side by side.
@@ -470,7 +472,7 @@ class Codec:
 
     @property
     def own_forms(self) -> dict[NestedKey, OwnForm]:
-        """What converts entries to what the env gives, by key, where that is another thing."""
+        """What converts entries from the form of networks to that of the env, by key."""
         own = [each for each in self.entries if each.whole or each.given != each.shape]
         return {entry.key: OwnForm(entry.space) for entry in own}
 

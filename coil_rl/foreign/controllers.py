@@ -26,7 +26,7 @@ from coil_rl.foreign.guard import NUMBERS, Guard, hold
 from coil_rl.foreign.host import Host, Predictor, asks_for_env, called, check_call, role_of
 from coil_rl.foreign.remembered import copied, maker_of_rows, state_of
 from coil_rl.foreign.shared import FunctionGuide, NetworkGuide
-from coil_rl.transforms.action_space import ActionSpace, OwnNumbers, nested_key, written_key
+from coil_rl.transforms.action_space import ActionSpace, OwnForms, nested_key, written_key
 from coil_rl.transforms.hosted import HostedGuide, ToldGuide
 
 
@@ -36,8 +36,8 @@ class PerRow(HostedGuide):
     An object is made when its row first acts, and is not asked after the end of an episode, see
     `Guides`. `act(observation)` gets one NumPy array for each of `in_keys`; whole numbers and
     choices are as a Gymnasium env gives them. It returns an action: numbers, an index or a one-hot
-    vector. `reset()`, if there is one, is called at the start of each episode; without it
-    each episode gets a new object. Objects with `state_dict()` and `load_state_dict(state)` are
+    vector. `reset()`, if there is one, is called at the start of each episode; without it each
+    episode gets a new object. Objects with `state_dict()` and `load_state_dict(state)` are
     part of a checkpoint; without these, and for networks that remember more than `state_dict()`
     has, new episodes begin when a run is resumed. They are called one after the other: a batched
     guide is many times faster.
@@ -76,12 +76,12 @@ class PerRow(HostedGuide):
         self.make, self.hosts = make, dict[int, Host]()
         self.guard = Guard()
         self.title = title or getattr(getattr(make, "func", make), "__name__", repr(make))
-        self.own: OwnNumbers = {}
+        self.own: OwnForms = {}
         self.asked: list[int] = []  # rows of the last call
         # whether the last restored state held those of the objects; else new episodes begin
         self.continues = True
 
-    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
+    def meet(self, space: ActionSpace, own: OwnForms) -> None:
         """Read whole numbers and choices as the env gives them from here on."""
         self.own = own
 
@@ -234,7 +234,7 @@ class ControllerGuide(HostedGuide):
         """Whether there is one object for each row, see `Guides`."""
         return isinstance(self.guide, PerRow)
 
-    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
+    def meet(self, space: ActionSpace, own: OwnForms) -> None:
         """Tell the controller about its env, if it asks for that."""
         if isinstance(self.guide, ToldGuide):
             self.guide.meet(space, own)

@@ -85,7 +85,7 @@ class GymnasiumEnv(SeededRows):
 
     Attributes:
         observation_bounds: declared bounds of the entries that have any, which they may leave.
-        own_numbers: what converts entries to what the env gives, where that is another thing.
+        own_forms: what converts entries from the form of networks to that of the env, by entry.
         optional: entries in which NaN is a number without a value, not a fault: those of `info`.
         seconds: of a step of one row, by kind of env; the envs of a run share them.
 
@@ -164,7 +164,7 @@ class GymnasiumEnv(SeededRows):
         action, number = self.codec.actions.spec, Unbounded(1, dtype=dtype)
         observation = Composite()
         self.observation_bounds: dict[Any, tuple[torch.Tensor, torch.Tensor]] = {}
-        self.own_numbers = self.codec.own_forms
+        self.own_forms = self.codec.own_forms
         for entry in self.codec.entries:
             if entry.name in RESERVED:
                 raise ValueError(

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from coil_rl.foreign.faults import ForeignError, action_array, foreign, shown
 from coil_rl.foreign.guard import Guard
-from coil_rl.transforms.action_space import ActionSpace, OwnNumbers, nested_key
+from coil_rl.transforms.action_space import ActionSpace, OwnForms, nested_key
 from coil_rl.transforms.hosted import HostedGuide
 
 # Share of the largest number of the actions by which they may differ: for the same question; in a
@@ -151,7 +151,7 @@ class _Shared(HostedGuide):
     """
 
     space: ActionSpace | None = None  # unknown outside of an env
-    own: OwnNumbers = {}  # noqa: RUF012  replaced, never changed
+    own: OwnForms = {}  # noqa: RUF012  replaced, never changed
     for_batch: bool | None = None  # unknown before the first call
     each: Ask | None = None  # asks for one row after the other, if that is possible
 
@@ -183,7 +183,7 @@ class _Shared(HostedGuide):
             return action  # checked on its device by `GuideActions`
         return torch.as_tensor(action_array(action), device=entries[0].device)
 
-    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
+    def meet(self, space: ActionSpace, own: OwnForms) -> None:
         """Take the space of the actions, which decides what has the form of actions."""
         self.space, self.own = space, own
 

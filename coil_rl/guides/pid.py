@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torchrl.envs import TensorDictPrimer
 
 from coil_rl.ranges import NonNegative, Positive, checked
-from coil_rl.transforms.action_space import ActionSpace, OwnNumbers, nested_key, written_key
+from coil_rl.transforms.action_space import ActionSpace, OwnForms, nested_key, written_key
 from coil_rl.transforms.guide_memory import primer_of
 from coil_rl.transforms.hosted import ToldGuide
 
@@ -125,7 +125,7 @@ class PID(ToldGuide):
         self._check_length(name, len(row))
         return row.expand(self.count)
 
-    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
+    def meet(self, space: ActionSpace, own: OwnForms) -> None:
         """Keep within the bounds of the env; a `ValueError` for actions that loops cannot move."""
         if not space.continuous:
             raise ValueError("a PID moves numbers, but the actions of this env are choices")

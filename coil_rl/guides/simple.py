@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.errors import UserError
 from coil_rl.ranges import Count, checked
-from coil_rl.transforms.action_space import ActionSpace, OwnNumbers, nested_key
+from coil_rl.transforms.action_space import ActionSpace, OwnForms, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.hosted import ToldGuide
 
@@ -68,7 +68,7 @@ class ZeroGuide(ConstantGuide, ToldGuide):
         super().__init__(0.0, in_key, out_key)
         self.value: Tensor = nn.Buffer(torch.zeros(size), persistent=False)
 
-    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
+    def meet(self, space: ActionSpace, own: OwnForms) -> None:
         """Take the neutral action of the env."""
         self.value = space.neutral()
 
@@ -105,7 +105,7 @@ class RandomGuide(ToldGuide):
         self.module = SeededGenerator(seed)
         self.space: ActionSpace | None = None
 
-    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
+    def meet(self, space: ActionSpace, own: OwnForms) -> None:
         """Draw from the actions of the env from here on, unless `low` or `high` is given."""
         if self.low is None and self.high is None:
             self.space = space

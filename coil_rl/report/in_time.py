@@ -18,7 +18,7 @@ from coil_rl.foreign.gymnasium_env import NOT_OBSERVED
 from coil_rl.report import style
 from coil_rl.report.pictures import Picture
 from coil_rl.report.statistics import Array
-from coil_rl.transforms.action_space import ActionSpace, own_numbers, space_of
+from coil_rl.transforms.action_space import ActionSpace, own_forms, space_of
 from coil_rl.transforms.discrete_actions import DiscreteActions
 from coil_rl.transforms.normalised_action import given_units
 
@@ -84,7 +84,7 @@ def _observed(env: EnvBase, before: TensorDictBase) -> dict[str, Tensor]:
     the numbering of the env.
     """
     base, left = _base(env), MOST_OBSERVED
-    own, shown = own_numbers(base), dict[str, Tensor]()
+    own, shown = own_forms(base), dict[str, Tensor]()
     keys = list(base.observation_spec.keys(True, True))
     for key in ["observation"] if "observation" in keys else keys:
         value = None if key[0] in NOT_OBSERVED else before.get(key, None)

@@ -111,7 +111,7 @@ class Delivery:
         return max(self._affordable(), self._first_episodes() * self.cases.longest)
 
     def _fits(self) -> bool:
-        """Return whether there is a test: because its first cases fit, or because one is owed.
+        """Return whether there is a test: its first cases fit, or a guide is to be compared.
 
         Episodes are taken to be as long as in the start test, and without one as in the training. A
         run that holds a guide, or found one ahead without enough cases to hold it, is always

@@ -99,7 +99,8 @@ class Experiment(Stateful):
 
         The frames are rounded up to whole batches. What tests have taken, and what is kept for the
         last one, is left out of these, so that a run with tests takes no more frames than one
-        without. At least one further update is left. A large rest that is no whole batch is said.
+        without. At least one further update is left. If more than `REST` of the frames stay unused,
+        that is said.
         """
         kept = 0 if self.reserve is None else self.reserve()
         batch = self.rollout.frames

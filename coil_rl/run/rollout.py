@@ -91,7 +91,7 @@ class Rollout:
     ) -> TensorDictBase:
         """Take the steps of a batch, and return the data of the next one.
 
-        What fails may have met a number that is NaN or infinite: then that is the error.
+        If a step fails behind a number that is NaN or infinite, that number is the error.
 
         Args:
             first: data of the first step.

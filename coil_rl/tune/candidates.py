@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from coil_rl.transforms.action_space import ActionSpace, OwnNumbers
+from coil_rl.transforms.action_space import ActionSpace, OwnForms
 from coil_rl.transforms.hosted import HostedGuide, ToldGuide
 
 
@@ -25,7 +25,7 @@ class Candidates(HostedGuide):
         self.in_keys: list[NestedKey] = list(first.in_keys)
         self.out_keys: list[NestedKey] = list(first.out_keys)
         super().__init__()
-        self.known: tuple[ActionSpace, OwnNumbers] | None = None  # of the env
+        self.known: tuple[ActionSpace, OwnForms] | None = None  # of the env
         self.guides = nn.ModuleList(guides)
         self.share = 0  # number of rows of each guide, known at the start of episodes
 
@@ -44,7 +44,7 @@ class Candidates(HostedGuide):
         if self.known is not None:
             self.meet(*self.known)
 
-    def meet(self, space: ActionSpace, own: OwnNumbers) -> None:
+    def meet(self, space: ActionSpace, own: OwnForms) -> None:
         """Tell the guides that ask for it about their env."""
         self.known = space, own
         for guide in self.guides:
