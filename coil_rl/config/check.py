@@ -39,7 +39,7 @@ from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, transformed, try_out
 from coil_rl.run.training import INIT
 from coil_rl.transforms import GuideActions
-from coil_rl.transforms.action_space import nested_key
+from coil_rl.transforms.action_space import nested_key, written_key
 from coil_rl.transforms.guide_actions import UnfitActionError
 
 # Kind of a learner: description and example.
@@ -483,10 +483,10 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
         known = [*env.observation_spec.keys(True), *transform.supplied, *memory]
         for key in guide.in_keys:
             if key not in known:
-                has = ", ".join(map(dotted, env.observation_spec.keys()))
+                has = ", ".join(map(written_key, env.observation_spec.keys(True, True)))
                 remedy = getattr(guide, "remedy", "")  # what gives the entry that it reads
                 raise UserError(
-                    f"{name}: it reads {dotted(key)}, but the env has only {has}"
+                    f"{name}: it reads {written_key(key)}, but the env has only {has}"
                     f"{remedy and '; '}{remedy}"
                 )
         advised = TransformedEnv(env, transform)

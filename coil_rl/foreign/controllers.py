@@ -23,7 +23,15 @@ from torch import nn
 from coil_rl.errors import did_you_mean
 from coil_rl.foreign.faults import ForeignError, foreign, shown
 from coil_rl.foreign.guard import NUMBERS, Guard, hold
-from coil_rl.foreign.host import Host, Predictor, asks_for_env, called, check_call, role_of
+from coil_rl.foreign.host import (
+    Host,
+    Predictor,
+    asks_for_env,
+    called,
+    check_call,
+    observation_of,
+    role_of,
+)
 from coil_rl.foreign.remembered import copied, maker_of_rows, state_of
 from coil_rl.foreign.shared import FunctionGuide, NetworkGuide
 from coil_rl.transforms.action_space import ActionSpace, OwnForms, nested_key, written_key
@@ -49,6 +57,7 @@ class PerRow(HostedGuide):
         in_keys: entries to read, [*batch, ...].
         out_key: entry for the action, [*batch, A].
         title: name of the controller for messages; by default that of what makes it.
+        as_one: whether `act` takes all entries as one observation: a dictionary, or a tuple.
 
     Example:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -69,11 +78,12 @@ class PerRow(HostedGuide):
         in_keys: Sequence[NestedKey] = ("observation",),
         out_key: NestedKey = "action",
         title: str = "",
+        as_one: bool = False,
     ) -> None:
         self.read = [nested_key(key) for key in in_keys]
         self.in_keys, self.out_keys = [*self.read, "row", "is_init"], [nested_key(out_key)]
         super().__init__()
-        self.make, self.hosts = make, dict[int, Host]()
+        self.make, self.hosts, self.as_one = make, dict[int, Host](), as_one
         self.guard = Guard()
         self.title = title or getattr(getattr(make, "func", make), "__name__", repr(make))
         self.own: OwnForms = {}
@@ -125,7 +135,7 @@ class PerRow(HostedGuide):
                 host.begin()
             elif host.steps is not None:
                 host.steps += 1
-            return host.act(*observed)
+            return host.act(*([observation_of(self.read, observed)] if self.as_one else observed))
 
     def unfit(
         self, action: torch.Tensor, batch: torch.Size, space: ActionSpace, problem: str
@@ -197,7 +207,8 @@ class ControllerGuide(HostedGuide):
 
     Args:
         of: the controller, or its name, such as `my_package.control:MyPID`.
-        in_keys: entries to read; None for `observation`, or for those of a TensorDictModule.
+        in_keys: entries to read, an argument each, or a dictionary of them for what takes one
+            argument; None for `observation`, or for those of a TensorDictModule.
         options: arguments of the class, or further ones of the function, by name.
 
     Raises:
@@ -226,8 +237,9 @@ class ControllerGuide(HostedGuide):
         guide = _guide_of(thing, title, keys, dict(options or {}))
         self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
         super().__init__()
-        self.guide = guide
-        self.title = title
+        self.guide, self.title = guide, title
+        if isinstance(guide, HostedGuide):
+            self.remedy = "name those that it reads by in_keys=[ENTRY,...]"
 
     @property
     def by_row(self) -> bool:  # type: ignore[override]
@@ -267,15 +279,17 @@ def _guide_of(
             f"{'; its predict is a function: of=MODULE:NAME.predict' if is_regressor else ''}"
         )
     if role == "function":
-        check_call(thing, title, read, options)
-        return FunctionGuide(partial(thing, **options), read, title)
+        function = partial(thing, **options)
+        if check_call(thing, title, read, options):
+            return FunctionGuide(lambda *given: function(observation_of(read, given)), read, title)
+        return FunctionGuide(function, read, title)
     if is_class:
         check_call(thing, title, [], options)
         make, kind = partial(thing, **options), called(thing)
         if role == "act" and not issubclass(kind, nn.Module):
             bound = isinstance(inspect.getattr_static(kind, "act"), (staticmethod, classmethod))
-            check_call(kind.act, f"{title}.act", read if bound else ["self", *read], {})
-            return PerRow(make, read, title=title)
+            as_one = check_call(kind.act, f"{title}.act", read if bound else ["self", *read], {})
+            return PerRow(make, read, title=title, as_one=as_one)
         with foreign(f"the controller {title}", "the constructor"):
             thing = make()
     elif options:
@@ -300,8 +314,8 @@ def _of_object(thing: Any, title: str, keys: list[NestedKey] | None) -> TensorDi
     if role == "network":
         return NetworkGuide(thing, read, title)
     if role == "act":
-        check_call(thing.act, f"{title}.act", read, {})
-        return PerRow(maker_of_rows(thing), read, title=title)
+        as_one = check_call(thing.act, f"{title}.act", read, {})
+        return PerRow(maker_of_rows(thing), read, title=title, as_one=as_one)
     parts = getattr(getattr(thing, "observation_space", None), "spaces", None)
     if keys is None and isinstance(parts, Mapping):
         read = [nested_key(key) for key in parts]

@@ -7,6 +7,7 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -232,8 +233,10 @@ class Host:
 
 def check_call(
     function: Callable[..., Any], title: str, entries: Sequence[Any], options: Mapping[str, Any]
-) -> None:
-    """Raise a `ValueError` if a function cannot be called like this.
+) -> bool:
+    """Return whether a function takes several entries as one observation, see `observation_of`.
+
+    A `ValueError` if it takes them neither so nor one by one.
 
     Args:
         function: the function or class.
@@ -243,14 +246,46 @@ def check_call(
     try:
         signature = inspect.signature(function)
     except ValueError:  # some functions written in C have none
-        return
+        return False
+    own, read = (["self"], entries[1:]) if "self" in entries[:1] else ([], entries)
     try:
         signature.bind(*entries, **options)
     except TypeError as error:
-        positional = [str(entry) for entry in entries if entry != "self"]
-        given = ", ".join([*positional, *(f"{key}=" for key in options)])
+        if len(read) > 1:
+            with suppress(TypeError):
+                signature.bind(*own, "observation", **options)
+                return True
+        given = ", ".join([*map(str, read), *(f"{key}=" for key in options)])
         unknown = [key for key in options if key not in signature.parameters]
         hints = "".join(did_you_mean(key, signature.parameters) for key in unknown)
+        if read and not unknown:
+            hints = "; in_keys=[ENTRY,...] names what it is called with"
         raise ValueError(
             f"{title} takes {signature}, but is called with ({given}): {error}{hints}"
         ) from error
+    return False
+
+
+def observation_of(keys: Sequence[NestedKey], entries: Sequence[Any]) -> Any:
+    """Return entries as one observation of a Dict or Tuple space.
+
+    Args:
+        keys: of the entries, as an env names them; those of a Tuple are numbers.
+        entries: the entries.
+    """
+    whole: dict[str, Any] = {}
+    for key, entry in zip(keys, entries, strict=True):
+        *outer, last = (key,) if isinstance(key, str) else key
+        place = whole
+        for part in outer:
+            place = place.setdefault(part, {})
+        place[last] = entry
+    return _with_tuples(whole.get("observation", whole) if len(whole) == 1 else whole)
+
+
+def _with_tuples(part: Any) -> Any:
+    """Return nested dictionaries with tuples in place of those whose keys are 0, 1, ..."""
+    if not isinstance(part, dict):
+        return part
+    parts = {key: _with_tuples(each) for key, each in part.items()}
+    return tuple(parts.values()) if [*parts] == [*map(str, range(len(parts)))] else parts

@@ -540,7 +540,7 @@ def _kind_of(make: Callable[[], Any]) -> type:
 
 
 def _new(own: PerRow, make: Callable[[], Any]) -> PerRow:
-    return PerRow(make, own.read, own.out_keys[0], own.title)
+    return PerRow(make, own.read, own.out_keys[0], own.title, own.as_one)
 
 
 def difference(one: TensorDictBase, other: TensorDictBase) -> NestedKey | None:

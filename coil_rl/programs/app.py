@@ -13,7 +13,6 @@ overrides then take a second:
 
 import contextlib
 import functools
-import logging
 import os
 import signal
 import sys
@@ -168,7 +167,6 @@ def run_program(
         no_sweep: the sentence that refuses a sweep, of a program that has none.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
     bugs: list[Exception] = []
 
     @functools.wraps(task)
@@ -189,7 +187,9 @@ def run_program(
 
     with program(config_name):
         sys.argv[1:] = map(spelled, sys.argv[1:])
-        sys.argv += further(sys.argv[1:]) if further else []
+        texts = [n for n, word in enumerate(sys.argv) if "=" in word and word[0] != "-"]
+        place = texts[-1] + 1 if texts else len(sys.argv)  # options may follow, such as --cfg job
+        sys.argv[place:place] = further(sys.argv[1:]) if further else []
         _check_options(config_name)
         try:
             hydra.main(version_base="1.3", config_path=config_path, config_name=config_name)(

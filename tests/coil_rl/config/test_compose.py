@@ -188,6 +188,11 @@ def test_actions_that_are_numbers_are_learned_by_sac(words: list[str], found: li
     assert default_learner(words) == found
 
 
+def test_options_may_follow_the_words_to_which_the_learner_is_added() -> None:
+    shown = called("train", *PENDULUM, "--cfg", "job").stdout
+    assert "_target_: coil_rl.learners.SAC" in shown
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "label"), [("Pendulum-v1", "sac"), ("CartPole-v1", "ppo"), ("pendulum", "ppo")]

@@ -269,7 +269,7 @@ PLANT = "{_target_: mine.Plant, _partial_: true}"
     ids=["class", "registered", "beside", "wrapper", "controller", "function"],
 )
 def test_code_of_a_run_is_that_of_the_files_which_its_parts_are_defined_in(
-    words, tmp_path, monkeypatch
+    words, tmp_path, monkeypatch, caplog
 ):
     config, found = composed("env=gym", "guide=constant", *words, "run_dir=unused"), []
     for number in (1, 1, 2):
@@ -277,6 +277,7 @@ def test_code_of_a_run_is_that_of_the_files_which_its_parts_are_defined_in(
         found.append(code_of_run(config))
     assert found[0] == found[1] != found[2]
     assert found[0].keys() == {"mine"}
+    assert not caplog.records, "a registered name is no fault"
     sys.modules.pop("mine")
 
 

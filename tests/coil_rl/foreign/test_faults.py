@@ -269,6 +269,10 @@ class Broken(Plant):
     ("maker", "message"),
     [
         (lambda: None, "the env .* is None, not an env of Gymnasium"),
+        (
+            lambda: gymnasium.vector.SyncVectorEnv([Plant]),
+            "not an env of Gymnasium: give the env of one row, of which a run makes budget.num_env",
+        ),
         (lambda: {}["valve"], "the env .* cannot be made: it raised KeyError: 'valve'"),
         (lambda: Broken(), "the env .* cannot be made: it raised NotImplementedError: later"),
         (lambda: sys.exit(3), "the env .* cannot be made: it raised SystemExit: 3"),

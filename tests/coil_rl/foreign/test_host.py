@@ -58,6 +58,10 @@ class Counter:
 class Other:
     pass
 
+class OfThree:
+    def act(self, one, two, three):
+        return one
+
 def half(observation, gain=0.5):
     return gain * observation[..., :1]
 
@@ -248,9 +252,9 @@ class OfOneEntry:
             r"takes \(observation, gain=0.5\), but is called with \(observation, k=\)",
         ),
         (
-            "my_control:Counter",
+            "my_control:OfThree",
             {"in_keys": ["a", "b"]},
-            r"my_control:Counter.act takes \(self, observation\), but is called with \(a, b\)",
+            r"takes \(self, one, two, three\), but is called with \(a, b\): .*; in_keys=",
         ),
         (
             "my_control:Guide",
@@ -333,6 +337,38 @@ def test_controller_reads_an_observation_as_the_env_gives_it(space, controller):
     seen = [np.ravel(each) for each in plant.shown[-6:-1]]
     expected = [each[[0, -1]] if batched else first_two(each) for each in seen]
     assert np.array_equal(advice.numpy(), np.array(expected, np.float32))
+
+
+GEAR, POSE = spaces.Discrete(3, start=-1), spaces.Box(-1, 1, (2,))
+SHIP = spaces.Dict(nav=spaces.Dict(gear=GEAR, pose=POSE), draught=spaces.Box(0, 9, ()))
+OF_SHIP = [["nav", "gear"], ["nav", "pose"], "draught"]
+OF_PAIR = [["observation", "0"], ["observation", "1"]]
+
+
+@pytest.mark.parametrize(
+    ("space", "keys", "read"),
+    [
+        (SHIP, OF_SHIP, lambda whole: [whole["nav"]["gear"], whole["draught"]]),
+        (SHIP, OF_SHIP[:2], lambda whole: whole["nav"]["pose"]),
+        (spaces.Tuple((GEAR, POSE)), OF_PAIR, lambda whole: [whole[0], whole[1][1]]),
+    ],
+    ids=["dictionary", "part of it", "tuple"],
+)
+@pytest.mark.parametrize("kind", ["class", "object", "function"])
+def test_controller_of_one_argument_gets_several_entries_as_one_observation(
+    space, keys, read, kind
+):
+    class Acts:
+        def act(self, observation):
+            return read(observation)
+
+    plant = Plant(space, TWO)
+    of = {"class": Acts, "object": Acts(), "function": read}[kind]
+    guide = GuideActions({"it": ControllerGuide(of, keys)})
+    env = TransformedEnv(GymnasiumEnv(lambda: plant, max_steps=9), guide)
+    advice = env.rollout(5)["guide_action"].reshape(-1, 2)
+    expected = [read(shown) for shown in plant.shown[-6:-1]]
+    np.testing.assert_array_equal(advice, np.array(expected, np.float32))
 
 
 @pytest.mark.parametrize("rows", [1, 3])

@@ -84,6 +84,16 @@ OF_TRAINING = "has no effect: only a training reads it"
         *((name, f"run={LONG}", LONG[:60]) for name in ("listen", "drive", "export", "info")),
         ("evaluate", "run=/nowhere", "run=/nowhere is not the folder of a run"),
         ("replay", "recording=drive.mcap run_dir=new/er", "drive.mcap"),
+        (
+            "evaluate",
+            "guide=controller guide.controller.of=math:sin guide.controller.in_keys=[x]",
+            "guide.controller: it reads x, but the env has only observation, cones, ",
+        ),
+        (
+            "evaluate",
+            "guide=controller guide.controller.of=math:sin guide.controller.in_keys=[x]",
+            "; name those that it reads by in_keys=[ENTRY,...]",
+        ),
         # what an evaluation does not read
         ("evaluate", "run=RUN env.laps=2", f"env.laps=2 {OWN}; what can be changed is run, "),
         ("evaluate", "run=RUN +action.x=1", f"+action.x=1 {OWN}"),
