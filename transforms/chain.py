@@ -12,9 +12,11 @@ from typing import Any, TypeAlias
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor, nn
+from torch.nn.parameter import is_lazy
 from torchrl.envs import Compose, InitTracker, RewardSum, TensorDictPrimer, Transform
 from torchrl.envs import TransformedEnv as Env
 
+from coil_rl.errors import UserError
 from coil_rl.transforms.disturbance import Disturbance
 from coil_rl.transforms.guide_actions import GuideActions
 from coil_rl.transforms.link import Link, State, write
@@ -111,8 +113,13 @@ def _links_in(transform: Transform, tensors: bool) -> Iterator[Link]:
     if isinstance(transform, Compose):
         for each in transform.transforms:
             yield from _links_in(each, tensors)
-    elif not isinstance(transform, LEFT_OUT):
+    elif not isinstance(transform, LEFT_OUT) and not _pays(transform):
         yield transform if isinstance(transform, Link) else Other(transform, tensors)
+
+
+def _pays(transform: Transform) -> bool:
+    """Return whether a transform changes nothing but the reward."""
+    return bool(transform.out_keys) and {*transform.out_keys} <= {*transform.parent.reward_keys}
 
 
 class Other(Link):
@@ -120,12 +127,27 @@ class Other(Link):
 
     Args:
         transform: the transform.
-        tensors: whether it must not remember anything; else it gets the data of the step before.
+        tensors: whether it must not remember anything, which is a `UserError`; else it gets the
+            data of the step before.
     """
 
     def __init__(self, transform: Transform, tensors: bool) -> None:
         super().__init__(in_keys=list(transform.in_keys or ()), out_keys=[])
         self.transform, self.tensors = transform, tensors
+        if tensors and self._remembers():
+            raise UserError(
+                f"{type(transform).__name__} remembers earlier steps in a way of its own, which "
+                "neither a learned guide nor an exported policy can; train without it, such as "
+                "with network=gru"
+            )
+
+    def _remembers(self) -> bool:
+        """Return whether what the transform writes depends on the steps before."""
+        spec = self.transform.parent.observation_spec
+        calls = (spec.zero(), spec.one(), spec.zero())
+        first, _, again = (self.transform._call(data) for data in calls)
+        changed = any((again[key] != value).any() for key, value in first.items(True, True))
+        return changed or getattr(self.transform, "needs_past", False)
 
     def observe(self, data: TensorDictBase, state: State) -> State:
         """Write what the transform writes in a step, or after a reset."""
@@ -148,6 +170,14 @@ class Other(Link):
     def sent(self, data: Any, state: State) -> State:
         """Keep the data of the step."""
         return {} if self.tensors else {BEFORE: data}
+
+
+def restore(transform: Transform, state: dict[str, Any]) -> None:
+    """Restore what `state_dict` of a transform returned."""
+    for name, buffer in transform.named_buffers():
+        if is_lazy(buffer):  # until the first reset, as that of CatFrames
+            buffer.materialize(state[name].shape)
+    transform.load_state_dict(state)
 
 
 def memory_keys(policy: Any) -> list[tuple[str, ...]]:

@@ -14,6 +14,7 @@ from torchrl.data import TensorSpec, Unbounded
 
 from coil_rl.ranges import checked
 from coil_rl.transforms.guide_transform import GuideSettings, GuideTransform, Schedule
+from coil_rl.transforms.link import Link
 
 NORMS = {"l1": 1.0, "l2": 2.0, "linf": float("inf")}
 
@@ -80,3 +81,15 @@ class RewardCoupling(GuideTransform):
         reward = self.parent.full_reward_spec[self.reward_key]
         spec = Unbounded(reward.shape, device=reward.device, dtype=reward.dtype)
         return {key: spec.clone() for key in self.written}
+
+
+class TaskReward(Link):
+    """Keeps the reward as `task_reward`, in front of transforms that change it."""
+
+    @property
+    def records(self) -> Mapping[NestedKey, TensorSpec]:
+        """`task_reward`."""
+        return {"task_reward": self.parent.full_reward_spec[self.parent.reward_key].clone()}
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set("task_reward", next_tensordict[self.parent.reward_key])

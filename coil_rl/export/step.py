@@ -20,7 +20,7 @@ from coil_rl.export.contract import ADVICE
 from coil_rl.run.controller import Controller
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import space_of
-from coil_rl.transforms.chain import Chain, Other, links_of
+from coil_rl.transforms.chain import Chain, links_of
 from coil_rl.transforms.degraded_advice import DegradedAdvice
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.last_action import LastAction
@@ -217,7 +217,4 @@ def exportable(controller: Controller) -> list[Link]:
                     f"{type(link).__name__} degrades the advice at random or by that of earlier "
                     "steps, which is for experiments only; train without degrade"
                 )
-        elif isinstance(link, Other) and getattr(link.transform, "needs_past", False):
-            name = type(link.transform).__name__
-            raise NotExportableError(f"{name} remembers earlier steps in a way of its own")
     return links

@@ -94,7 +94,8 @@ class Critics(TensorDictModuleBase):
     Args:
         env: the env, for its specs.
         in_keys: entries that they observe, besides the action.
-        network: architecture of each; convolutions are shared.
+        network: architecture of each; convolutions are shared. Those of a subclass with `layers` of
+            its own are computed one after the other.
         count: how many they are.
         outputs: numbers that each gives for an action.
         norm: "layer" normalises the hidden layers before their activation, "batch" what each layer
@@ -125,13 +126,22 @@ class Critics(TensorDictModuleBase):
         super().__init__()
         self.count, self.dropout, self.gain = count, dropout, gain
         self.concat = ConcatObservations(env, keys, {"action": action_shape(env)}, network)
-        architecture, width = Mlp(network.hidden, network.activation), self.concat.width
+        own = type(network).layers is not Mlp.layers
+        architecture = network if own else Mlp(network.hidden, network.activation)
+        width = self.concat.width
         alone = [architecture.layers(width, outputs, 1.0, env.device) for _ in range(count)]
+        self.own = nn.ModuleList(alone if own else [])
         # Of each network its layers with weights; of those the first ones, the second ones, ...
-        linear = [[layer for layer in mlp if isinstance(layer, nn.Linear)] for mlp in alone]
-        self.layers = nn.ModuleList(Layer(same) for same in zip(*linear, strict=True))
+        linear = [[each for each in mlp.modules() if isinstance(each, nn.Linear)] for mlp in alone]
+        stacked = [] if own else zip(*linear, strict=True)
+        self.layers = nn.ModuleList(Layer(same) for same in stacked)
         self.activation = ACTIVATIONS[network.activation]()
         self.norm: Norm = "layer" if norm == "none" and network.layer_norm else norm
+        if own and (dropout or self.norm != "none"):
+            raise ValueError(
+                f"{type(network).__name__} has layers of its own, and critics normalise, or leave "
+                "out numbers (dropout), in those of Mlp only; do so in these layers"
+            )
         hidden: Sequence[int] = network.hidden
         widths = {"none": [], "layer": hidden, "batch": [width, *hidden]}[self.norm]
         kind = BatchNorm if self.norm == "batch" else LayerNorm
@@ -146,6 +156,8 @@ class Critics(TensorDictModuleBase):
         """
         read = self.concat(*(entries[key] for key in self.in_keys))
         x = read.reshape(-1, read.shape[-1]).expand(self.count, -1, -1)
+        if len(self.own):
+            x = torch.stack([layers(rows) for layers, rows in zip(self.own, x, strict=True)])
         for place, layer in enumerate(self.layers):
             if place and self.dropout and train:
                 x = F.dropout(x, self.dropout)

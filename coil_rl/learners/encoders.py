@@ -199,8 +199,11 @@ class Mlp:
 
     def layers(
         self, inputs: int, outputs: int, gain: float, device: torch.device | None = None
-    ) -> MLP:
-        """Return the layers after it; `gain` scales the initial weights of the last one."""
+    ) -> nn.Module:
+        """Return the layers after it; `gain` scales the initial weights of the last one.
+
+        An architecture of your own is a subclass that has this method.
+        """
         norm: dict[str, Any] = {}
         if self.layer_norm:
             norm = {

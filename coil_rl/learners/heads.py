@@ -25,7 +25,7 @@ class GlobalScaleHead(nn.Module):
         super().__init__()
         self.network, self.event = network, event
         self.log_scale = nn.Parameter(
-            torch.full(event, math.log(scale), device=network.layers[-1].weight.device)
+            torch.full(event, math.log(scale), device=next(network.parameters()).device)
         )
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:

@@ -235,12 +235,12 @@ class PPO(Stateful, Learner):
         """Set the entries that batches and minibatches need."""
         clips = UNCLIPPED in self.policy.out_keys
         self.sample_key = UNCLIPPED if clips else env.action_key
-        observed = dict.fromkeys([*in_keys, *self.policy.in_keys])
+        valued = [*in_keys, *self.critic.in_keys]
+        observed = dict.fromkeys([*valued, *self.policy.in_keys])
         read = [*observed, self.sample_key, "action_log_prob", *self.extensions.keys]
         if guide_may_act(env):
             read.append(AGENT_ACTS)
-        valued = dict.fromkeys([*in_keys, *self.critic.in_keys])
-        after = [*valued, "done", "terminated", env.reward_key]
+        after = [*dict.fromkeys(valued), "done", "terminated", env.reward_key]
         self.keys: list[NestedKey] = [*read, *(unravel_key(("next", key)) for key in after)]
         self.minibatch_keys = [*read, "advantage", "value_target"]
 

@@ -24,7 +24,7 @@ from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_explorati
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.learners.anchor import rest_guides
 from coil_rl.transforms import GuideActions
-from coil_rl.transforms.chain import Chain, Past
+from coil_rl.transforms.chain import Chain, Past, restore
 
 
 class Controller:
@@ -131,7 +131,7 @@ class Controller:
         self.past = None
         if past is not None:
             self.past = [{key: _restored(value, batch) for key, value in own} for own in past]
-        self.env.transform.load_state_dict(state["transforms"])
+        restore(self.env.transform, state["transforms"])
 
     def _check_read(self) -> None:
         """Refuse a policy or guide that reads what is no part of an observation."""

@@ -136,6 +136,8 @@ class Totals:
         There is one flag a row. Entries of several agents are summed.
         """
         running, measures = running.reshape(-1), self.measures.values()
+        if "task_reward" in after:  # the reward may be another one for who learns
+            after = after.copy().update({"reward": after["task_reward"]})
         self.steps = self.steps.to(running.device) + running.long()
         entries = [after[each.entry].double().reshape(len(running), -1) for each in measures]
         if all(entry.shape[1] == 1 for entry in entries):

@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import (
     Compose,
     EnvBase,
+    FrameSkipTransform,
     RewardSum,
     Transform,
     TransformedEnv,
@@ -28,6 +29,7 @@ from coil_rl.foreign.trial import PATIENCE, Trial
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.normalised_action import normalising
+from coil_rl.transforms.reward_coupling import TaskReward
 
 TRAIN = "train"  # episodes of the training: random starts, tracks or seeds
 TEST = "test"  # cases of the table, which training never sees
@@ -202,10 +204,22 @@ def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> Env
             f"{name}: VecNorm normalises by statistics that an evaluation begins anew; leave it "
             "out and give learner.normalise=true"
         )
+    if any(isinstance(part, FrameSkipTransform) for part in transforms):
+        raise UserError(
+            f"{name}: FrameSkipTransform takes steps that are not counted, and with actions in "
+            "another unit; repeat them in a wrapper of the env, or by its own frame_skip"
+        )
     # The sum comes first, before a method changes the reward.
-    env = TransformedEnv(env, Compose(*limits_of(env), RewardSum(), *transforms))
+    kept = [TaskReward()] if any(_may_pay(each, env) for each in transforms) else []
+    env = TransformedEnv(env, Compose(*limits_of(env), RewardSum(), *kept, *transforms))
     try:
         env.observation_spec  # noqa: B018  transforms check the specs when these are computed
     except (KeyError, ValueError) as error:
         raise UserError(f"{name}: {error.args[0]}") from error
     return env
+
+
+def _may_pay(transform: Transform, env: EnvBase) -> bool:
+    """Return whether a transform of somebody else may change the reward."""
+    of_others = not type(transform).__module__.startswith(("coil_", "torchrl."))
+    return of_others or not {*env.reward_keys}.isdisjoint(transform.out_keys or ())

@@ -16,6 +16,7 @@ from coil_rl.errors import UserError
 from coil_rl.foreign.batch import optional_entries
 from coil_rl.run.exploration import Exploring, exploring
 from coil_rl.run.lean_steps import LeanSteps
+from coil_rl.transforms.chain import restore
 from coil_rl.transforms.guide_transform import set_progress
 
 
@@ -139,7 +140,7 @@ class Rollout:
         """
         self.base_env.load_state_dict(state["env"])
         if self.base_env is not self.env:
-            self.env.load_state_dict(state["transforms"])
+            restore(self.env.transform, state["transforms"])
         carrier = state["carrier"]
         # A part that cannot go on has said so.
         continues = all(getattr(module, "continues", True) for module in self.env.modules())

@@ -5,9 +5,20 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Unbounded
-from torchrl.envs import Compose, InitTracker, StepCounter, TensorDictPrimer, TransformedEnv
+from torchrl.envs import (
+    CatFrames,
+    Compose,
+    InitTracker,
+    ObservationNorm,
+    RewardScaling,
+    StepCounter,
+    TensorDictPrimer,
+    TimeMaxPool,
+    TransformedEnv,
+)
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.errors import UserError
 from coil_rl.guides import SplineGuide, SplineMemoryGuide
 from coil_rl.transforms import (
     ActionDelay,
@@ -89,9 +100,23 @@ def test_chain_executes_what_the_env_executes(case, guide):
     assert torch.stack(given).unique().numel() > 2
 
 
-def test_disturbances_are_left_out():
-    env = env_of(SplineGuide(), ObservationDelay(1, 1), ActionDelay(1, 1))
+def test_disturbances_and_rewards_are_left_out():
+    parts = [ObservationDelay(1, 1), ActionDelay(1, 1), RewardScaling(0.0, 2.0)]
+    env = env_of(SplineGuide(), *parts)
     assert [type(link) for link in links_of(env.transform)] == [NormalisedAction, GuideActions]
+
+
+HISTORY = {"in_keys": ["observation"], "out_keys": ["past"]}
+
+
+@pytest.mark.parametrize("remembers", [CatFrames(3, -1, **HISTORY), TimeMaxPool(T=2, **HISTORY)])
+def test_transform_that_remembers_in_its_own_way_is_refused_where_states_are_tensors(remembers):
+    env = env_of(SplineGuide(), ObservationNorm(0.1, 2.0, in_keys=["observation"]))
+    assert len([*links_of(env.transform, tensors=True)]) == 3
+    env.append_transform(remembers)
+    assert len([*links_of(env.transform)]) == 4
+    with pytest.raises(UserError, match=f"{type(remembers).__name__} remembers earlier steps"):
+        [*links_of(env.transform, tensors=True)]
 
 
 def test_what_does_not_change_in_an_episode_is_not_remembered():

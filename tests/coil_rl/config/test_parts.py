@@ -9,7 +9,7 @@ import torch
 from odd_parts import Gain
 from omegaconf import OmegaConf
 from programs import ONE_SECOND, composed, shipped
-from torchrl.envs import RenameTransform, TransformedEnv
+from torchrl.envs import RenameTransform, Transform, TransformedEnv
 
 from coil_rl.config import parts
 from coil_rl.config.assemble import load_guides
@@ -35,9 +35,11 @@ from coil_rl.config.python import Named, named, open_run
 from coil_rl.config.python import composed as composed_in_python
 from coil_rl.envs.reward import RewardWeights
 from coil_rl.errors import UserError
+from coil_rl.guides import RandomGuide
 from coil_rl.programs.distill import distill
 from coil_rl.programs.train import train
 from coil_rl.record import METRICS
+from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.run.parts import TEST, TESTS, TRAIN
 from coil_rl.testing import check_env, check_guide
 from coil_rl.transforms import ActionDelay, GuideActions, ObservationDelay
@@ -89,6 +91,37 @@ def test_override_with_another_target_replaces_all_arguments():
     assert [track.name for track in env.tracks] == ["robot (simulated)"]
     weights = RewardWeights(*env.weights)
     assert (weights.finish, weights.crash) == (1, -100)
+
+
+class Halves(Transform):
+    """Halves the reward, and does not say that it writes it."""
+
+    def _step(self, tensordict, next_tensordict):
+        return next_tensordict.set("reward", next_tensordict["reward"] / 2)
+
+
+@pytest.mark.parametrize(
+    "node",
+    [
+        "{_target_: torchrl.envs.RewardScaling, loc: 0, scale: 0.5}",
+        "{_target_: torchrl.envs.RewardClipping, clamp_min: -0.01, clamp_max: 0.01}",
+        f"{{_target_: {__name__}.Halves}}",
+    ],
+)
+def test_returns_are_the_envs_own_whatever_a_method_makes_of_its_rewards(node):
+    results = []
+    for words in ([], [f"+method.transforms.own={node}"]):
+        env = env_maker(small("method=ppo", *words))(cases=TEST)
+        results.append(evaluate_policy(env, RandomGuide(-1, 1)).rewards)
+    assert results[0] == results[1]
+    after = env.rollout(5)["next"]
+    assert not torch.equal(after["reward"], after["task_reward"])
+
+
+def test_transform_that_takes_steps_itself_is_refused():
+    node = "{_target_: torchrl.envs.FrameSkipTransform, frame_skip: 2}"
+    with pytest.raises(UserError, match="FrameSkipTransform takes steps that are not counted"):
+        env_maker(small("method=ppo", f"+method.transforms.own={node}"))()
 
 
 def lists_its_arguments(**options):

@@ -25,6 +25,42 @@ def images(*shape, dtype=torch.uint8, action=None):
     return AnyEnv(4, action, {"image": image, "speed": Unbounded((2,))})
 
 
+class Skip(nn.Module):
+    """A layer that is added to what it reads, and one after it."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__()
+        self.inner, self.last = nn.Linear(inputs, inputs), nn.Linear(inputs, outputs)
+
+    def forward(self, x):
+        return self.last(x + self.inner(x).tanh())
+
+
+class Skips(Mlp):
+    """An architecture of somebody else."""
+
+    def layers(self, inputs, outputs, gain, device=None):
+        return Skip(inputs, outputs)
+
+
+@pytest.mark.parametrize(("kind", "networks"), [(PPO, 2), (SAC, 3), (DQN, 1)])
+def test_every_network_has_layers_of_ones_own_and_learns(kind, networks):
+    env = AnyEnv(action=action_of(kind))
+    learner, rollout = learning(kind, env, ["observation"], network=Skips())
+    learned = (learner.policy, learner.critic, getattr(learner, "critics", None))
+    parts = {part for each in learned if each for part in each.modules() if type(part) is Skip}
+    before = {part: part.inner.weight.clone() for part in parts}
+    assert len(parts) == networks
+    learner.update(rollout.collect())
+    assert not any(torch.equal(part.inner.weight, weight) for part, weight in before.items())
+
+
+@pytest.mark.parametrize("options", [{"dropout": 0.1}, {"critic_layer_norm": True}])
+def test_critics_with_layers_of_ones_own_do_not_normalise_or_drop(options):
+    with pytest.raises(ValueError, match="Skips has layers of its own"):
+        SAC(AnyEnv(), network=Skips(), **options)
+
+
 def test_default_network_is_that_of_hidden_to_the_bit():
     weights = []
     for options in ({"hidden": [8, 4]}, {"network": Mlp([8, 4])}, {"network": Mlp([8, 4], "relu")}):

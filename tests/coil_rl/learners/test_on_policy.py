@@ -5,7 +5,9 @@ from functools import partial
 import pytest
 import torch
 import worlds
+from any_env import AnyEnv, learning
 from cart_poles import CartPoles
+from torchrl.data import Unbounded
 from torchrl.objectives.value import GAE
 
 from coil_rl.envs import ConeTrackEnv
@@ -74,6 +76,26 @@ def test_minibatch_of_one_frame_is_refused(kind):
     trained(kind, CartPoles(2), steps=4, minibatches=4)
     with pytest.raises(ValueError, match="minibatches=5 leaves less than 2 of 8 frames to each"):
         trained(kind, CartPoles(2), steps=4, minibatches=5)
+
+
+class SeeingPPO(PPO):
+    """A critic that observes more than the policy."""
+
+    def build_critic(self, env, in_keys, network):
+        return super().build_critic(env, [*in_keys, "hidden"], network)
+
+
+@pytest.mark.parametrize("normalise", [False, True])
+def test_critic_may_observe_more_than_the_policy(normalise):
+    shown = {"observation": Unbounded((3,)), "hidden": Unbounded((2,))}
+    learner, rollout = learning(SeeingPPO, AnyEnv(observations=shown), normalise=normalise)
+    batch = rollout.collect()
+    assert {"hidden", ("next", "hidden")} <= set(batch.keys(True, True))
+    assert "hidden" not in learner.policy.in_keys
+    values = [learner.critic(batch.clone())["state_value"]]
+    values.append(learner.critic(batch.clone().set("hidden", batch["hidden"] + 1))["state_value"])
+    assert not torch.equal(*values)
+    assert torch.tensor(list(learner.update(batch).values())).isfinite().all()
 
 
 @pytest.mark.slow

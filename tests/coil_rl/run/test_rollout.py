@@ -2,7 +2,7 @@ import pytest
 import torch
 import worlds
 from tensordict import TensorDict
-from torchrl.envs import Compose, RewardSum, TransformedEnv
+from torchrl.envs import CatFrames, Compose, RewardSum, TransformedEnv
 from torchrl.modules import RandomPolicy
 
 from coil_rl import GymnasiumEnv
@@ -16,7 +16,8 @@ from coil_rl.transforms import GuideActions
 
 def rollout(seed=0, steps=6, keys=None):
     env = ConeTrackEnv(shipped_tracks("train"), 5, seed=seed, rate=8)
-    env = TransformedEnv(env, Compose(GuideActions({"spline": SplineGuide()}), RewardSum()))
+    past = CatFrames(N=3, dim=-1, in_keys=["observation"], out_keys=["past"])
+    env = TransformedEnv(env, Compose(GuideActions({"spline": SplineGuide()}), RewardSum(), past))
     return Rollout(env, RandomGuide(-1, 0.2, seed=seed), steps, keys)
 
 
