@@ -8,6 +8,7 @@ these kinds of actions.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, TypeAlias, TypeVar
@@ -42,10 +43,14 @@ def nested_key(key: Key) -> Key:
 
 
 def written_key(key: NestedKey) -> str:
-    """Return the key of an entry as YAML takes it, such as `[observation,"0"]`."""
-    if isinstance(key, str):
-        return key
-    return f"[{','.join(json.dumps(part) if part.isdigit() else part for part in key)}]"
+    """Return the key of an entry as a command takes it, such as `[observation,"0"]`."""
+    if not isinstance(key, str):
+        return f"[{','.join(map(written_key, key))}]"
+    return (
+        key
+        if re.fullmatch(r"[a-z_][\w./-]*", key, re.A | re.I)
+        else json.dumps(key, ensure_ascii=False)
+    )
 
 
 class ActionRange:

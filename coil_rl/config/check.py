@@ -486,7 +486,7 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
                 has = ", ".join(map(written_key, env.observation_spec.keys(True, True)))
                 remedy = getattr(guide, "remedy", "")  # what gives the entry that it reads
                 raise UserError(
-                    f"{name}: it reads {written_key(key)}, but the env has only {has}"
+                    f"{name}: it reads {dotted(key)}, but the env has only {has}"
                     f"{remedy and '; '}{remedy}"
                 )
         advised = TransformedEnv(env, transform)

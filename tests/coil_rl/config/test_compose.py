@@ -7,14 +7,17 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from package_entries import declare
 from programs import CONF, ROOT, called, environment, shipped
+from tensordict import NestedKey
 
 from coil_rl import Measure, UserError
 from coil_rl.config import python
 from coil_rl.config.compose import compose_train, covers, default_learner
 from coil_rl.measures import measures_of
+from coil_rl.transforms.action_space import nested_key, written_key
 
 METHODS = shipped("method")
 # Groups whose files may set everything, and a shipped file to begin with.
@@ -186,6 +189,15 @@ SAC = ["learner=sac", "budget.frames=100000"]
 )
 def test_actions_that_are_numbers_are_learned_by_sac(words: list[str], found: list[str]) -> None:
     assert default_learner(words) == found
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["zone/2.speed", "1", "T_in [°C]", 'the "inner" one', ("observation", "0"), ("Höhe", "a b")],
+)
+def test_a_key_in_a_message_may_be_typed_as_it_is(key: NestedKey) -> None:
+    word = OverridesParser.create().parse_override(f"observes=[{written_key(key)}]")
+    assert [nested_key(each) for each in word.value()] == [key]
 
 
 def test_options_may_follow_the_words_to_which_the_learner_is_added() -> None:
