@@ -19,7 +19,7 @@ from tensordict import TensorDict
 from coil_rl.foreign.codec import Codec
 from coil_rl.foreign.controllers import ControllerGuide, load
 from coil_rl.foreign.host import asks_for_env, called, role_of
-from coil_rl.foreign.remembered import maker_of_rows
+from coil_rl.foreign.remembered import Anew, maker_of_rows
 from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.transforms.guide_actions import Guides
 
@@ -85,10 +85,10 @@ def maker_beside(thing: Any, name: str, env: gymnasium.Env[Any, Any]) -> Callabl
             "a method act(observation)"
         )
     if asks:
-        thing = partial(thing, env)
+        thing = Anew(thing, env)
     several = isinstance(env.observation_space, (spaces.Dict, spaces.Tuple))
     if role == "function" and (asks or several):  # it gets the observation as the env gives it
         return partial(SimpleNamespace, act=thing)
     if role == "act":
-        return thing if is_class else maker_of_rows(thing)
+        return Anew(thing) if is_class else maker_of_rows(thing)
     return partial(OneRow, thing() if is_class else thing, env)

@@ -32,7 +32,7 @@ from coil_rl.foreign.host import (
     observation_of,
     role_of,
 )
-from coil_rl.foreign.remembered import copied, maker_of_rows, state_of
+from coil_rl.foreign.remembered import Anew, copied, maker_of_rows, state_of
 from coil_rl.foreign.shared import FunctionGuide, NetworkGuide
 from coil_rl.transforms.action_space import ActionSpace, OwnForms, nested_key, written_key
 from coil_rl.transforms.hosted import HostedGuide, ToldGuide
@@ -285,7 +285,7 @@ def _guide_of(
         return FunctionGuide(function, read, title)
     if is_class:
         check_call(thing, title, [], options)
-        make, kind = partial(thing, **options), called(thing)
+        make, kind = Anew(thing, **options), called(thing)
         if role == "act" and not issubclass(kind, nn.Module):
             bound = isinstance(inspect.getattr_static(kind, "act"), (staticmethod, classmethod))
             as_one = check_call(kind.act, f"{title}.act", read if bound else ["self", *read], {})

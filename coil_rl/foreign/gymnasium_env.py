@@ -29,6 +29,7 @@ from coil_rl.foreign.makers import (
     name_of,
 )
 from coil_rl.foreign.plant import GymnasiumPlant
+from coil_rl.foreign.remembered import Anew
 from coil_rl.foreign.rows import GymnasiumRows
 from coil_rl.foreign.workers import Workers, choose, timed
 from coil_rl.ranges import Count, Processes, Seed, checked
@@ -131,11 +132,11 @@ class GymnasiumEnv(SeededRows):
         guard = Guard()
         with guard:
             maker = maker_of(id)
-            make = partial(make_env, maker, wrappers, settings)
+            make = Anew(make_env, maker, wrappers, settings)
             self.shown = render and "rgb_array" in metadata_of(make(), "render_modes", ())
         drawn, every = make, cases or num_envs
         if self.shown:
-            drawn = partial(make_env, maker, wrappers, settings | {"render_mode": "rgb_array"})
+            drawn = Anew(make_env, maker, wrappers, settings | {"render_mode": "rgb_array"})
         name = name_of(maker)
 
         def make_plant(row: int) -> GymnasiumPlant:

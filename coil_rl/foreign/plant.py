@@ -33,6 +33,7 @@ from coil_rl.foreign.guard import Numbers
 from coil_rl.foreign.host import Host
 from coil_rl.foreign.limit import limit_of, limits_of, warn_of_limit
 from coil_rl.foreign.makers import Env
+from coil_rl.foreign.remembered import own
 
 OLD_LIMIT = "TimeLimit.truncated"  # in info: how older envs say that the time was over
 MASKS = {"action_mask", "action_masks"}  # in info: which actions are possible
@@ -146,7 +147,7 @@ class GymnasiumPlant(Plant):
             self.close()
             self.alive.pop(id(self.env.unwrapped), None)
             self._open()
-        given: dict[str, Any] = {"options": dict(self.options)} if self.options else {}
+        given: dict[str, Any] = {"options": own(self.options)} if self.options else {}
         with foreign(self.place, "reset"):
             answer: Any = self.env.reset(seed=self.seed, **given)
             if not isinstance(answer, (tuple, list)) or len(answer) != 2:

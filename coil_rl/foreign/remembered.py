@@ -12,25 +12,50 @@ import numpy as np
 import torch
 from torch import nn
 
+from coil_rl.foreign.faults import FaultError, shortened
+
 OF_TORCH = frozenset(vars(nn.Module()))
 # What numbers of NumPy are made of. They keep their types, as float32 goes on in another way.
 OF_NUMPY: list[Any] = [np.dtype, np.float64(0).__reduce__()[0]]
 OF_NUMPY += {type(np.dtype(each)) for each in "?bhilqBHILQefdg"}
 
 
+def own(value: Any) -> Any:
+    """Return a value whose dictionaries and lists are new, as code of others may change them."""
+    if type(value) is dict:
+        return {key: own(each) for key, each in value.items()}
+    if type(value) is partial:
+        return Anew(value)
+    return [own(each) for each in value] if type(value) is list else value
+
+
+class Anew(partial[Any]):
+    """A `functools.partial` whose calls share no dictionary and no list of its arguments."""
+
+    def __call__(self, *args: Any, **arguments: Any) -> Any:
+        """Return what it makes."""
+        return self.func(*own([*self.args]), *args, **own(self.keywords), **arguments)
+
+
 def maker_of_rows(thing: Any) -> partial[Any]:
     """Return a function that makes a copy of an object with `act`, for one row of the env.
 
-    Copies of a network share its weights, and are in evaluation mode.
+    Copies of a network share its weights, and are in evaluation mode. What cannot be copied is a
+    `FaultError` where a copy is made.
     """
-    if not isinstance(thing, nn.Module):
-        return partial(copy.deepcopy, thing)
-    return partial(_copy_of_network, thing.eval())
+    return partial(_copy_of, thing.eval() if isinstance(thing, nn.Module) else thing)
 
 
-def _copy_of_network(network: nn.Module) -> nn.Module:
-    with torch.no_grad():
-        return copy.deepcopy(network, {id(each): each for each in network.parameters()})
+def _copy_of(thing: Any) -> Any:
+    shared = thing.parameters() if isinstance(thing, nn.Module) else ()
+    try:
+        with torch.no_grad():
+            return copy.deepcopy(thing, {id(each): each for each in shared})
+    except Exception as error:
+        raise FaultError(
+            f"it cannot be copied for each row ({type(error).__name__}: {shortened(str(error))}); "
+            "give its class, of which each row gets an object"
+        ) from error
 
 
 def state_of(thing: Any, make: Callable[[], Any]) -> dict[str, Any] | None:

@@ -448,6 +448,13 @@ def test_action_that_does_not_fit_is_told_as_it_was_returned(plant, controller, 
     assert is_one_sentence(caught)
 
 
+def test_object_that_cannot_be_copied_asks_for_its_class():
+    message = rf"{ROW} 0\): it cannot be copied for each row \(TypeError: .*; give its class, of"
+    with pytest.raises(ForeignError, match=message) as caught:
+        stepped(ControllerGuide(Gives(number for number in WELL)))
+    assert is_one_sentence(caught)
+
+
 def test_what_a_controller_does_with_its_observation_changes_nothing():
     def spoils(*given):
         given[-1][...] = 0.0

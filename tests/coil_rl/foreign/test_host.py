@@ -4,6 +4,7 @@ import importlib
 import textwrap
 from functools import partial
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -159,6 +160,63 @@ def test_object_without_reset_is_made_anew_for_each_episode():
     assert (rollout["observation"] < 9).all(), (
         "what a controller does with its array should not change the data"
     )
+
+
+class Halves:
+    """Changes in place what it is given."""
+
+    def __init__(self, gains):
+        self.gains = gains
+
+    def act(self, observation=None):
+        self.gains["now"][0] /= 2
+        return self.gains["now"]
+
+
+class Halving(Plant):
+    """Pays halves of the options of its maker, and of its resets."""
+
+    def __init__(self, gains):
+        super().__init__(end=3)
+        self.made = Halves(gains)
+
+    def reset(self, *, seed=None, options=None):
+        self.begun = Halves(options)
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        paid = self.begun.act()[0] + 10 * self.made.act()[0]
+        observation, _, *ends = super().step(action)
+        return observation, paid, *ends
+
+
+class PaysMore(gymnasium.RewardWrapper):
+    def __init__(self, env, gains):
+        super().__init__(env)
+        self.wrapped = Halves(gains)
+
+    def reward(self, reward):
+        return reward + 100 * self.wrapped.act()[0]
+
+
+def test_arguments_belong_to_one_row_and_one_episode():
+    gains = {"now": [1.0]}
+    theirs = partial(Halves, gains=gains)
+    env = GymnasiumEnv(
+        Halving,
+        2,
+        options={"gains": gains},
+        reset_options=gains,
+        wrappers=[partial(PaysMore, gains=gains)],
+        controllers={"beside": theirs},
+        fresh=True,
+    )
+    env = TransformedEnv(env, GuideActions({"theirs": ControllerGuide(theirs)}))
+    data = env.rollout(5, break_when_any_done=False)
+    halves = torch.tensor([0.5, 0.25, 0.125, 0.5, 0.25]).expand(2, -1)[..., None]
+    assert torch.equal(data["guide_action"][..., 0, :], halves)
+    assert torch.equal(data["controller", "beside"], halves)
+    assert torch.equal(data["next", "reward"], 111 * halves)
 
 
 def test_states_of_the_objects_are_in_the_checkpoint():
