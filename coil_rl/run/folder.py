@@ -92,13 +92,13 @@ def check_same(
 ) -> None:
     """Raise a `UserError` if two configurations differ.
 
-    The message begins with the holder of the first one.
+    The message begins with the holder of the first one. A part, such as the learner, is named
+    before its values.
     """
-    for key in dict.fromkeys([*saved, *requested]):
-        if saved.get(key) != requested.get(key):
-            raise UserError(
-                f"{holder} with {key}={saved.get(key)}, not {requested.get(key)}; {remedy}"
-            )
+    keys = dict.fromkeys([*saved, *requested])
+    differ = [key for key in keys if saved.get(key) != requested.get(key)]
+    for key in sorted(differ, key=lambda key: not key.endswith("_target_")):
+        raise UserError(f"{holder} with {key}={saved.get(key)}, not {requested.get(key)}; {remedy}")
 
 
 def refuse_links(folder: Path) -> None:

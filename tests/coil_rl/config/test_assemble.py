@@ -200,3 +200,5 @@ def test_repeated_words_are_about_the_same_run(env, tmp_path):
     assert holds(tmp_path / "run", compose_train(words))
     with pytest.raises(UserError, match=r"holds a run with learner.gamma="):
         holds(tmp_path / "run", compose_train([*words, "learner.gamma=0.5"]))
+    with pytest.raises(UserError, match=r"a run with learner\._target_=coil_rl\.learners\.PPO,"):
+        holds(tmp_path / "run", compose_train([*words, "learner=a2c"]))

@@ -25,12 +25,6 @@ class NotRuntimeCheckable(Protocol):
     pass
 
 
-def test_name_that_does_not_exist_is_one_sentence_and_no_line_of_hydra(caplog):
-    with pytest.raises(UserError, match=r"there is no .programs\.nothing"):
-        build({"_target_": "programs.nothing"}, "env")
-    assert not caplog.records
-
-
 @pytest.mark.parametrize(
     ("annotation", "good", "bad"),
     [
