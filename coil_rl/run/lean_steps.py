@@ -3,14 +3,16 @@
 TorchRL's step is for any env: it looks for keys, completes what an env leaves out, and carries all
 that was written to the next step. With a small network this takes longer than a step of an env that
 is known. `LeanSteps` is for those: it calls the env and its transforms directly, and carries only
-what is read. All others keep TorchRL's step, see `LeanSteps.covers`.
+what is read. All others keep TorchRL's step, see `LeanSteps.covers`. The advice of a network may
+differ in the last bit, because it is computed in batches of another size.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
-from torch import Tensor, where
+from torch import Tensor
 from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from coil_rl.envs.seeded_env import SeededEnv
@@ -19,6 +21,9 @@ from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.link import Link
 
 ENDS = {"done", "terminated", "truncated"}
+# Rows up to which a step and the first entries of the next episodes are observed at once: the
+# many small operations of a guide take as long for both together as for one of them.
+AT_ONCE = 512
 
 
 class LeanEnv:
@@ -58,6 +63,14 @@ class LeanEnv:
         Args:
             before: entries before the step, of which the sums of rewards are read.
         """
+        return self.observed(self.moved(action, before))
+
+    def moved(self, action: Tensor, before: Mapping[NestedKey, Tensor] | TensorDictBase) -> Any:
+        """Return what the env writes in a step, and the sums of rewards.
+
+        Args:
+            before: as for `step`.
+        """
         # An env of this project reads its action by the key only; a dictionary is made at once.
         acted: Any = Entries(action=action)
         for link in reversed(self.links):
@@ -65,17 +78,13 @@ class LeanEnv:
         after = self.base._step(acted)
         for key in self.sums:
             after.set(key, before[key] + after["reward"])
-        for link in self.links:
-            link.observe(after, {})
         return after
 
-    def reset(self, rows: Tensor) -> TensorDictBase:
-        """Return the entries after a reset of some rows, [B, 1]."""
-        mask = self.data({"_reset": rows})
-        first = self.base._reset(mask)
+    def observed(self, data: TensorDictBase) -> TensorDictBase:
+        """Write what is observed of entries of the env, and return them."""
         for link in self.links:
-            first = link._reset(mask, first)
-        return first
+            link.observe(data, {})
+        return data
 
     def data(self, entries: Mapping[NestedKey, Tensor]) -> TensorDict:
         """Return entries as data of the env."""
@@ -96,6 +105,10 @@ class LeanSteps:
         self.before = [key for key in keys if not _is_next(key)]
         self.after = {key: unravel_key(key[1:]) for key in keys if _is_next(key)}
         self.carried = [*_observed(policy, keys), *self.env.sums]
+        links, known = self.env.links, set(self.env.base.observation_spec.keys(True, True))
+        read = dict.fromkeys([*self.carried, *(key for link in links for key in link.in_keys)])
+        self.read = [key for key in read if key in known]
+        self.written = [key for link in links for key in link.out_keys]
 
     @staticmethod
     def covers(env: EnvBase, policy: Any, keys: Sequence[NestedKey] | None) -> bool:
@@ -125,23 +138,35 @@ class LeanSteps:
         Args:
             entries: what is read in this step, and what the policy has written.
         """
-        after = self.env.step(entries["action"], entries)
+        after = self.env.moved(entries["action"], entries)
+        rows = after["done"].flatten().nonzero().flatten()
+        first = self._observed(after, rows)
         kept = {key: entries[key] for key in self.before}
         kept |= {key: after[name] for key, name in self.after.items()}
-        return kept, self._begun(after)
+        carried = self.carry(after)
+        for key, value in first.items():
+            carried[key] = carried[key].index_put((rows,), value)
+        return kept, carried
 
-    def _begun(self, after: TensorDictBase) -> Entries:
-        """Return what is read in the next step, after a reset of the rows that are done."""
-        done, carried = after["done"], self.carry(after)
-        if not done.any():
-            return carried
-        first = self.env.reset(done.clone())
-        for key in self.env.sums:
-            first.set(key, carried[key].new_zeros(()).expand_as(carried[key]))
-        for key, value in carried.items():
-            rows = done.view(-1, *(1,) * (value.ndim - 1))
-            carried[key] = where(rows, first[key], value)
-        return carried
+    def _observed(self, after: TensorDictBase, rows: Tensor) -> dict[NestedKey, Tensor]:
+        """Write what is observed after a step; return what is read of the next episodes of rows."""
+        if not len(rows):
+            self.env.observed(after)
+            return {}
+        env, count = self.env, len(after)
+        first = env.base._reset(env.data({"_reset": after["done"].clone()}))
+        new = {key: first[key][rows] for key in self.read}
+        if count > AT_ONCE:
+            env.observed(after)
+            count = 0
+        else:
+            new = {key: torch.cat([after[key], value]) for key, value in new.items()}
+        data = env.observed(TensorDict(new, (count + len(rows),), device=env.device))
+        if count:
+            for key in self.written:
+                after.set(key, data[key][:count])
+        zero = {key: after[key].new_zeros(len(rows), 1) for key in env.sums}
+        return {key: zero[key] if key in zero else data[key][count:] for key in self.carried}
 
 
 def _transforms(env: EnvBase) -> list[Transform]:
