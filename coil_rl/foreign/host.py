@@ -280,7 +280,9 @@ def observation_of(keys: Sequence[NestedKey], entries: Sequence[Any]) -> Any:
         for part in outer:
             place = place.setdefault(part, {})
         place[last] = entry
-    return _with_tuples(whole.get("observation", whole) if len(whole) == 1 else whole)
+    parts = {key: _with_tuples(part) for key, part in whole.items()}
+    given = parts.get("observation")  # under this name an env writes a Tuple, and what is no Dict
+    return given if len(parts) == 1 and isinstance(given, tuple) else parts
 
 
 def _with_tuples(part: Any) -> Any:

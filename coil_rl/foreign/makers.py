@@ -53,7 +53,8 @@ def registered_maker(id: str) -> Any:
 
 def name_of(maker: str | Callable[..., Env]) -> str:
     """Return the name of an env for messages."""
-    return maker if isinstance(maker, str) else getattr(maker, "__qualname__", repr(maker))
+    made = getattr(maker, "func", maker)  # by a partial
+    return made if isinstance(made, str) else getattr(made, "__qualname__", repr(made))
 
 
 def make_env(

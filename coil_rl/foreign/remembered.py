@@ -34,7 +34,7 @@ class Anew(partial[Any]):
 
     def __call__(self, *args: Any, **arguments: Any) -> Any:
         """Return what it makes."""
-        return self.func(*own([*self.args]), *args, **own(self.keywords), **arguments)
+        return self.func(*own([*self.args]), *args, **own(self.keywords) | arguments)
 
 
 def maker_of_rows(thing: Any) -> partial[Any]:

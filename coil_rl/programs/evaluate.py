@@ -172,7 +172,7 @@ def check(config: DictConfig) -> None:
             f"name an env and guide=exported guide.exported.file={config.exported}"
         )
     reason = (
-        f"run={config.run} has its own configuration"
+        f"run={config.run} has its own configuration (for another env +evaluation.env.KEY=VALUE)"
         if given
         else "a guide is evaluated without an agent"
     )

@@ -409,8 +409,18 @@ OF_PAIR = [["observation", "0"], ["observation", "1"]]
         (SHIP, OF_SHIP, lambda whole: [whole["nav"]["gear"], whole["draught"]]),
         (SHIP, OF_SHIP[:2], lambda whole: whole["nav"]["pose"]),
         (spaces.Tuple((GEAR, POSE)), OF_PAIR, lambda whole: [whole[0], whole[1][1]]),
+        (
+            spaces.Dict({"1": GEAR, "0": POSE}),
+            ["0", "1"],
+            lambda whole: [whole["1"], whole["0"][0]],
+        ),
+        (
+            spaces.Dict(observation=SHIP["nav"]),
+            [["observation", "gear"], ["observation", "pose"]],
+            lambda whole: whole["observation"]["pose"] + whole["observation"]["gear"],
+        ),
     ],
-    ids=["dictionary", "part of it", "tuple"],
+    ids=["dictionary", "part of it", "tuple", "numbered", "one name"],
 )
 @pytest.mark.parametrize("kind", ["class", "object", "function"])
 def test_controller_of_one_argument_gets_several_entries_as_one_observation(

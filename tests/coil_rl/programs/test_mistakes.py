@@ -95,7 +95,11 @@ OF_TRAINING = "has no effect: only a training reads it"
             "; name those that it reads by in_keys=[ENTRY,...]",
         ),
         # what an evaluation does not read
-        ("evaluate", "run=RUN env.laps=2", f"env.laps=2 {OWN}; what can be changed is run, "),
+        (
+            "evaluate",
+            "run=RUN env.laps=2",
+            f"{OWN} (for another env +evaluation.env.KEY=VALUE); what",
+        ),
         ("evaluate", "run=RUN +action.x=1", f"+action.x=1 {OWN}"),
         ("listen", "run=RUN guide=random", f"guide=random {OWN}"),
         ("evaluate", "run=RUN evaluation.curve.num_envs=3", f"num_envs=3 {OF_TRAINING}"),
