@@ -238,8 +238,11 @@ class ControllerGuide(HostedGuide):
         self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
         super().__init__()
         self.guide, self.title = guide, title
-        if isinstance(guide, HostedGuide):
-            self.remedy = "name those that it reads by in_keys=[ENTRY,...]"
+        self.remedy = (
+            "name those that it reads by in_keys=[ENTRY,...]"
+            if isinstance(guide, HostedGuide)
+            else ""
+        )
 
     @property
     def by_row(self) -> bool:  # type: ignore[override]
@@ -279,10 +282,12 @@ def _guide_of(
             f"{'; its predict is a function: of=MODULE:NAME.predict' if is_regressor else ''}"
         )
     if role == "function":
-        function = partial(thing, **options)
-        if check_call(thing, title, read, options):
-            return FunctionGuide(lambda *given: function(observation_of(read, given)), read, title)
-        return FunctionGuide(function, read, title)
+        as_one, function = check_call(thing, title, read, options), partial(thing, **options)
+        return FunctionGuide(
+            (lambda *given: function(observation_of(read, given))) if as_one else function,
+            read,
+            title,
+        )
     if is_class:
         check_call(thing, title, [], options)
         make, kind = Anew(thing, **options), called(thing)
@@ -314,8 +319,12 @@ def _of_object(thing: Any, title: str, keys: list[NestedKey] | None) -> TensorDi
     if role == "network":
         return NetworkGuide(thing, read, title)
     if role == "act":
-        as_one = check_call(thing.act, f"{title}.act", read, {})
-        return PerRow(maker_of_rows(thing), read, title=title, as_one=as_one)
+        return PerRow(
+            maker_of_rows(thing),
+            read,
+            title=title,
+            as_one=check_call(thing.act, f"{title}.act", read, {}),
+        )
     parts = getattr(getattr(thing, "observation_space", None), "spaces", None)
     if keys is None and isinstance(parts, Mapping):
         read = [nested_key(key) for key in parts]

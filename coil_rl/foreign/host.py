@@ -258,10 +258,10 @@ def check_call(
         given = ", ".join([*map(str, read), *(f"{key}=" for key in options)])
         unknown = [key for key in options if key not in signature.parameters]
         hints = "".join(did_you_mean(key, signature.parameters) for key in unknown)
-        if read and not unknown:
-            hints = "; in_keys=[ENTRY,...] names what it is called with"
+        of_keys = "; in_keys=[ENTRY,...] names what it is called with"
         raise ValueError(
-            f"{title} takes {signature}, but is called with ({given}): {error}{hints}"
+            f"{title} takes {signature}, but is called with ({given}): {error}"
+            f"{of_keys if read and not unknown else hints}"
         ) from error
     return False
 

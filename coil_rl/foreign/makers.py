@@ -81,9 +81,11 @@ def make_env(
     except (Exception, SystemExit) as error:
         raise ValueError(f"the env {name} cannot be made: {_reason(name, error)}") from error
     if not isinstance(env, gymnasium.Env):
-        remedy = "derive its class from gymnasium.Env"
-        if isinstance(env, gymnasium.vector.VectorEnv):
-            remedy = "give the env of one row, of which a run makes budget.num_envs"
+        remedy = (
+            "give the env of one row, of which a run makes budget.num_envs"
+            if isinstance(env, gymnasium.vector.VectorEnv)
+            else "derive its class from gymnasium.Env"
+        )
         raise ValueError(f"the env {name} is {shown(env)}, not an env of Gymnasium: {remedy}")
     if missing:
         raise ValueError(f"the env {name} has no {missing[0]}: set it in its __init__")
