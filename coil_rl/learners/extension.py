@@ -53,6 +53,9 @@ class Extension:
         """Act after an update with a batch [B, T], and return metrics by name."""
         return {}
 
+    def begin_episodes(self) -> None:
+        """Forget the running episodes: new ones begin with the next batch."""
+
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next update depends on; nothing by default."""
         return {}
@@ -107,6 +110,11 @@ class Extensions(Extension):
         for extension in self.each:
             metrics |= extension.finish(batch, progress)
         return metrics
+
+    def begin_episodes(self) -> None:
+        """Let all forget the running episodes."""
+        for extension in self.each:
+            extension.begin_episodes()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of all, by their numbers."""

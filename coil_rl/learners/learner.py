@@ -69,6 +69,9 @@ class Learner(ABC):
             steps: T, of each row.
         """
 
+    def begin_episodes(self) -> None:  # noqa: B027  optional
+        """Forget the running episodes: the next batch is not a continuation of the last one."""
+
     def export(self, folder: Path) -> None:  # noqa: B027  optional
         """Write what others need besides the policy into the folder of a finished run."""
 
@@ -85,6 +88,12 @@ class Stateful:
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next update depends on, besides its batch."""
         return {name: _state_of(getattr(self, name)) for name in self.parts}
+
+    def begin_episodes(self) -> None:
+        """Let each part forget the running episodes."""
+        for name in self.parts:
+            if hasattr(part := getattr(self, name), "begin_episodes"):
+                part.begin_episodes()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state that `state_dict` returned."""

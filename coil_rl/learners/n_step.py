@@ -70,6 +70,10 @@ class NStep:
         self.given = complete[:, -keep:]
         return new
 
+    def begin_episodes(self) -> None:
+        """Forget the waiting steps, which nothing follows."""
+        self.waiting = self.given = None
+
     def state_dict(self) -> dict[str, Any]:
         """Return the waiting steps."""
         if self.waiting is None:

@@ -77,6 +77,10 @@ class RewardScale(Extension):
             batch["next", "reward"], self.given = self.given, None
         return {"reward_scale": self.scale}
 
+    def begin_episodes(self) -> None:
+        """Forget the returns of the running episodes."""
+        self.running = None
+
     def state_dict(self) -> dict[str, Any]:
         """Return the statistics."""
         return {"moments": self.moments.state_dict(), "running": self.running}

@@ -323,6 +323,8 @@ class Experiment(Stateful):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state that `state_dict` returned."""
         super().load_state_dict(state)
+        if self.rollout.carrier is None:  # its env cannot go on with the running episodes
+            self.learner.begin_episodes()
         # What building this process's env has asked its guides for is no part of the run.
         self.calls_before = state["calls"] - guide_calls(self.rollout.env)
         self.returns = deque(state["returns"], maxlen=self.EPISODES)

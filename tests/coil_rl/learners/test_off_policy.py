@@ -92,6 +92,14 @@ def test_rewards_of_several_steps_are_summed_within_an_episode():
             assert float(value) == (0.0 if last == 8 else gamma ** len(taken))
 
 
+def test_sum_does_not_reach_from_forgotten_episodes_into_new_ones():
+    learner = SAC(PendulumEnv(), ["th"], n_step=3)
+    learner.store(steps(0, 4))
+    learner.begin_episodes()
+    learner.store(steps(4, 4))
+    assert stored(learner) == [0, 1, 4, 5]
+
+
 def test_value_of_the_state_in_which_an_episode_was_truncated_is_limited():
     batch = steps(0, 5)
     batch["next", "done"][[1, 3, 4]] = batch["next", "terminated"][4] = True

@@ -8,6 +8,7 @@ from any_env import AnyEnv, action_of, learning
 from tensordict import TensorDict
 
 from coil_rl.learners import DQN, PPO, SAC, TRPO
+from coil_rl.learners.normaliser import Moments
 from coil_rl.learners.reward_scale import RewardScale
 
 
@@ -49,6 +50,18 @@ def test_returns_go_on_from_batch_to_batch_and_end_with_their_episodes():
     scale.prepare(batch_of([[3.0], [1.0]], [[True], [False]]))
     returns = torch.tensor([1.0, 2.5, 4.0, 0.0, 4.25, 1.0]).double()
     assert scale.scale == pytest.approx(float(returns.std(correction=0)))
+
+
+@pytest.mark.parametrize("kind", [PPO, SAC])
+def test_new_episodes_do_not_begin_with_the_returns_of_those_before(kind):
+    learner, rollout = learning(kind, AnyEnv(action=action_of(kind)), scale_rewards=True)
+    scale = getattr(learner, "reward_scale", None) or learner.extensions.each[0]
+    learner.update(rollout.collect())
+    assert scale.running.any()
+    learner.begin_episodes()
+    scale.moments = Moments(torch.Size([]))
+    scale.learn(batch_of([[3.0]], [[False]]))
+    assert scale.moments.mean == 3
 
 
 def test_rewards_that_are_0_stay_and_equal_returns_are_divided_by_their_size():

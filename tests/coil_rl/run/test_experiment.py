@@ -164,6 +164,19 @@ def test_stopped_and_resumed_run_ends_with_the_same_files(
     assert contents(tmp_path / "stopped") == resumed
 
 
+@pytest.mark.parametrize("continues", [True, False])
+def test_learner_forgets_episodes_that_a_resumed_env_cannot_go_on_with(tmp_path, continues):
+    stopped, forgotten = experiment(tmp_path), []
+    stopped.update(0.0)
+    stopped.save()
+    again = experiment(tmp_path)
+    again.metrics.truncate = lambda count: None
+    again.rollout.base_env.continues = continues
+    again.learner.begin_episodes = lambda: forgotten.append(True)
+    again.resume()
+    assert bool(forgotten) != continues
+
+
 def test_checkpoint_of_another_run_is_refused(tmp_path):
     def resumed(**identity):
         run = experiment(tmp_path, frames=16 * 8)
