@@ -417,6 +417,7 @@ class Run:
             before = begun.get(CODE_BEFORE, {}) | begun[CODE]
             saved = {**self.settings, CODE: present, CODE_BEFORE: before}
             write_config(self.folder, saved)
+            (self.folder / record.GUIDE_RETURNS.name).unlink(missing_ok=True)  # of the other code
             say(f"{self.folder} goes on with another file of {names}", error=True)
 
     def check_unchanged(self) -> None:

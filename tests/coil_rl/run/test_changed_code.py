@@ -7,6 +7,7 @@ import pytest
 
 import coil_rl
 from coil_rl import UserError
+from coil_rl.record import GUIDE_RETURNS
 from coil_rl.run.folder import CODE, CODE_BEFORE, code_of
 
 PLANT = """
@@ -45,14 +46,17 @@ def test_change_of_a_file_is_said_and_refused_where_the_run_would_go_on(place, c
     (place / "rewards_of_mine.py").write_text("def cost(level):\n    return level**2\n")
     with pytest.warns(UserWarning, match="was trained with another file of rewards_of_mine: what"):
         run.evaluate(cases=1)
+    GUIDE_RETURNS.write(folder, {"guide": -9.0})
     again = coil_rl.open_run(folder, trust=["tank_of_mine"])
     with pytest.warns(UserWarning, match="another file of rewards_of_mine"):
         again.controller()
     with pytest.raises(UserError, match=r"another file of rewards_of_mine.* changed=accept"):
         again.train(frames=64)
     assert code_of(folder)[CODE] == begun
+    assert GUIDE_RETURNS.read(folder) == {"guide": -9.0}
     again.train(frames=64, changed="accept")
     assert "goes on with another file of rewards_of_mine" in capsys.readouterr().err
     now = code_of(folder)
     assert now[CODE_BEFORE] == begun
+    assert GUIDE_RETURNS.read(folder) == {}  # measured anew, without a guide
     assert now[CODE]["rewards_of_mine"] != begun["rewards_of_mine"]
