@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
 
@@ -78,11 +78,13 @@ class NStep:
         """Return the waiting steps."""
         if self.waiting is None:
             return {}
-        return {"waiting": self.waiting.clone(), "given": self.given}
+        return {"waiting": self.waiting.clone().to_dict(), "given": self.given}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state that `state_dict` returned."""
-        self.waiting, self.given = state.get("waiting"), state.get("given")
+        self.waiting, self.given = None, state.get("given")
+        if self.given is not None:
+            self.waiting = TensorDict.from_dict(state["waiting"], batch_size=self.given.shape)
 
 
 def discounted(minibatch: Any, gamma: Tensor, value: Tensor) -> Tensor:

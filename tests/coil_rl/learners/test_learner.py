@@ -7,6 +7,7 @@ import torch
 from any_env import AnyEnv, action_of, check_same_update, learning
 from torchrl.data import Bounded
 
+from coil_rl.foreign.remembered import copied
 from coil_rl.learners import A2C, DQN, PPO, SAC, TQC, TRPO, CrossQ, Reinforce
 
 KINDS = [PPO, A2C, Reinforce, TRPO, SAC, DQN]
@@ -70,7 +71,7 @@ def test_restored_learner_goes_on_with_the_same_digits(kind, options, updates):
     for _ in range(updates):
         first.update(rollout.collect())
     second, _ = learning(kind, InUnits(kind, unit=1e3), **options, **replay, seed=9)
-    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    second.load_state_dict(copied(first.state_dict()))  # as a checkpoint gives it back
     check_same_update(first, second, rollout.collect())
     if replay:
         assert (first.buffer[:] == second.buffer[:]).all()
