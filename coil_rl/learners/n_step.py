@@ -36,7 +36,7 @@ class NStep:
         if self.count == 1:
             return rows.reshape(-1)
         if self.waiting is not None:
-            rows = torch.cat([self.waiting, rows], 1)
+            rows = torch.cat([self.waiting.to(rows.device), rows], 1)  # a checkpoint is on the CPU
         after = rows["next"]
         total = rows.shape[1]
         place = torch.arange(total, device=rows.device)
@@ -64,7 +64,7 @@ class NStep:
         """Keep the last steps for the next batch; return which steps are complete and new."""
         new = complete.clone()
         if self.given is not None:
-            new[:, : self.given.shape[1]] &= ~self.given
+            new[:, : self.given.shape[1]] &= ~self.given.to(new.device)
         keep = min(self.count - 1, rows.shape[1])
         self.waiting = rows[:, -keep:].clone()
         self.given = complete[:, -keep:]
