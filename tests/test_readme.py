@@ -78,6 +78,7 @@ TASKS = {
     "Reacher*": "reacher",
 }
 ARMS = ("intact", "half", "reversed", "random")
+RUNS = pandas.read_csv(ROOT / "docs" / "methods" / "promise_sac_runs.csv")
 
 
 def promised(runs):
@@ -98,7 +99,7 @@ def promised(runs):
 
 
 def test_numbers_of_the_table_are_those_of_the_runs():
-    rows = pandas.read_csv(ROOT / "docs" / "methods" / "promise_sac_runs.csv")
+    rows = RUNS[RUNS["seed"] < 10]
     verdicts = Counter()
     for name, task in TASKS.items():
         [cells] = re.findall(rf"^\| {re.escape(name)}, [\d,]+ \|(.*)\|$", README, flags=re.M)
@@ -115,6 +116,26 @@ def test_numbers_of_the_table_are_those_of_the_runs():
             assert end.strip() == f"{mark}{end.strip('* ')}{mark}", (task, arm)
     counts = "{gain} gains, {even} even, {loss} losses".format_map(verdicts)
     assert f"**{counts}** in nine tasks" in README
+
+
+def test_ten_other_seeds_have_the_numbers_of_their_runs():
+    rows = RUNS[RUNS["seed"] >= 10]
+    page = (ROOT / "docs" / "anchored_measured.md").read_text().partition("**Ten other seeds")[2]
+    page = page.partition("\n- ")[0]
+    verdicts = Counter()
+    for task, runs in rows.groupby("task"):
+        [cells] = re.findall(rf"^\| {task} \|(.*)\|$", page, flags=re.MULTILINE)
+        ppo, sac, *pairs = cells.split("|")
+        alone, arms = promised(runs)
+        check_number(sac, alone["sac"])
+        check_number(ppo, alone["ppo"])
+        for arm, pair in zip(ARMS, pairs, strict=True):
+            verdicts[arms[arm][2]] += 1
+            guide, end = pair.partition(";")[0].split("→")
+            check_number(guide, arms[arm][0])
+            check_number(end.strip("* "), arms[arm][1])
+    counts = "{gain} gains, {even} even, {loss} losses".format_map(verdicts)
+    assert all(counts in " ".join(text.split()) for text in (README, page))
 
 
 def test_verdicts_with_ppo_are_those_of_the_benchmark():

@@ -130,7 +130,7 @@ def test_distributed_collector_runs_a_learner(tmp_path):
 def test_returns_of_methods_with_replay_are_those_of_the_runs():
     files = [DOCS / "methods" / f"{name}_runs.csv" for name in ("replay", "promise_sac")]
     runs = pandas.concat(map(pandas.read_csv, files))
-    means = runs.groupby(["task", "method", "arm"])["end"].mean()
+    means = runs[runs["seed"] < 10].groupby(["task", "method", "arm"])["end"].mean()
     part = (DOCS / "learners.md").read_text().partition("### With a guide")[2]
     for name, method in REPLAY.items():
         [cells] = re.findall(rf"^\| \[?{name}\b[^|]*\|(.*)\|$", part, flags=re.MULTILINE)
