@@ -15,6 +15,7 @@ from torchrl.envs import (
     Compose,
     EnvBase,
     FrameSkipTransform,
+    InitTracker,
     RewardSum,
     Transform,
     TransformedEnv,
@@ -222,4 +223,6 @@ def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> Env
 def _may_pay(transform: Transform, env: EnvBase) -> bool:
     """Return whether a transform of somebody else may change the reward."""
     of_others = not type(transform).__module__.startswith(("coil_", "torchrl."))
+    if isinstance(transform, InitTracker):  # it knows its keys in an env only
+        return False
     return of_others or not {*env.reward_keys}.isdisjoint(transform.out_keys or ())

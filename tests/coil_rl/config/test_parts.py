@@ -439,3 +439,9 @@ def test_proxies_are_copied_whole_or_not_at_all(tmp_path):
     with pytest.raises(FileNotFoundError):
         copy_proxies({"guide": run}, folder)
     assert not list(folder.iterdir())
+
+
+def test_network_with_a_memory_has_its_transforms_in_an_env():
+    words = ["env=pendulum", "method=ppo", "learner=ppo", "network=gru", "learner.minibatches=1"]
+    env = parts.env_maker(composed(*words))(2)
+    assert "is_init" in env.reset()
