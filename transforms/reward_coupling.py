@@ -70,7 +70,9 @@ class RewardCoupling(GuideTransform):
         difference = space.normalise(action) - space.normalise(self.advice(tensordict))
         distance = torch.linalg.vector_norm(difference, self.order, -1, keepdim=True)
         distance = distance.to(reward.dtype)
-        next_tensordict.set("task_reward", reward).set("guide_distance", distance)
+        if "task_reward" not in next_tensordict:  # of a `TaskReward` in front
+            next_tensordict.set("task_reward", reward)
+        next_tensordict.set("guide_distance", distance)
         if self.learns:
             next_tensordict.set(self.reward_key, reward - self.current(self.beta) * distance)
         return next_tensordict

@@ -33,7 +33,7 @@ class Anew(partial[Any]):
     """A `functools.partial` whose calls share no dictionary and no list of its arguments."""
 
     def __call__(self, *args: Any, **arguments: Any) -> Any:
-        """Return what it makes."""
+        """Call the function with new dictionaries and lists in place of those given before."""
         return self.func(*own([*self.args]), *args, **own(self.keywords) | arguments)
 
 

@@ -112,7 +112,7 @@ class Extensions(Extension):
         return metrics
 
     def begin_episodes(self) -> None:
-        """Let all forget the running episodes."""
+        """Tell all extensions that the running episodes do not go on."""
         for extension in self.each:
             extension.begin_episodes()
 

@@ -90,7 +90,7 @@ class Stateful:
         return {name: _state_of(getattr(self, name)) for name in self.parts}
 
     def begin_episodes(self) -> None:
-        """Let each part forget the running episodes."""
+        """Tell each part that the running episodes do not go on."""
         for name in self.parts:
             if hasattr(part := getattr(self, name), "begin_episodes"):
                 part.begin_episodes()

@@ -71,7 +71,7 @@ class NStep:
         return new
 
     def begin_episodes(self) -> None:
-        """Forget the waiting steps, which nothing follows."""
+        """Drop the waiting steps: their episodes do not go on."""
         self.waiting = self.given = None
 
     def state_dict(self) -> dict[str, Any]:

@@ -97,7 +97,8 @@ def check_same(
     """
     keys = dict.fromkeys([*saved, *requested])
     differ = [key for key in keys if saved.get(key) != requested.get(key)]
-    for key in sorted(differ, key=lambda key: not key.endswith("_target_")):
+    if differ:
+        key = max(differ, key=lambda key: key.endswith("_target_"))  # the first of equals
         raise UserError(f"{holder} with {key}={saved.get(key)}, not {requested.get(key)}; {remedy}")
 
 

@@ -81,7 +81,7 @@ class LeanEnv:
         return after
 
     def observed(self, data: TensorDictBase) -> TensorDictBase:
-        """Write what is observed of entries of the env, and return them."""
+        """Write the observations for entries of the env, and return all."""
         for link in self.links:
             link.observe(data, {})
         return data
@@ -140,7 +140,7 @@ class LeanSteps:
         """
         after = self.env.moved(entries["action"], entries)
         rows = after["done"].flatten().nonzero().flatten()
-        first = self._observed(after, rows)
+        first = self._begin(after, rows)
         kept = {key: entries[key] for key in self.before}
         kept |= {key: after[name] for key, name in self.after.items()}
         carried = self.carry(after)
@@ -148,8 +148,16 @@ class LeanSteps:
             carried[key] = carried[key].index_put((rows,), value)
         return kept, carried
 
-    def _observed(self, after: TensorDictBase, rows: Tensor) -> dict[NestedKey, Tensor]:
-        """Write what is observed after a step; return what is read of the next episodes of rows."""
+    def _begin(self, after: TensorDictBase, rows: Tensor) -> dict[NestedKey, Tensor]:
+        """Write the observations after a step, and begin new episodes in the rows that are done.
+
+        Args:
+            after: what the env has written in the step.
+            rows: that are done, [K].
+
+        Returns:
+            What is read of the first steps of the new episodes, [K, ...].
+        """
         if not len(rows):
             self.env.observed(after)
             return {}

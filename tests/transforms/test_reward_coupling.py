@@ -1,10 +1,11 @@
 import pytest
 import torch
 import worlds
-from torchrl.envs import RewardSum
+from torchrl.envs import RewardScaling, RewardSum
 
 from coil_rl.schedules import Linear
 from coil_rl.transforms import RewardCoupling, set_progress
+from coil_rl.transforms.reward_coupling import TaskReward
 
 
 @pytest.mark.parametrize(("norm", "order"), [("l1", 1), ("l2", 2), ("linf", torch.inf)])
@@ -38,3 +39,10 @@ def test_distance_of_discrete_actions_is_0_or_2():
     rollout = worlds.carts(RewardCoupling(0.5, "l1")).train().rollout(5)
     differs = rollout["action"] != rollout["guide_action"].argmax(-1).squeeze(-1)
     assert torch.equal(rollout["next", "guide_distance"].squeeze(-1), 2.0 * differs)
+
+
+def test_kept_reward_stays_the_envs_own_behind_a_transform_of_the_reward():
+    parts = [TaskReward(), RewardScaling(0.0, 0.5), RewardCoupling(beta=0.3)]
+    after = worlds.cones(*parts).train().rollout(3)["next"]
+    coupled = 0.5 * after["task_reward"] - 0.3 * after["guide_distance"]
+    torch.testing.assert_close(after["reward"], coupled)

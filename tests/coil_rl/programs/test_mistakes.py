@@ -98,7 +98,8 @@ OF_TRAINING = "has no effect: only a training reads it"
         (
             "evaluate",
             "run=RUN env.laps=2",
-            f"{OWN} (for another env +evaluation.env.KEY=VALUE); what",
+            f"env.laps=2 {OWN} (for another env +evaluation.env.KEY=VALUE); what can be changed is "
+            "run, ",
         ),
         ("evaluate", "run=RUN +action.x=1", f"+action.x=1 {OWN}"),
         ("listen", "run=RUN guide=random", f"guide=random {OWN}"),
