@@ -19,7 +19,7 @@ from coil_rl.export.step import NotExportableError, PolicyStep, exportable
 from coil_rl.extras import require
 from coil_rl.files import whole_file
 from coil_rl.foreign.controllers import PerRow
-from coil_rl.foreign.shared import FunctionGuide
+from coil_rl.foreign.shared import SharedGuide
 from coil_rl.guides.simple import EntryGuide
 from coil_rl.output import progress, say
 from coil_rl.ranges import Interval, checked
@@ -152,7 +152,7 @@ def _cause(controller: Controller) -> str | None:
         for part in guide.modules():
             if isinstance(part, PerRow):
                 return f"guide {name} is a Python object for each row ({part.title})"
-            if isinstance(part, FunctionGuide) and not part.for_batch:
+            if isinstance(part, SharedGuide) and not part.for_batch:
                 return f"guide {name} is a Python function of one observation ({part.title})"
             if isinstance(part, SeededGenerator):
                 return f"guide {name} draws numbers at random"

@@ -33,7 +33,7 @@ from coil_rl.foreign.host import (
     role_of,
 )
 from coil_rl.foreign.remembered import Anew, copied, maker_of_rows, state_of
-from coil_rl.foreign.shared import FunctionGuide, NetworkGuide
+from coil_rl.foreign.shared import SharedGuide
 from coil_rl.transforms.action_space import ActionSpace, OwnForms, nested_key, written_key
 from coil_rl.transforms.hosted import HostedGuide, ToldGuide
 
@@ -104,7 +104,12 @@ class PerRow(HostedGuide):
         for key in self.read:
             entry = flat[key]
             if is_tensor_collection(entry):
-                raise ForeignError(_parts_of(key, entry))
+                inner = entry.keys(include_nested=True, leaves_only=True)
+                names = ",".join(written_key(unravel_key((key, part))) for part in inner)
+                raise ForeignError(
+                    f"{written_key(key)} is not one entry but several; name those that the "
+                    f"controller reads by in_keys=[{names}]"
+                )
             entry = self.own[key](entry) if key in self.own else entry
             columns.append(entry.cpu().numpy().copy())
         observations = zip(*columns, strict=True)
@@ -199,8 +204,8 @@ class ControllerGuide(HostedGuide):
     | a class with a method `act` | `PerRow`: one object for each row of the env |
     | an object with a method `act`, or a network with one | `PerRow`: one copy for each row |
     | a trained model with `predict`, as of Stable-Baselines3 | `PerRow`: one state for each row |
-    | another `nn.Module`, or a class of such | `NetworkGuide`: entries [B, N] to actions [B, A] |
-    | a function | `FunctionGuide`: of one observation, or of a batch of them |
+    | another `nn.Module`, or a class of such | `SharedGuide`: entries [B, N] to actions [B, A] |
+    | a function | `SharedGuide`: of one observation, or of a batch of them |
 
     A `functools.partial` of a class is used as the class. Of a module with weights a copy is used,
     which alone a method may train.
@@ -283,7 +288,7 @@ def _guide_of(
         )
     if role == "function":
         as_one, function = check_call(thing, title, read, options), partial(thing, **options)
-        return FunctionGuide(
+        return SharedGuide(
             (lambda *given: function(observation_of(read, given))) if as_one else function,
             read,
             title,
@@ -317,7 +322,7 @@ def _of_object(thing: Any, title: str, keys: list[NestedKey] | None) -> TensorDi
             raise ValueError(f"of={title} has its own in_keys={thing.in_keys}; leave in_keys out")
         return hold(thing)
     if role == "network":
-        return NetworkGuide(thing, read, title)
+        return SharedGuide(thing, read, title)
     if role == "act":
         return PerRow(
             maker_of_rows(thing),
@@ -333,17 +338,7 @@ def _of_object(thing: Any, title: str, keys: list[NestedKey] | None) -> TensorDi
             f"of={title} predicts from one entry, as its observation_space is no Dict, but in_keys "
             f"names {', '.join(map(written_key, read))}; name one"
         )
-    return PerRow(partial(Predictor, thing, read), read, title=title)
-
-
-def _parts_of(key: NestedKey, entry: TensorDictBase) -> str:
-    """Return the error message for a key that stands for several entries."""
-    inner = entry.keys(include_nested=True, leaves_only=True)
-    names = [written_key(unravel_key((key, part))) for part in inner]
-    return (
-        f"{written_key(key)} is not one entry but several; name those that the controller reads by "
-        f"in_keys=[{','.join(names)}]"
-    )
+    return PerRow(partial(Predictor, thing), read, title=title, as_one=isinstance(parts, Mapping))
 
 
 def load(of: str, key: str = "of") -> Any:

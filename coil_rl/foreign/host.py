@@ -69,19 +69,12 @@ def role_of(thing: Any) -> Role:
             return "act"
     elif callable(act):
         return "act"
-    if not callable(act) and _predicts(thing):
+    # The models of scikit-learn do not take `deterministic`.
+    if not callable(act) and "deterministic" in _parameters(getattr(thing, "predict", None)):
         return "predict"
     if issubclass(kind, nn.Module):
         return "network"
     return "function" if callable(thing) and not inspect.isclass(thing) else ""
-
-
-def _predicts(thing: Any) -> bool:
-    """Return whether something has a `predict` as the models of Stable-Baselines3 have it.
-
-    Those of scikit-learn do not take `deterministic`.
-    """
-    return "deterministic" in _parameters(getattr(thing, "predict", None))
 
 
 def _parameters(thing: Any) -> Mapping[str, inspect.Parameter]:
@@ -101,11 +94,10 @@ class Predictor:
     Args:
         model: the model. `predict` must take `deterministic`; the others are given if it takes
             them.
-        keys: of the entries that it is given one by one, as its space has them.
     """
 
-    def __init__(self, model: Any, keys: Sequence[NestedKey]) -> None:
-        self.model, self.keys = model, keys
+    def __init__(self, model: Any) -> None:
+        self.model = model
         self.space = getattr(model, "observation_space", None)
         parameters = inspect.signature(model.predict).parameters
         self.takes = {name for name in ("state", "episode_start") if name in parameters}
@@ -115,23 +107,20 @@ class Predictor:
         """Begin an episode: forget the state."""
         self.state, self.first = None, True
 
-    def act(self, *observed: Any) -> Any:
-        """Return the deterministic action for the entries of an observation."""
+    def act(self, observed: Any) -> Any:
+        """Return the deterministic action for an observation; of a Dict space a dictionary."""
+        parts = getattr(self.space, "spaces", None)
+        if isinstance(parts, Mapping):
+            observed = {key: _in_space(entry, parts.get(key)) for key, entry in observed.items()}
+        else:
+            observed = _in_space(observed, self.space)
         given = {"state": self.state, "episode_start": np.array([self.first])}
         known = {name: given[name] for name in self.takes}
-        answer = self.model.predict(self._whole(observed), deterministic=True, **known)
+        answer = self.model.predict(observed, deterministic=True, **known)
         self.first = False
         if isinstance(answer, tuple) and len(answer) == 2:
             answer, self.state = answer
         return answer
-
-    def _whole(self, entries: Sequence[NDArray[Any]]) -> Any:
-        """Return the observation of some entries."""
-        parts = getattr(self.space, "spaces", None)
-        if not isinstance(parts, Mapping):
-            return _in_space(entries[0], self.space)
-        named = zip(self.keys, entries, strict=True)
-        return {key: _in_space(entry, parts.get(key)) for key, entry in named}
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the next actions of the episode depend on."""

@@ -6,7 +6,6 @@ again.
 """
 
 import warnings
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -142,24 +141,42 @@ def _near(one: Tensor, other: Tensor, tolerance: float, actions: Sequence[Tensor
     return bool(((one - other).abs() <= tolerance * numbers.abs().max()).all())
 
 
-class _Shared(HostedGuide):
-    """Base of guides of one controller for all rows.
+class SharedGuide(HostedGuide):
+    """A network or a function as a guide, one for all rows.
+
+    A network gets the entries of all rows, [B, N], and returns actions [B, A]. A function gets the
+    observations of all rows at once, or of one row after the other.
+
+    A function for a batch gets tensors [B, N] and returns actions [B, A]. One for a single
+    observation gets NumPy arrays [N] and returns an action [A], a number or an index. Whole
+    numbers and choices are as a Gymnasium env gives them. Which of the two it is, is found out
+    at its first call: it is for a batch if it gives the same for a row beside quite other ones as
+    for the row alone, in the form of actions, or if it cannot take a row alone. A function that
+    remembers something would mix the rows: `takes_batch` finds it.
 
     Args:
+        module: the network, or the function of one value for each of `in_keys`; it must give the
+            same action for the same observation.
         in_keys: entries to read, [*batch, ...].
-        title: name of the controller, for messages.
+        title: its name, for messages.
+
+    Raises:
+        ForeignError: at a call, for what a function raises for one row, for a batch if it can take
+            neither, for what it returns that is no action, for another action for the same
+            observation, and for a network whose action depends on the other rows.
     """
 
     space: ActionSpace | None = None  # unknown outside of an env
     own: OwnForms = {}  # noqa: RUF012  replaced, never changed
     for_batch: bool | None = None  # unknown before the first call
-    each: Ask | None = None  # asks for one row after the other, if that is possible
 
-    def __init__(self, in_keys: Sequence[NestedKey], title: str) -> None:
+    def __init__(
+        self, module: Callable[..., Any], in_keys: Sequence[NestedKey], title: str
+    ) -> None:
         self.in_keys: list[NestedKey] = [nested_key(key) for key in in_keys]
         self.out_keys = ["action"]
         super().__init__()
-        self.title, self.guard = title, Guard()
+        self.module, self.title, self.guard = module, title, Guard()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action, which may be one number for each row, as regressors predict it."""
@@ -172,16 +189,36 @@ class _Shared(HostedGuide):
             action = self.space.as_column(action, tensordict.batch_size)
         return tensordict.set("action", action)
 
-    @abstractmethod
-    def _asked(self, entries: Sequence[Tensor]) -> Any:
-        """Return what the controller gives for all rows."""
-
     def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
         """Return the actions for all rows."""
-        action = self._asked(entries)
+        if isinstance(self.module, nn.Module):
+            action = self.module(*entries)
+        else:
+            action = self.module(*(entry.clone() for entry in self._as_given(entries)))
         if isinstance(action, Tensor):
             return action  # checked on its device by `GuideActions`
         return torch.as_tensor(action_array(action), device=entries[0].device)
+
+    def _by_row(self, entries: Sequence[Tensor]) -> Tensor:
+        """Return the actions of a function for one row after the other."""
+        rows = [self._alone(entries, row) for row in range(len(entries[0]))]
+        if len({row.shape for row in rows}) > 1:
+            shapes = ", ".join(sorted({str(list(row.shape)) for row in rows}))
+            raise ForeignError(
+                f"the controller {self.title} returned actions of the shapes {shapes} in one step"
+            )
+        return torch.from_numpy(np.stack(rows))
+
+    def _alone(self, entries: Sequence[Tensor], row: int) -> NDArray[Any]:
+        """Return the action for one row, as an array of at least one dimension."""
+        with foreign(f"the controller {self.title} (row {row})", "it"):
+            alone = self._as_given([entry[row] for entry in entries])
+            return action_array(self.module(*(each.cpu().numpy().copy()[()] for each in alone)))
+
+    def _as_given(self, entries: Sequence[Tensor]) -> list[Tensor]:
+        """Return entries as the env gives them, [*batch, ...]."""
+        named = zip(self.in_keys, entries, strict=True)
+        return [self.own[key](entry) if key in self.own else entry for key, entry in named]
 
     def meet(self, space: ActionSpace, own: OwnForms) -> None:
         """Take the space of the actions, which decides what has the form of actions."""
@@ -207,14 +244,15 @@ class _Shared(HostedGuide):
         with self.guard:
             rows = [entry.flatten(0, dims - 1) if dims else entry[None] for entry in entries]
             if self.for_batch is None:
+                each = None if isinstance(self.module, nn.Module) else self._by_row
                 with torch.no_grad(), warnings.catch_warnings():
                     warnings.simplefilter("ignore")  # of numbers that no env has
                     self.for_batch = takes_batch(
-                        self.title, rows, self._of_batch, self.each, self._has_form
+                        self.title, rows, self._of_batch, each, self._has_form
                     )
-            if self.for_batch or self.each is None:
+            if self.for_batch:
                 return self._of_batch(entries)
-            action = self.each(rows).to(rows[0].device)
+            action = self._by_row(rows).to(rows[0].device)
             return action.reshape(*entries[0].shape[:dims], *action.shape[1:])
 
     def _has_form(self, together: Tensor, alone: Tensor, count: int) -> bool:
@@ -229,81 +267,6 @@ class _Shared(HostedGuide):
         if together.shape == (count, *alone.shape):
             return True
         return self.space is not None and self.space.takes(together, torch.Size([count]))
-
-
-class NetworkGuide(_Shared):
-    """A network as a guide: entries [B, N] to actions [B, A].
-
-    Args:
-        network: the network.
-        in_keys: entries to read.
-        title: name of the network, for messages.
-
-    Raises:
-        ForeignError: at a call, for a network that gives another action for the same observation,
-            or one that depends on the other rows.
-    """
-
-    def __init__(self, network: nn.Module, in_keys: Sequence[NestedKey], title: str) -> None:
-        super().__init__(in_keys, title)
-        self.module = network
-
-    def _asked(self, entries: Sequence[Tensor]) -> Any:
-        return self.module(*entries)
-
-
-class FunctionGuide(_Shared):
-    """A function as a guide, of one observation or of a batch of them.
-
-    It gets the observations of all rows at once, or of one row after the other.
-
-    A function for a batch gets tensors [B, N] and returns actions [B, A]. One for a single
-    observation gets NumPy arrays [N] and returns an action [A], a number or an index. Whole
-    numbers and choices are as a Gymnasium env gives them. Which of the two it is, is found out
-    at its first call: it is for a batch if it gives the same for a row beside quite other ones as
-    for the row alone, in the form of actions, or if it cannot take a row alone. A function that
-    remembers something would mix the rows: `takes_batch` finds it.
-
-    Args:
-        function: takes one value for each of `in_keys`; it must give the same action for the same
-            observation.
-        in_keys: entries to read, [*batch, ...].
-        title: name of the function, for messages.
-
-    Raises:
-        ForeignError: at a call, for what the function raises, for a batch if it can take neither,
-            for what it returns that is no action, and for another action for the same observation.
-    """
-
-    def __init__(
-        self, function: Callable[..., Any], in_keys: Sequence[NestedKey], title: str
-    ) -> None:
-        super().__init__(in_keys, title)
-        self.function = function
-
-    def _as_given(self, entries: Sequence[Tensor]) -> list[Tensor]:
-        """Return entries as the env gives them, [*batch, ...]."""
-        named = zip(self.in_keys, entries, strict=True)
-        return [self.own[key](entry) if key in self.own else entry for key, entry in named]
-
-    def _asked(self, entries: Sequence[Tensor]) -> Any:
-        return self.function(*(entry.clone() for entry in self._as_given(entries)))
-
-    def each(self, entries: Sequence[Tensor]) -> Tensor:
-        """Return the actions for one row after the other."""
-        rows = [self._alone(entries, row) for row in range(len(entries[0]))]
-        if len({row.shape for row in rows}) > 1:
-            shapes = ", ".join(sorted({str(list(row.shape)) for row in rows}))
-            raise ForeignError(
-                f"the controller {self.title} returned actions of the shapes {shapes} in one step"
-            )
-        return torch.from_numpy(np.stack(rows))
-
-    def _alone(self, entries: Sequence[Tensor], row: int) -> NDArray[Any]:
-        """Return the action for one row, as an array of at least one dimension."""
-        with foreign(f"the controller {self.title} (row {row})", "it"):
-            alone = self._as_given([entry[row] for entry in entries])
-            return action_array(self.function(*(each.cpu().numpy().copy()[()] for each in alone)))
 
 
 def _beside_others(entry: Tensor) -> Tensor:
