@@ -57,6 +57,7 @@ def describe(
     """
     plant = controller.plant
     known = meanings_of(plant)
+    title = plant.codec.name if isinstance(plant, GymnasiumEnv) else type(plant).__name__
     rate: dict[str, Any] | None = None
     if not math.isnan(getattr(plant, "rate", math.nan)):
         rate = {"value": float(plant.rate), "unit": "steps per second"}
@@ -66,7 +67,7 @@ def describe(
         "format": FORMAT,
         "version": VERSION,
         "policy": _policy(run, which, guide_itself(controller, step)),
-        "env": {"title": title_of(plant), "control_rate": rate},
+        "env": {"title": title, "control_rate": rate},
         "batch": "any number of rows; the first dimension of every input and output",
         "inputs": [_input(entry, plant, step, known) for entry in step.inputs],
         "outputs": [_action(plant, step, known)],
@@ -85,17 +86,6 @@ def describe(
         "results": results_of(run),
         "made_with": {name: metadata.version(name) for name in PACKAGES} | {"opset": OPSET},
     }
-
-
-def title_of(plant: Any) -> str:
-    """Return the name of an env, for people.
-
-    Args:
-        plant: without transforms.
-    """
-    if isinstance(plant, GymnasiumEnv):
-        return plant.codec.name
-    return type(plant).__name__
 
 
 def guide_itself(controller: Controller, step: PolicyStep) -> str | None:

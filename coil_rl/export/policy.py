@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from coil_rl.export.contract import ADVICE, place_of, read_contract
 from coil_rl.export.session import Session
+from coil_rl.foreign.faults import shown
 
 
 class ExportedPolicy:
@@ -184,28 +185,21 @@ def _one_hot(value: Any, entry: Mapping[str, Any]) -> Any:
 
 def _row(value: Any, entry: Mapping[str, Any]) -> NDArray[Any]:
     """Return the value of an input with the batch dimension, [1, ...]."""
-    shape = tuple(entry["shape"])
-    given = np.asarray(value)
+    given, shape = np.asarray(value), tuple(entry["shape"])
     # Dimensions of 1 may be left out.
-    if [n for n in given.shape if n != 1] != [n for n in shape if n != 1]:
-        raise ValueError(
-            f"{entry['name']} has the shape {list(given.shape)}, but must have {list(shape)}"
-        )
-    if given.dtype.kind not in "fiub":
-        raise ValueError(f"{entry['name']} holds {given.dtype}, but must hold numbers")
-    if not np.isfinite(given).all():
-        raise ValueError(f"{entry['name']} holds a number that is not finite")
-    if "choices" in entry:
-        _chosen(entry["name"], given.reshape(shape), entry["choices"], entry["lowest"])
-    with np.errstate(all="ignore"):
-        converted = given.astype(entry["dtype"])
-    fits = np.isfinite(converted) if converted.dtype.kind == "f" else converted == given
-    if not fits.all():
-        raise ValueError(
-            f"{entry['name']} holds {given[~fits].tolist()[0]}, which is no number of "
-            f"{entry['dtype']}; give numbers as the env does"
-        )
-    return converted.reshape(1, *shape)
+    fits = [n for n in given.shape if n != 1] == [n for n in shape if n != 1]
+    if fits and given.dtype.kind in "fiub":
+        with np.errstate(all="ignore"):
+            converted = given.astype(entry["dtype"])
+        same = converted.dtype.kind == "f" or (converted == given).all()
+        if same and np.isfinite(converted).all():
+            if "choices" in entry:
+                _chosen(entry["name"], given.reshape(shape), entry["choices"], entry["lowest"])
+            return converted.reshape(1, *shape)
+    raise ValueError(
+        f"{entry['name']} is {shown(value)}, but must be {list(shape)} finite numbers of "
+        f"{entry['dtype']}"
+    )
 
 
 def _chosen(
