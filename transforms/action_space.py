@@ -359,16 +359,6 @@ class ActionTransform(Link):
         return self.action_space.clamp(vectors)
 
 
-def first_choices(env: EnvBase) -> Tensor | None:
-    """Return the lowest number of each choice of an env, [n], if it has one and that is not 0."""
-    return getattr(env, "first_choices", None)
-
-
-def own_shape(env: EnvBase) -> Sequence[int] | None:
-    """Return the shape of an action as controllers give it; None: that of the env's spec."""
-    return getattr(env, "own_shape", None)
-
-
 def own_forms(env: EnvBase) -> OwnForms:
     """Return what converts entries from the form of networks to that of the env, by entry."""
     return getattr(env, "own_forms", {})
@@ -381,8 +371,8 @@ def space_of(env: EnvBase, action_key: NestedKey) -> ActionSpace:
         env: without transforms.
         action_key: entry of the action.
     """
-    spec = env.full_action_spec[action_key]
-    return ActionSpace(spec, env.batch_dims, first_choices(env), own_shape(env))
+    first, shape = getattr(env, "first_choices", None), getattr(env, "own_shape", None)
+    return ActionSpace(env.full_action_spec[action_key], env.batch_dims, first, shape)
 
 
 def random_action(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, ClassVar
 
 import numpy as np
@@ -74,13 +74,11 @@ def plain_array(value: Any, what: str) -> NDArray[Any]:
     """
     if type(value) is np.ndarray and value.dtype.kind in "biuf":
         return value
-    try:
+    with suppress(Exception):
         array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
-    except Exception as error:
-        raise FaultError(f"{what} is {shown(value)}, not an array of numbers") from error
-    if array.dtype.kind not in "biuf" or np.ma.is_masked(value):
-        raise FaultError(f"{what} is {shown(value)}, not an array of numbers")
-    return array
+        if array.dtype.kind in "biuf" and not np.ma.is_masked(value):
+            return array
+    raise FaultError(f"{what} is {shown(value)}, not an array of numbers")
 
 
 def one_number(value: Any, what: str) -> float:
@@ -92,11 +90,9 @@ def one_number(value: Any, what: str) -> float:
     Raises:
         FaultError: for None, a text, an array with a dimension, and a complex number.
     """
-    try:
+    with suppress(Exception):
         if not isinstance(value, (str, bytes)) and np.ndim(value) == 0:
             return float(value)
-    except Exception as error:
-        raise FaultError(f"{what} is {shown(value)}, not one number") from error
     raise FaultError(f"{what} is {shown(value)}, not one number")
 
 

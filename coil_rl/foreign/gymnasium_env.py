@@ -156,7 +156,8 @@ class GymnasiumEnv(SeededRows):
         if not workers:
             self.held.extend(map(make_plant, range(1, num_envs)))
         super().__init__(self.held, num_envs, seed, first_seed, cases, device)
-        self.rate = _rate(first.env)
+        rate = metadata_of(first.env, "render_fps", math.nan)
+        self.rate = float(rate) if isinstance(rate, (int, float)) else math.nan
         actions = self.codec.actions
         self.first_choices, self.own_shape = actions.first, actions.own_shape
         self._declare_specs(name, makers, dtype)
@@ -289,9 +290,3 @@ class GymnasiumEnv(SeededRows):
                 tensors[key] = value.to(spec.dtype).reshape(spec.shape)
         data = TensorDict(tensors, self.batch_size)
         return data if self.device is None or self.device.type == "cpu" else data.to(self.device)
-
-
-def _rate(env: Env) -> float:
-    """Return the pictures per second of an env; NaN if it does not say."""
-    rate = metadata_of(env, "render_fps", math.nan)
-    return float(rate) if isinstance(rate, (int, float)) else math.nan

@@ -20,6 +20,7 @@ from coil_rl.foreign.limit import layers
 # What an error about a missing package mentions, and the extra of coil-rl that installs it.
 EXTRAS = {"box2d": "gym", "pygame": "gym", "mujoco": "mujoco", "minigrid": "babyai"}
 
+SPACES = ("action_space", "observation_space")
 Env = gymnasium.Env[Any, Any]
 
 
@@ -73,11 +74,7 @@ def make_env(
             env = _limited(env, steps)
         for wrapper in wrappers:
             env = wrapper(env)
-        missing = [
-            which
-            for which in ("action_space", "observation_space")
-            if isinstance(env, gymnasium.Env) and getattr(env, which, None) is None
-        ]
+        found = {which: getattr(env, which, None) for which in SPACES}
     except (Exception, SystemExit) as error:
         raise ValueError(f"the env {name} cannot be made: {_reason(name, error)}") from error
     if not isinstance(env, gymnasium.Env):
@@ -87,8 +84,12 @@ def make_env(
             else "derive its class from gymnasium.Env"
         )
         raise ValueError(f"the env {name} is {shown(env)}, not an env of Gymnasium: {remedy}")
-    if missing:
-        raise ValueError(f"the env {name} has no {missing[0]}: set it in its __init__")
+    for which, space in found.items():
+        if not isinstance(space, gymnasium.Space):
+            raise ValueError(
+                f"the {which} of {name} is {shown(space)}, not a space of Gymnasium: set it in its "
+                "__init__"
+            )
     _check_statistics(env, name)
     return env
 

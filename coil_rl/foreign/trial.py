@@ -6,7 +6,6 @@ is evaluated, driven or exported, and in `coil_rl.testing`.
 """
 
 import gc
-import inspect
 import math
 import pickle
 import sys
@@ -25,11 +24,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from coil_rl.foreign.batch import SeededRows, optional_entries, same
+from coil_rl.foreign.batch import SeededRows, same
 from coil_rl.foreign.controllers import PerRow
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
-from coil_rl.foreign.host import called, is_of_user
+from coil_rl.foreign.host import is_of_user
 from coil_rl.foreign.limit import layers
 from coil_rl.foreign.remembered import pickled
 from coil_rl.transforms import GuideActions
@@ -145,7 +144,8 @@ class Trial:
             return self.env.rollout(self.steps, policy, break_when_any_done=False)
 
     def _look_at_numbers(self, rollout: TensorDictBase) -> None:
-        optional = {part for key in optional_entries(self.env) for part in (key, ("next", *key))}
+        known = getattr(self.env, "optional", ())
+        optional = {part for key in known for part in (key, ("next", *key))}
         for key, value in rollout.items(True, True):
             numbers = value.nan_to_num() if key in optional else value
             if value.is_floating_point() and not numbers.isfinite().all():
@@ -179,9 +179,9 @@ class Trial:
             if entry.bounds is None:
                 continue
             low, high = (np.ravel(bound).astype(np.float64) for bound in entry.bounds)
-            parts = [rollout[entry.key], rollout["next"][entry.key]]
-            rows = [part.reshape(part.shape[:2].numel(), low.size) for part in parts]
-            values = torch.cat(rows).double().cpu().numpy()
+            shown = torch.cat([rollout[entry.key], rollout["next"][entry.key]])
+            rows = shown.reshape(shown.shape[:2].numel(), low.size)
+            values = rows.double().cpu().numpy()
             excess = np.maximum(low - values, values - high)
             if excess.size and excess.max() > 0:
                 row, index = np.unravel_index(excess.argmax(), excess.shape)
@@ -382,7 +382,6 @@ class Trial:
         own = getattr(guide, "guide", guide)
         if not isinstance(own, PerRow):
             return
-        shared = _Shared([_kind_of(own.make)])
         with suppress(ForeignError, UnfitActionError), torch.random.fork_rng():
             torch.manual_seed(0)
             recorded, first = self.recorded(), _new(own, own.make)
@@ -393,8 +392,7 @@ class Trial:
                 again = _new(own, lambda: _reseeded(own.make(), first))
                 return self._advice(again, data, **how)
 
-            title = f"the controller {own.title}"
-            shared.restore()
+            title, shared = f"the controller {own.title}", _Shared([type(first.hosts[0].thing)])
             self._ask(title, ask, recorded[:, :steps], torch.allclose, shared, alone=True)
 
 
@@ -528,15 +526,6 @@ def _is_data(value: Any) -> bool:
 def _random(env: EnvBase) -> Callable[[TensorDictBase], TensorDictBase]:
     """Return what writes a random action, also where it has no bound."""
     return partial(random_action, env) if len(env.action_keys) == 1 else env.rand_action
-
-
-def _kind_of(make: Callable[[], Any]) -> type:
-    """Return the class of what a maker makes, without making one."""
-    kind: Any = called(make)
-    if inspect.isclass(kind):
-        return kind
-    given = make.args if isinstance(make, partial) else ()
-    return type(given[-1] if given else make)
 
 
 def _new(own: PerRow, make: Callable[[], Any]) -> PerRow:

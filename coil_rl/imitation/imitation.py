@@ -22,9 +22,10 @@ from coil_rl.imitation.validation import cross_validate, scores
 from coil_rl.learners.encoders import ConcatObservations
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.networks import FastTensorDictModule
-from coil_rl.ranges import Interval, checked
+from coil_rl.ranges import Index, Interval, checked
 from coil_rl.run import checkpoint
 from coil_rl.transforms.action_space import ActionSpace, nested_key
+from coil_rl.transforms.guide_transform import check_advised
 
 
 @checked
@@ -48,7 +49,7 @@ class Imitation(Learner):
 
     Raises:
         KeyError: for an env without such advice or observation.
-        ValueError: for an env without such a guide, and for a seed out of range.
+        ValueError: for a seed out of range.
         UserError: for a data set that is missing, damaged or of another env.
 
     Attributes:
@@ -80,7 +81,7 @@ class Imitation(Learner):
         *,
         regressor: Regressor,
         advice_key: str = "guide_action",
-        guide: int = 0,
+        guide: Index = 0,
         group_key: str | Sequence[str] | None = ("info", "track"),
         kept_key: str | Sequence[str] | None = ("info", "usable"),
         validate: bool = True,
@@ -90,21 +91,13 @@ class Imitation(Learner):
         in_keys = [nested_key(key) for key in in_keys]
         spec, batch_dims = env.observation_spec, len(env.batch_size)
         available = list(spec.keys(True, True))
-        if advice_key not in available:
-            names = ", ".join(key for key in available if isinstance(key, str))
-            raise KeyError(
-                f"the env has no entry {advice_key}; it has {names}; put GuideActions around it"
-            )
-        guides, size = spec[advice_key].shape[batch_dims:]
-        if not 0 <= guide < guides:
-            raise ValueError(
-                f"guide={guide} must be at least 0 and less than {guides}, the number of guides"
-            )
+        self.in_keys, self.advice_key, self.guide = list(in_keys), advice_key, guide
+        check_advised(spec, self)
+        _, size = spec[advice_key].shape[batch_dims:]
         self.concat = ConcatObservations(env, in_keys)
         self.regressor = regressor.fresh(self.concat.width, size).to(env.device)
         action = _Action(self.concat, self.regressor, ActionSpace(env.action_spec, batch_dims))
         self.policy = FastTensorDictModule(action, in_keys, ["action"])
-        self.in_keys, self.advice_key, self.guide = list(in_keys), advice_key, guide
         group: NestedKey | None = nested_key(group_key)
         self.group_key = group if group in available else None
         kept: NestedKey | None = nested_key(kept_key)
