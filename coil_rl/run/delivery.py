@@ -171,7 +171,7 @@ class Delivery:
             candidates |= self._guides()
             earlier = self._earlier(update)
             if earlier is not None:
-                candidates["earlier"] = checkpoint.load(earlier)
+                candidates["earlier"] = checkpoint.load(self.curve.file(earlier))
             returns = self._tested(candidates)
         means = {name: float(values.mean()) for name, values in returns.items()}
         chosen = max(means, key=lambda name: means[name], default="last")
@@ -186,8 +186,8 @@ class Delivery:
         )
         return dict(zip(self.names, numbers, strict=True))
 
-    def _earlier(self, update: int) -> Path | None:
-        """Return the file of the kept policy with the highest return in training, if it is known.
+    def _earlier(self, update: int) -> int | None:
+        """Return the update of the kept policy with the highest return in training, if it is known.
 
         The first one is left out, as no episode was finished with it.
         """
@@ -198,7 +198,7 @@ class Delivery:
         known = {each: value for each, value in returns.items() if not math.isnan(value)}
         if not known:
             return None
-        return self.curve.file(max(known, key=lambda each: known[each]))
+        return max(known, key=lambda each: known[each])
 
     def _guides(self) -> dict[str, Any]:
         """Return what stands for the guides: the first policy if it holds one, else their numbers.
@@ -225,6 +225,7 @@ class Delivery:
             name: policy_of(state, self.learner, self.env) for name, state in candidates.items()
         }
         earlier = policies.pop("earlier", None)
+        self.cases.taught = None  # what is handed over is the policy that was tested
         self.cases.begin()
         begun = self.cases.steps
         for count in self.cases.blocks(FIRST_CASES, reserve):
@@ -249,7 +250,7 @@ class Delivery:
         chosen: str,
         means: Mapping[str, float],
         returns: Mapping[str, Tensor],
-        earlier: Path | None,
+        earlier: int | None,
     ) -> None:
         """Write which policy is handed over, and why.
 
@@ -257,11 +258,13 @@ class Delivery:
             chosen: name of the policy that is handed over.
             means: of the returns, by name.
             returns: of each policy in each case, by name; empty without a test.
-            earlier: file of the best kept policy; None: there is none.
+            earlier: update of the best kept policy; None: there is none.
         """
-        ahead = None
+        ahead = frames = None
         if chosen != "last":
             ahead = difference(returns[chosen].tolist(), returns["last"].tolist())[:3]
+        if chosen == "earlier" and earlier is not None:
+            frames = int(self.curve.metrics.rows[earlier]["frames"])
         report = record.Delivery(
             policy=chosen if returns else record.UNTESTED,
             cases=len(returns.get("last", ())),
@@ -269,7 +272,7 @@ class Delivery:
             calls=self.cases.calls,
             returns=dict(means),
             ahead=ahead,
-            frames=int(earlier.stem) if chosen == "earlier" and earlier is not None else None,
+            frames=frames,
         )
         record.DELIVERY.write(self.folder, report)
 

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -141,10 +142,22 @@ def test_earlier_policy_is_compared_if_its_episodes_fit(length, is_compared, mon
     monkeypatch.setattr("coil_rl.run.delivery.policy_of", lambda state, learner, env: state)
     cases = CountedCases(build=lambda rows: None, frames=1000)
     cases.length = length
+    cases.teach([], lambda steps: None)
     delivery = Delivery(learner=None, env=None, cases=cases, curve=None, folder=tmp_path)
     delivery.cases.renew = lambda count: setattr(cases, "count", count)
     returns = delivery._tested({name: {} for name in ("last", "guide", "earlier")})
     assert ("earlier" in returns) == is_compared
+    assert cases.taught is None  # what is handed over is the policy that was tested
+
+
+@pytest.mark.parametrize("chosen", ["last", "earlier"])
+def test_frames_of_an_earlier_policy_are_those_of_the_log(chosen, tmp_path):
+    """The file of a policy that a longer run kept does not count the test at the first end."""
+    curve = SimpleNamespace(metrics=SimpleNamespace(rows=[{"frames": 0}, {"frames": 260}]))
+    cases = TrainingCases(build=GuideActs, frames=1000)
+    delivery = Delivery(learner=None, env=None, cases=cases, curve=curve, folder=tmp_path)
+    delivery._report(chosen, {}, dict.fromkeys(("last", "earlier"), torch.zeros(2)), 1)
+    assert report(tmp_path)["frames"] == (260 if chosen == "earlier" else None)
 
 
 @pytest.mark.slow
