@@ -146,10 +146,15 @@ class Judgement:
 
     def __init__(self, measures: Mapping[str, Measure]) -> None:
         self.measures = measures
-        self.table: list[dict[str, Any]] = []  # means, for evaluation.csv
+        self.table: list[dict[str, Any]] = []  # means
         self.counts: list[dict[str, int]] = []  # episodes that each mean rests on
         self.episodes: list[dict[str, Any]] = []
         self.shown: dict[str, EvaluationResult] = {}  # deterministic episodes, by title
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows of evaluation.csv."""
+        return with_denominators(self.table, self.counts)
 
     def add(
         self,
@@ -210,8 +215,7 @@ def judge(
     for picture in trial.pictures:
         with decoration(f"the picture {type(picture).__name__} in {folder}"):
             picture.draw(judgement.shown, folder)
-    table = with_denominators(judgement.table, judgement.counts)
-    record.EVALUATION.write(folder, table)
+    record.EVALUATION.write(folder, judgement.rows)
     return judgement
 
 
@@ -310,8 +314,8 @@ def not_worse(
         answer=answer,
         low=found.low,
         high=found.high,
-        allowed=allowed,
-        spec=return_format([found.low, found.high, allowed]),
+        least=f"{-allowed or 0.0:{return_format([allowed])}}",
+        spec=return_format([found.low, found.high]),
     )
 
 

@@ -29,17 +29,23 @@ def test_agent_is_not_worse_if_the_whole_interval_is_above_one_percent_less(agen
     (sentence,) = not_worse(result_of(mine), result_of(guide), "guide", chance=zero)
     assert f"Not worse than guide on these 3 cases: {answer} " in sentence
     _, low, high = mean_interval([reward - 100 for reward in agent])
-    spec = return_format([low, high, 1])
+    spec = return_format([low, high])
     assert f"{low:+{spec}} to {high:+{spec}}" in sentence
-    assert f"above {-1:{spec}}, 1 % of" in sentence
+    assert "above -1.00, 1 % of" in sentence
 
 
-def test_small_limit_is_shown_beside_large_returns():
-    (sentence,) = not_worse(result_of([100.1, 90.2]), result_of([100, 90]), "guide", chance=94)
-    assert (
-        "(reward minus the guide's: -0.485 to +0.785, 95 % interval; yes means above -0.010"
-        in sentence
-    )
+@pytest.mark.parametrize(
+    ("agent", "interval", "chance", "limit"),
+    [
+        ([100.1, 90.2], "-0.485 to +0.785", 94, "-0.0100"),
+        ([110, 102], "-1.7 to +23.7", 94, "-0.0100"),  # not 0
+        ([100.1, 90.2], "-0.485 to +0.785", 95, "0.0"),
+    ],
+)
+def test_small_limit_is_shown_beside_large_returns(agent, interval, chance, limit):
+    (sentence,) = not_worse(result_of(agent), result_of([100, 90]), "guide", chance)
+    said = f"(reward minus the guide's: {interval}, 95 % interval; yes means above {limit},"
+    assert said in sentence
 
 
 def test_agent_with_the_returns_of_its_guide_has_no_interval():
