@@ -26,8 +26,7 @@ FALLBACK = f" or {GUIDE}"  # after the label, there: the policy with a guide to 
 EVALUATION = "evaluation"  # set of cases for reports
 SELECTION = "selection"  # set of cases for the choice of the best policy
 RETURN, CHOICE = f"{EVALUATION}/return", f"{SELECTION}/return"  # columns of metrics.csv
-PER_STEP = "per_step_"  # prefix of the measures of tasks
-TERM = "reward_"  # prefix of the measures of the terms of the reward
+TERM = "reward_"  # prefix of the measures without a heading that are terms of the reward
 RESTORE = "restore the file, or remove the run from the folder"
 
 
@@ -159,7 +158,7 @@ def _read_run(folder: Path) -> Run:
     if rows is None:
         return run
     with file_of_a_run(folder / record.EVALUATION.name, RESTORE):
-        shown = [name for name, measure in run.measures.items() if measure.title]
+        shown = [name for name, measure in run.measures.items() if measure.heading(name)]
         evaluation = _cases_of(rows, shown)
     delivery = record.DELIVERY.read(folder)
     return replace(

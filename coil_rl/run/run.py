@@ -266,7 +266,7 @@ class Run:
         with tempfile.TemporaryDirectory() as temporary:
             place = Path(temporary) if folder is None else Path(folder).expanduser()
             judgement = self.judge(trial, place, self.seed)
-        return pd.DataFrame(judgement.table)
+        return pd.DataFrame(judgement.rows)
 
     def judge(self, trial: Trial, folder: Path, seed: int) -> Judgement:
         """Evaluate the policy of a finished run and the guides; see `judge`."""

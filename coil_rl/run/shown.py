@@ -36,8 +36,10 @@ def page_of(run: Run) -> str:
     parts, rows = [f"<p>{escape(line_of(run))}</p>"], _means(run)
     if rows:
         measures = measures_of((run.settings.get("evaluation") or {}).get("measures") or {})
-        titles = {name: each.title for name, each in measures.items() if each.title}
-        table = pd.DataFrame(rows, columns=["driver", "advice", "actions", "reward", *titles])
+        titles = {name: text for name, each in measures.items() if (text := each.heading(name))}
+        counts = [name for name in rows[0] if name.endswith("episodes") and name not in measures]
+        columns = ["driver", "advice", "actions", "reward", *titles, *counts]
+        table = pd.DataFrame(rows, columns=columns)
         table = table.rename(columns=titles)
         parts.append(table.to_html(index=False, float_format="{:.4g}".format, na_rep="-"))
     picture = run.folder / "learning_curve.png"
