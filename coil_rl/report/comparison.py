@@ -16,7 +16,7 @@ from coil_rl.errors import UserError
 from coil_rl.measures import Measure, with_denominators
 from coil_rl.record import DRIVER
 from coil_rl.report.guides import is_guide, shared_guides
-from coil_rl.report.runs import FALLBACK, GUIDE, Run, by_label
+from coil_rl.report.runs import FALLBACK, GUIDE, TERM, Run, by_label
 from coil_rl.report.sentences import listed
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
 from coil_rl.report.table import return_format
@@ -186,18 +186,13 @@ class Group:
             means[name] = self.measures[name].pool(rows[name].tolist(), counts[name].tolist())
         return means
 
-    def parts(self, prefix: str) -> dict[str, float]:
-        """Return the mean of each column with a prefix, over the seeds and cases that have it.
-
-        Args:
-            prefix: PER_STEP or TERM.
-        """
-        columns = [
-            column
-            for column in self.table
-            if column.startswith(prefix) and not column.endswith(EPISODES)
-        ]
-        return {column: float(self.table[column].mean()) for column in columns}
+    def terms(self) -> dict[str, float]:
+        """Return the terms of the reward by the names of their measures, which have no heading."""
+        return {
+            name: mean
+            for name, mean in self.means().items()
+            if name.startswith(TERM) and not self.measures[name].heading(name)
+        }
 
 
 def _of_case(rows: pd.DataFrame, case: str | None) -> pd.DataFrame:

@@ -14,7 +14,7 @@ from typing import Any
 from coil_rl.record import UNTESTED
 from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning, points
-from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run, begun_with, by_label
+from coil_rl.report.runs import GUIDE, TERM, Run, begun_with, by_label
 from coil_rl.report.sentences import REPORT
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
 from coil_rl.report.table import AUTO_FORMAT, TABLES, Table, return_format
@@ -37,10 +37,8 @@ def section(comparison: Comparison, against: str | None) -> list[Block]:
     columns = _columns(comparison, rows, against)
     shown = with_cells(rows, comparison.spec)
     counts = [group.counts() for group in comparison.groups]
-    parts = _parts(comparison, TERM, "term of the reward", AUTO_FORMAT)
-    parts += _parts(comparison, PER_STEP, "reward of a step", ".3f")
     cases = cases_table(comparison.groups, "report_cases.csv")
-    return [Table(shown, columns, counts), *parts, cases]
+    return [Table(shown, columns, counts), *_terms(comparison), cases]
 
 
 def _columns(
@@ -56,8 +54,7 @@ def _columns(
         if key not in hidden:
             columns[key] = (text.format(other=_other(against)), spec)
     for name, measure in chain.from_iterable(each.measures.items() for each in comparison.groups):
-        has_column = name in ("completed", "crashed") or name.startswith(PER_STEP)
-        if measure.heading(name) and not has_column:
+        if measure.heading(name) and name not in ("completed", "crashed"):
             columns[name] = (measure.heading(name), measure.format)
     columns["needs_guide"] = ("guide at test time", "")
     return columns
@@ -236,21 +233,16 @@ def _other(against: str | None) -> str:
     return "its guide" if against == GUIDE else against or ""
 
 
-def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list[Table]:
-    """Return the table of the parts of the reward; no table without such columns.
-
-    Args:
-        prefix: of the columns, PER_STEP or TERM.
-        heading: of the column with the names of the policies.
-    """
+def _terms(comparison: Comparison) -> list[Table]:
+    """Return the table of the terms of the reward; no table without such measures."""
     rows: list[dict[str, Any]] = []
-    columns = {"driver": (heading, "")}
+    columns = {"driver": ("term of the reward", "")}
     for group in comparison.groups:
-        parts = group.parts(prefix)
-        for name in parts:
-            columns[name] = (name.removeprefix(prefix), spec)
-        if parts:
-            rows.append({"driver": group.title, **parts})
+        terms = group.terms()
+        for name in terms:
+            columns[name] = (name.removeprefix(TERM), AUTO_FORMAT)
+        if terms:
+            rows.append({"driver": group.title, **terms})
     return [Table(rows, columns)] if rows else []
 
 

@@ -1,7 +1,6 @@
 import math
 from pathlib import Path
 
-import pytest
 from run_folders import driven, make_run, make_sweep
 
 from coil_rl.record import UNTESTED
@@ -57,21 +56,21 @@ def test_policies_without_a_common_seed_are_said(tmp_path):
         assert page.unpaired(against, {"deterministic": comparison}) == []
 
 
-@pytest.mark.parametrize(
-    ("prefix", "guide", "title", "shown"),
-    [
-        ("reward_", (2.0, -1.0), "term of the reward", ["guide 2.00 -1.00", "coil 0.62 -0.12"]),
-        ("per_step_", (0.25, math.nan), "reward of a step", ["guide 0.250 -", "coil 0.625 -0.125"]),
-    ],
-)
-def test_parts_of_the_reward_have_their_own_table(prefix, guide, title, shown, tmp_path):
-    names = [f"{prefix}left", f"{prefix}right"]
-    for seed, agent in enumerate([(0.5, -0.125), (0.75, -0.125)]):
-        rows = driven("guide", {"a": 1.0}, **dict(zip(names, guide, strict=True)))
+def test_terms_of_the_reward_have_their_own_table(tmp_path):
+    """A measure of a user that is called like a term is a column like any other."""
+    terms, own = ["reward_left", "reward_right"], ["reward_least", "per_step_cost"]
+    measures = {name: {"entry": "reward", "reduction": "sum", "title": ""} for name in terms}
+    measures |= {name: {"entry": "reward", "reduction": "min", "format": ".1f"} for name in own}
+    for seed, agent in enumerate([(0.5, -0.125, 3.0, 7.0), (0.75, -0.125, 4.0, 8.0)]):
+        names = [*terms, *own]
+        rows = driven("guide", {"a": 1.0}, **dict(zip(names, (2.0, -1.0, 5.0, 6.0), strict=True)))
         rows += driven("coil", {"a": 2.0}, **dict(zip(names, agent, strict=True)))
-        make_run(tmp_path / f"run_{seed}", "coil", seed, rows)
-    found = [" ".join(row) for row in cells(section(tmp_path)[1])]
-    assert found == [f"{title} left right", *shown]
+        settings = {"evaluation": {"measures": measures}}
+        make_run(tmp_path / f"run_{seed}", "coil", seed, rows, settings=settings)
+    drivers, table, *_ = section(tmp_path)
+    found = [" ".join(row) for row in cells(table)]
+    assert found == ["term of the reward left right", "guide 2.00 -1.00", "coil 0.62 -0.12"]
+    assert [row[-3:-1] for row in cells(drivers)] == [own, ["5.0", "6.0"], ["3.0", "7.0"]]
 
 
 def test_returns_of_trained_guides_are_shown_before_and_after():
