@@ -23,6 +23,7 @@ from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.normaliser import Normaliser
 from coil_rl.measures import MEAN_CASE
+from coil_rl.report.runs import GUIDE
 from coil_rl.run.controller import Controller
 from coil_rl.run.delivery import GuideActs
 from coil_rl.run.folder import HANDED_OVER
@@ -83,7 +84,7 @@ def describe(
             "cpu_milliseconds_per_call": round(parity.milliseconds, 3),
             "cpu_milliseconds_per_call_of_torch": round(parity.torch_milliseconds, 3),
         },
-        "results": results_of(run),
+        "results": results_of(run, which),
         "made_with": {name: metadata.version(name) for name in PACKAGES} | {"opset": OPSET},
     }
 
@@ -242,9 +243,18 @@ def _inside(step: PolicyStep) -> list[str]:
     return sentences
 
 
-def results_of(run: Run) -> list[dict[str, Any]]:
-    """Return the means of the evaluation of a run, by driver; empty if it was not evaluated."""
+def results_of(run: Run, which: str) -> list[dict[str, Any]]:
+    """Return the means of the evaluation of a run, by driver; empty if it was not evaluated.
+
+    They are of the policy that it handed over; of another one only the guides have results.
+
+    Args:
+        which: as for `describe`.
+    """
     rows = record.EVALUATION.read(run.folder) or []
+    delivery = record.DELIVERY.read(run.folder)
+    if which == "last" and delivery and "last" in delivery.returns and delivery.policy != "last":
+        rows = [row for row in rows if row["driver"].split()[0] == GUIDE]
     cases = len({row["case"] for row in rows} - {MEAN_CASE})
     results = []
     for row in rows:
