@@ -45,7 +45,7 @@ class Measure:
         format: of its numbers in tables; "auto": as they need.
 
     Raises:
-        ValueError: for another reduction or format, or two bounds.
+        ValueError: for another reduction or format, two bounds, or one of a flag.
     """
 
     entry: str | tuple[str, ...]
@@ -61,6 +61,10 @@ class Measure:
             raise ValueError(f"reduction={self.reduction} must be one of {', '.join(REDUCTIONS)}")
         if self.at_least is not None and self.at_most is not None:
             raise ValueError("at_least and at_most cannot both be given; give one")
+        if self.reduction == "any" and (self.at_least, self.at_most) != (None, None):
+            raise ValueError(
+                "reduction=any is a flag without bounds; write max with at_least, min with at_most"
+            )
         if self.format != "auto" and not re.fullmatch(FORMAT, self.format):
             raise ValueError(f"format={self.format} must be a format of numbers, such as .1f")
 

@@ -29,9 +29,11 @@ def test_measure_of_a_yaml_file_has_tuples_as_keys():
     [
         ({"reduction": "median"}, "reduction=median must be one of mean, sum, min, max, last, any"),
         ({"at_least": 1.0, "at_most": 2.0}, "at_least and at_most cannot both be given; give one"),
+        ({"reduction": "any", "at_least": 3.0}, "reduction=any is a flag without bounds"),
+        ({"reduction": "any", "at_most": 3.0}, "write max with at_least, min with at_most"),
     ],
 )
-def test_unknown_reduction_and_two_bounds_are_refused(options, message):
+def test_unknown_reduction_and_bounds_without_a_meaning_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         Measure("reward", **options)
 
