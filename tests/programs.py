@@ -26,7 +26,7 @@ CONF = Path(coil_rl.conf.__path__[0])  # of the library that is tested, which ma
 GUEST_CONFS = (coil_fmu.conf, coil_robot.conf, coil_studies.conf)
 CONFS = (CONF, *(Path(each.__path__[0]) for each in GUEST_CONFS))
 
-# Programs of guests, by command.
+# Programs outside of coil_rl/programs, by command.
 GUESTS = {
     "compare": "coil_rl.comparison.program",
     "export": "coil_rl.export.program",
@@ -35,6 +35,8 @@ GUESTS = {
     "drive": "coil_robot.programs.drive",
     "replay": "coil_robot.programs.replay",
     "reproduce": "coil_paper.program",
+    "guide_benchmark": "benchmarks.guide_benchmark.__main__",
+    "promise": "benchmarks.promise",
 }
 TRACK = ["track=folder", f"track.dir={ROOT / 'tests' / 'ring.csv'}"]
 LAP = [*TRACK, "env.laps=1", "env.rate=6"]
@@ -121,10 +123,11 @@ def mode_is_known(name, arguments):
 def called(name, *arguments, cwd=".", code=0):
     """Run a program in this process; `code=None` accepts any exit code."""
     out, error, ended, given = io.StringIO(), io.StringIO(), 0, sys.argv
-    sys.argv = [name, *arguments]
+    words = [*map(str, arguments)]
+    sys.argv = [name, *words]
     try:
         with (
-            mode_is_known(name, arguments),
+            mode_is_known(name, words),
             contextlib.chdir(cwd),
             contextlib.redirect_stderr(error),
             contextlib.redirect_stdout(out),

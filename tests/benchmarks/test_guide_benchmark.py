@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-import sys
 from importlib.util import find_spec
 
 import gymnasium
@@ -29,6 +28,7 @@ from coil_rl.errors import UserError
 from coil_rl.report.runs import read_runs
 
 pytest.importorskip("gymnasium.envs.classic_control")
+PROGRAM = "guide_benchmark"
 ROWS = ROOT / "docs" / "guide_benchmark" / "rows.csv"
 FOREIGN = ROOT / "benchmarks" / "guide_benchmark" / "conf"
 PACKAGES = {
@@ -141,17 +141,6 @@ def folder(tmp_path_factory):
     for words in (["+arm=alone", "method=ppo"], ["+arm=intact,random", "method=kickstart"]):
         called("train", "-m", "+experiment=guide_benchmark/pendulum", *words, *small, cwd=path)
     return path
-
-
-@pytest.fixture
-def run(monkeypatch):
-    """Return a function that runs the program with some words."""
-
-    def run_with(*words):
-        monkeypatch.setattr(sys, "argv", ["guide_benchmark", *map(str, words)])
-        program.main()
-
-    return run_with
 
 
 @pytest.mark.slow
@@ -267,16 +256,15 @@ def test_methods_are_ordered_by_their_share_of_losses_and_name_their_worst_pair(
 
 
 @pytest.mark.slow
-def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, run, capsys):
+def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path):
     file = tmp_path / "rows.csv"
     for _ in range(2):  # the second time each row replaces itself
-        run(folder, "--pages", tmp_path, "--add", file)
+        printed = called(PROGRAM, folder, "--pages", tmp_path, "--add", file).stdout
     rows = read_csv(file)
     assert len(rows) == 3
     for row in rows:
         check_row(row)
     page = (tmp_path / "README.md").read_text()
-    printed = capsys.readouterr().out
     assert page in printed
     assert "pendulum: 3 of 3 runs finished, 0 were refused" in printed
     assert "Smoke" in page
@@ -285,12 +273,12 @@ def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, run, 
 
 
 @pytest.mark.slow
-def test_page_of_all_tasks_is_of_the_whole_table_that_rows_join(folder, tmp_path, run):
+def test_page_of_all_tasks_is_of_the_whole_table_that_rows_join(folder, tmp_path):
     file, pages, picture = tmp_path / "table.csv", tmp_path / "pages", "pendulum.webp"
     pages.mkdir()
     shutil.copyfile(ROWS, file)
     shutil.copyfile(ROWS.parent / picture, pages / picture)
-    run(folder, "--pages", pages, "--add", file)
+    called(PROGRAM, folder, "--pages", pages, "--add", file)
     assert len(read_rows(file)) == len(read_rows(ROWS)) + 3
     assert (pages / "rows.csv").read_bytes() == file.read_bytes()
     page = (pages / "README.md").read_text()
@@ -304,10 +292,10 @@ def test_page_of_all_tasks_is_of_the_whole_table_that_rows_join(folder, tmp_path
 
 
 @pytest.mark.slow
-def test_pages_of_the_docs_are_those_of_the_table(tmp_path, run):
+def test_pages_of_the_docs_are_those_of_the_table(tmp_path):
     for file in (ROWS, *ROWS.parent.glob("*.webp")):
         shutil.copyfile(file, tmp_path / file.name)
-    run("--pages", tmp_path, "--add", tmp_path / "rows.csv")
+    called(PROGRAM, "--pages", tmp_path, "--add", tmp_path / "rows.csv")
     for page in ROWS.parent.glob("*.md"):
         assert (tmp_path / page.name).read_text() == page.read_text(), page.name
 
@@ -319,13 +307,9 @@ def test_pages_of_the_docs_are_those_of_the_table(tmp_path, run):
         (["."], "the task chess has no reference"),
     ],
 )
-def test_without_results_it_ends_with_one_sentence(words, message, made, run, capsys, monkeypatch):
+def test_without_results_it_ends_with_one_sentence(words, message, made):
     shutil.copytree(made, made / "chess")
-    monkeypatch.chdir(made)
-    with pytest.raises(SystemExit) as refused:
-        run(*words)
-    assert refused.value.code == 2
-    assert message in capsys.readouterr().err
+    assert message in called(PROGRAM, *words, cwd=made, code=2).stderr
     assert not (made / "pages").exists()
 
 

@@ -57,18 +57,11 @@ def rows_of(runs, parts=None):
     return promise.rows_of_task("task", arms, promise.best_alone(arms), parts)
 
 
-def printed(monkeypatch, capsys, *words):
-    """Return what the program prints."""
-    monkeypatch.setattr("sys.argv", ["promise", *map(str, words)])
-    promise.main()
-    return capsys.readouterr().out
-
-
-def test_one_seed_has_no_verdict(tmp_path, monkeypatch, capsys):
+def test_one_seed_has_no_verdict(tmp_path):
     small(tmp_path / "task", {"ppo_alone": 10.0, "coil_intact": 5.0, "coil_random": 5.0})
     (row, _) = rows_of(read_runs([tmp_path / "task"]))
     assert row["verdict"] == "unknown"
-    assert "0 even (undecided), 2 unknown, 0 losses." in printed(monkeypatch, capsys, tmp_path)
+    assert "0 even (undecided), 2 unknown, 0 losses." in called("promise", tmp_path).stdout
 
 
 def test_task_whose_random_guide_is_as_good_as_the_better_has_no_verdict(tmp_path):
@@ -77,11 +70,10 @@ def test_task_whose_random_guide_is_as_good_as_the_better_has_no_verdict(tmp_pat
     assert [row["verdict"] for row in rows] == ["unknown", "unknown"]
 
 
-def test_reward_that_is_nan_is_no_part_of_a_mean(tmp_path, monkeypatch, capsys):
+def test_reward_that_is_nan_is_no_part_of_a_mean(tmp_path):
     small(tmp_path / "task", {"ppo_alone": math.nan, "coil_intact": 5.0}, seeds=2)
-    with pytest.raises(SystemExit, match="2"):
-        printed(monkeypatch, capsys, tmp_path)
-    assert "the reward of ppo_alone is nan in 1 of 2 cases" in capsys.readouterr().err
+    said = called("promise", tmp_path, code=2).stderr
+    assert "the reward of ppo_alone is nan in 1 of 2 cases" in said
 
 
 @pytest.mark.parametrize(
@@ -135,14 +127,12 @@ def test_of_several_guides_and_learners_alone_the_best_ones_are_compared(tmp_pat
     ],
     ids=["no folder", "empty folder", "no PPO", "only PPO"],
 )
-def test_folder_without_results_is_one_sentence(arms, message, tmp_path, monkeypatch, capsys):
+def test_folder_without_results_is_one_sentence(arms, message, tmp_path):
     folder = tmp_path / "promise"
     if arms is not None:
         folder.mkdir()
         small(folder / "task", arms) if arms else None
-    with pytest.raises(SystemExit, match="2"):
-        printed(monkeypatch, capsys, folder)
-    assert message in capsys.readouterr().err
+    assert message in called("promise", folder, code=2).stderr
     assert not list(tmp_path.rglob("promise.*"))
 
 
@@ -187,8 +177,8 @@ def test_table_compares_each_arm_with_the_better_of_guide_and_learning_alone(fol
 
 
 @pytest.mark.slow
-def test_program_writes_the_table(folder, monkeypatch, capsys):
-    out = printed(monkeypatch, capsys, folder)
+def test_program_writes_the_table(folder):
+    out = called("promise", folder).stdout
     page = (folder / "promise.md").read_text()
     assert page in out
     assert "gains," in page

@@ -11,7 +11,7 @@ SIGHT = 7.0
 POSE = torch.tensor([[3.0], [1.0], [0.5]], dtype=torch.float64)
 
 
-def straight(left: int, right: int) -> torch.Tensor:
+def straight(left, right):
     """Return cones every metre, 1 m to each side of a car, [2, N, 2, 1] m in its frame."""
     ahead = torch.arange(1.0, max(left, right) + 1, dtype=torch.float64)
     cones = torch.stack([ahead, torch.ones_like(ahead)])

@@ -1,22 +1,18 @@
 """Comparison of the batched env with the oracle, an independent implementation."""
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-from oracle import OneCar, Outcome, guide_action, midpoints
+from oracle import OneCar, guide_action, midpoints
 from torchrl.envs import TransformedEnv
 from worlds import AUTHORS
 
 from coil_rl.cones.spline import SplineGuide
-from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
+from coil_rl.envs import ConeTrackEnv, random_tracks, shipped_tracks
 from coil_rl.envs.reward import TERMS
 from coil_rl.transforms import ObservationDelay
-
-Array = NDArray[np.float64]
 
 
 class Preset(NamedTuple):
@@ -43,14 +39,14 @@ COINCIDENT = {"cubic": 1e-3, "quadratic": 5e-5}
 
 
 def drive(
-    tracks: list[Track],
-    preset: Preset,
-    driver: str,
-    steps: int,
+    tracks,
+    preset,
+    driver,
+    steps,
     *,
-    seed: int = 0,
-    dtype: torch.dtype = torch.float64,
-) -> dict[str, Array]:
+    seed=0,
+    dtype=torch.float64,
+):
     """Drive one episode per track in one batch; return the outputs, [steps, cars, ...] each."""
     options = dict(preset.env)
     lag = int(options.pop("late_observation", False))
@@ -60,7 +56,7 @@ def drive(
     rng = np.random.default_rng(seed)
     noise = np.zeros(len(tracks))
     over = torch.zeros(len(tracks), 1, dtype=torch.bool)
-    rows: list[dict[str, Array]] = []
+    rows = []
     with torch.no_grad():
         state = env.reset()
         while len(rows) < steps and not over.all():
@@ -82,7 +78,7 @@ def drive(
     return {key: np.stack([row[key] for row in rows]) for key in rows[0]}
 
 
-def retrace(track: Track, preset: Preset, actions: Array) -> Iterator[tuple[float, float, Outcome]]:
+def retrace(track, preset, actions):
     """Yield the oracle's advice, smallest gap of midpoints and outcome for the same actions."""
     car = OneCar(track.left, track.right, track.start, **preset.env)
     for action in actions:
@@ -95,7 +91,7 @@ def retrace(track: Track, preset: Preset, actions: Array) -> Iterator[tuple[floa
             return
 
 
-def assert_agreement(track: Track, preset: Preset, trace: dict[str, Array]) -> Outcome:
+def assert_agreement(track, preset, trace):
     """Compare the trace [steps, ...] of an episode with the oracle; return its last outcome."""
     advice, gaps, outcomes = zip(*retrace(track, preset, trace["action"][:, 0]), strict=True)
     rows = [outcome._asdict() | outcome.terms for outcome in outcomes]
@@ -135,12 +131,12 @@ def assert_agreement(track: Track, preset: Preset, trace: dict[str, Array]) -> O
     return outcomes[-1]
 
 
-def column(trace: dict[str, Array], car: int) -> dict[str, Array]:
+def column(trace, car):
     return {key: value[:, car] for key, value in trace.items()}
 
 
 @pytest.mark.slow
-def test_env_agrees_with_the_oracle_over_two_laps(ring: Track) -> None:
+def test_env_agrees_with_the_oracle_over_two_laps(ring):
     preset = Preset({"rate": 8.0}, {})
     trace = drive([ring], preset, "guide", 500)
     assert assert_agreement(ring, preset, column(trace, 0)).lap == 2
@@ -150,7 +146,7 @@ def test_env_agrees_with_the_oracle_over_two_laps(ring: Track) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("driver", ["random", "disturbed"])
-def test_env_agrees_with_the_oracle_under_other_steering(preset: str, driver: str) -> None:
+def test_env_agrees_with_the_oracle_under_other_steering(preset, driver):
     tracks = random_tracks(2, seed=5) * (2 if driver == "random" else 1)
     trace = drive(tracks, PRESETS[preset], driver, 150, seed=1)
     for car, track in enumerate(tracks):
@@ -158,7 +154,7 @@ def test_env_agrees_with_the_oracle_under_other_steering(preset: str, driver: st
     assert trace["crashed"].any() or driver == "disturbed"
 
 
-def test_guide_agrees_with_the_oracle_for_coincident_midpoints(levels: list[Track]) -> None:
+def test_guide_agrees_with_the_oracle_for_coincident_midpoints(levels):
     # The authors' cones are on a grid, so different pairs have the same midpoint.
     trace = drive(levels[:1], PRESETS["paper"], "guide", 60)
     retraced = retrace(levels[0], PRESETS["paper"], trace["action"][:, 0, 0])
@@ -167,7 +163,7 @@ def test_guide_agrees_with_the_oracle_for_coincident_midpoints(levels: list[Trac
 
 
 @pytest.mark.slow
-def test_float32_reward_agrees_with_the_oracle(ring: Track) -> None:
+def test_float32_reward_agrees_with_the_oracle(ring):
     preset = Preset({"laps": 1, "rate": 8.0}, {})
     trace = drive([ring], preset, "guide", 500, dtype=torch.float32)
     car, total, terminated = OneCar(ring.left, ring.right, ring.start, **preset.env), 0.0, False
@@ -181,9 +177,7 @@ def test_float32_reward_agrees_with_the_oracle(ring: Track) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("driver", ["guide", "disturbed", "random"])
-def test_env_agrees_with_the_oracle_on_every_track(
-    preset: str, driver: str, levels: list[Track]
-) -> None:
+def test_env_agrees_with_the_oracle_on_every_track(preset, driver, levels):
     tracks = [*shipped_tracks("all"), *random_tracks(4, seed=11), *levels]
     trace = drive(tracks, PRESETS[preset], driver, 12_000, seed=2)
     ends = [

@@ -136,14 +136,16 @@ def test_returned_arrays_are_copies_and_info_is_optional():
     assert not (again == 7).any()
 
 
-def test_reset_of_some_cars_obeys_its_seed():
-    mask, starts = np.array([False, True] * 4), []
+def test_reset_of_some_cars_obeys_its_seed_and_leaves_the_others():
+    mask, starts, straight = np.array([False, True] * 4), [], np.zeros((8, 1), np.float32)
     for steps in (1, 7):
         envs = gymnasium.make_vec(gym.ID, num_envs=8)
         envs.reset(seed=steps)
         for _ in range(steps):
-            envs.step(np.zeros((8, 1), np.float32))
-        starts.append(envs.reset(seed=11, options={"reset_mask": mask})[0][mask])
+            before = envs.step(straight)[0]
+        observation, _ = envs.reset(seed=11, options={"reset_mask": mask})
+        np.testing.assert_array_equal(observation[~mask], before[~mask])
+        starts.append([observation[mask], envs.step(straight)[0][mask]])
     np.testing.assert_array_equal(*starts)
 
 

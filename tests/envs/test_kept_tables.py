@@ -1,10 +1,7 @@
 import os
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor
 
 from coil_rl.envs import Track, shipped_tracks
 from coil_rl.envs.kept_tables import MOST_FILES, cache_folder, kept
@@ -12,13 +9,13 @@ from coil_rl.envs.track_map import TrackMap, _computed_tables, _tables
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     _tables.cache_clear()
     return cache_folder()
 
 
-def numbers() -> dict[str, Tensor]:
+def numbers():
     return {
         "field": torch.arange(200_000, dtype=torch.float32),
         "empty": torch.zeros(0, 3, dtype=torch.int16),
@@ -29,20 +26,20 @@ def numbers() -> dict[str, Tensor]:
 class Computed:
     """Makes the tables, and counts how often."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.times = 0
 
-    def __call__(self) -> dict[str, Tensor]:
+    def __call__(self):
         self.times += 1
         return numbers()
 
 
-def equal(tables: dict[str, Tensor], others: dict[str, Tensor]) -> bool:
+def equal(tables, others):
     types = [{name: table.dtype for name, table in each.items()} for each in (tables, others)]
     return types[0] == types[1] and all(map(torch.equal, tables.values(), others.values()))
 
 
-def test_tables_are_computed_once_for_each_source(cache: Path) -> None:
+def test_tables_are_computed_once_for_each_source(cache):
     make = Computed()
     for source in ([b"a", b"b"], [b"a", b"b"], [b"ab"], [b"a", b"b"]):
         assert equal(dict(kept("numbers", source, make)), numbers())
@@ -50,17 +47,17 @@ def test_tables_are_computed_once_for_each_source(cache: Path) -> None:
     assert len(list(cache.iterdir())) == 2
 
 
-def content(change: Callable[[bytes], bytes]) -> Callable[[Path], object]:
+def content(change):
     return lambda file: file.write_bytes(change(file.read_bytes()))
 
 
-def pipe(file: Path) -> None:
+def pipe(file):
     """Put a pipe in place of the file, which must not be waited for."""
     file.unlink()
     os.mkfifo(file)
 
 
-DAMAGES: dict[str, Callable[[Path], object]] = {
+DAMAGES = {
     "cut": content(lambda whole: whole[:1000]),
     "flipped": content(lambda whole: whole[:1000] + bytes([whole[1000] ^ 1]) + whole[1001:]),
     "foreign": content(lambda whole: b"cos\nsystem\n(S'touch /tmp/hacked'\ntR."),
@@ -70,9 +67,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
-def test_damaged_file_is_computed_anew_and_replaced(
-    damage: Callable[[Path], object], cache: Path
-) -> None:
+def test_damaged_file_is_computed_anew_and_replaced(damage, cache):
     make = Computed()
     kept("numbers", [b"a"], make)
     (file,) = cache.iterdir()
@@ -83,7 +78,7 @@ def test_damaged_file_is_computed_anew_and_replaced(
     assert file.read_bytes() == whole
 
 
-def test_folder_that_cannot_be_used_costs_nothing_but_time(cache: Path) -> None:
+def test_folder_that_cannot_be_used_costs_nothing_but_time(cache):
     cache.parent.mkdir(exist_ok=True)
     cache.write_text("a file in its place")
     make = Computed()
@@ -93,7 +88,7 @@ def test_folder_that_cannot_be_used_costs_nothing_but_time(cache: Path) -> None:
     assert cache.is_file()
 
 
-def test_files_that_were_not_used_for_long_are_removed(cache: Path) -> None:
+def test_files_that_were_not_used_for_long_are_removed(cache):
     make = Computed()
     for number in range(MOST_FILES + 3):
         kept("numbers", [str(number).encode()], make)
@@ -104,7 +99,7 @@ def test_files_that_were_not_used_for_long_are_removed(cache: Path) -> None:
     assert make.times == MOST_FILES + 3
 
 
-def test_map_of_kept_tables_is_that_of_computed_ones(cache: Path) -> None:
+def test_map_of_kept_tables_is_that_of_computed_ones(cache):
     tracks = tuple(shipped_tracks("test")[:1])
     computed = _computed_tables(tracks, 7.0, torch.float32)
     for _ in range(2):
@@ -113,7 +108,7 @@ def test_map_of_kept_tables_is_that_of_computed_ones(cache: Path) -> None:
     assert len(list(cache.iterdir())) == 1
 
 
-def test_map_of_other_tracks_has_its_own_tables(cache: Path, ring: Track) -> None:
+def test_map_of_other_tracks_has_its_own_tables(cache, ring):
     (track,) = shipped_tracks("test")[:1]
     moved = Track(track.name, track.left + 0.5, track.right + 0.5)
     for tracks, sight in (([track], 7.0), ([moved], 7.0), ([track], 6.0), ([track, ring], 7.0)):

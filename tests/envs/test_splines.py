@@ -6,11 +6,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import make_smoothing_spline
-from torch import Tensor
 
-from coil_rl.envs.splines import Spline, least_squares_parabola, smoothing_spline
+from coil_rl.envs.splines import least_squares_parabola, smoothing_spline
 
-Points = tuple[Tensor, Tensor]  # padded points, and their numbers
 SLOTS = 16
 FITS = {
     "smoothing": lambda points, count: smoothing_spline(points, count, 0.3),
@@ -22,18 +20,18 @@ steady = settings(max_examples=40)
 seeds = st.integers(0, 2**31)
 
 
-def random_batch(dtype: torch.dtype = torch.float64, batch: int = 37) -> Points:
+def random_batch(dtype=torch.float64, batch=37):
     """Random walks [2, SLOTS, batch] and their numbers of real points [batch]."""
     draw = torch.Generator().manual_seed(3)
     points = torch.randn(2, SLOTS, batch, dtype=dtype, generator=draw).cumsum(1)
     return points, torch.randint(0, SLOTS + 1, (batch,), generator=draw)
 
 
-def tensors(spline: Spline) -> tuple[Tensor, ...]:
+def tensors(spline):
     return spline.knots, spline.values, spline.bends, spline.equidistant(7)
 
 
-def separated(seed: int, n: int) -> np.ndarray:
+def separated(seed, n):
     """Random walk of n points with steps of 0.5 to 2 m: [2, n]."""
     rng = np.random.default_rng(seed)
     step = rng.normal(size=(2, n))
@@ -41,20 +39,21 @@ def separated(seed: int, n: int) -> np.ndarray:
     return step.cumsum(1)
 
 
-def padded(rows: list[np.ndarray], slots: int = SLOTS, garbage: float = 7.0) -> Points:
+def padded(rows, slots=SLOTS, garbage=7.0):
+    """Return padded points, and their numbers."""
     points = torch.full((rows[0].shape[0], slots, len(rows)), garbage, dtype=torch.float64)
     for i, row in enumerate(rows):
         points[:, : row.shape[1], i] = torch.from_numpy(row)
     return points, torch.tensor([row.shape[1] for row in rows])
 
 
-def chord(row: np.ndarray) -> np.ndarray:
+def chord(row):
     return np.concatenate([[0], np.linalg.norm(np.diff(row), axis=0).cumsum()])
 
 
 @steady
 @given(seeds, st.integers(5, SLOTS), st.sampled_from([1e-4, 0.01, 0.1, 1.0, 30.0]))
-def test_smoothing_spline_agrees_with_scipy(seed: int, n: int, smoothing: float) -> None:
+def test_smoothing_spline_agrees_with_scipy(seed, n, smoothing):
     row = separated(seed, n)
     u = chord(row)
     spline = smoothing_spline(*padded([row]), smoothing)
@@ -70,9 +69,7 @@ def test_smoothing_spline_agrees_with_scipy(seed: int, n: int, smoothing: float)
 
 @pytest.mark.parametrize("n", [2, 3, 4])
 @pytest.mark.parametrize("smoothing", [0.01, 1.0])
-def test_smoothing_spline_of_few_points_minimises_the_penalised_squares(
-    n: int, smoothing: float
-) -> None:
+def test_smoothing_spline_of_few_points_minimises_the_penalised_squares(n, smoothing):
     row = separated(n, n)
     h = np.diff(chord(row))
     second = np.zeros((n - 2, n))
@@ -89,7 +86,7 @@ def test_smoothing_spline_of_few_points_minimises_the_penalised_squares(
 
 
 @pytest.mark.parametrize("gap", [0.02, 0.05, 0.2])
-def test_close_points_cost_no_digits_in_float32(gap: float) -> None:
+def test_close_points_cost_no_digits_in_float32(gap):
     along = torch.tensor([0.0, 1.0, 1.0 + gap, 2.5, 2.5 + gap, 4.0])
     points = torch.stack([along, 0.3 * torch.sin(3.0 * along)]).unsqueeze(-1)
     found = smoothing_spline(points, torch.tensor([6.0]), 0.3)
@@ -101,7 +98,7 @@ def test_close_points_cost_no_digits_in_float32(gap: float) -> None:
 
 @steady
 @given(seeds, st.integers(2, SLOTS))
-def test_parabola_agrees_with_numpy(seed: int, n: int) -> None:
+def test_parabola_agrees_with_numpy(seed, n):
     row = separated(seed, n)
     u = chord(row)
     where = np.linspace(0, u[-1], 41)
@@ -112,7 +109,7 @@ def test_parabola_agrees_with_numpy(seed: int, n: int) -> None:
 
 
 @every_fit
-def test_float32_is_close_to_float64(fit) -> None:
+def test_float32_is_close_to_float64(fit):
     points, count = padded([100 + separated(n, n) for n in range(2, SLOTS + 1)])
     single = fit(points.float(), count).equidistant(9)
     assert torch.allclose(single.double(), fit(points, count).equidistant(9), atol=2e-3)
@@ -120,9 +117,7 @@ def test_float32_is_close_to_float64(fit) -> None:
 
 @pytest.mark.parametrize("gap", [0.0, 1e-4, 1e-2])
 @pytest.mark.parametrize("smoothing", [0.1, 10.0])
-def test_nearly_coincident_points_count_as_one_of_double_weight(
-    gap: float, smoothing: float
-) -> None:
+def test_nearly_coincident_points_count_as_one_of_double_weight(gap, smoothing):
     # Midpoints of neighbouring cone pairs are this close; the normal equations lose most digits
     # here.
     row = separated(1, 8)
@@ -139,7 +134,7 @@ def test_nearly_coincident_points_count_as_one_of_double_weight(
 
 
 @every_fit
-def test_no_points_give_zeros_one_a_constant_two_a_line(fit) -> None:
+def test_no_points_give_zeros_one_a_constant_two_a_line(fit):
     rows = [np.zeros((2, 0)), np.array([[3.0], [4.0]]), np.array([[1.0, 4.0], [1.0, 5.0]])]
     spline = fit(*padded(rows, garbage=-50.0))
     at = spline.equidistant(3)
@@ -152,7 +147,7 @@ def test_no_points_give_zeros_one_a_constant_two_a_line(fit) -> None:
 
 @every_fit
 @pytest.mark.parametrize("slots", [2, 3, 4, 5])
-def test_results_do_not_depend_on_the_number_of_slots(fit, slots: int) -> None:
+def test_results_do_not_depend_on_the_number_of_slots(fit, slots):
     rows = [separated(5, n) for n in range(1, slots + 1)]
     few, many = fit(*padded(rows, slots)), fit(*padded(rows))
     assert torch.equal(few.equidistant(6), many.equidistant(6))
@@ -160,7 +155,7 @@ def test_results_do_not_depend_on_the_number_of_slots(fit, slots: int) -> None:
 
 @every_fit
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_padding_does_not_change_results(fit, dtype: torch.dtype) -> None:
+def test_padding_does_not_change_results(fit, dtype):
     points, count = random_batch(dtype)
     padding = torch.arange(SLOTS)[:, None] >= count
     for garbage in (0.0, -1e6, 1e30):
@@ -171,9 +166,7 @@ def test_padding_does_not_change_results(fit, dtype: torch.dtype) -> None:
 
 @steady
 @given(seeds, st.integers(2, SLOTS), st.floats(-3, 3), st.floats(-100, 100))
-def test_splines_are_equivariant_to_rigid_motions_and_reversal(
-    seed: int, n: int, angle: float, shift: float
-) -> None:
+def test_splines_are_equivariant_to_rigid_motions_and_reversal(seed, n, angle, shift):
     row = separated(seed, n)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     for fit in FITS.values():
@@ -185,9 +178,7 @@ def test_splines_are_equivariant_to_rigid_motions_and_reversal(
 
 @every_fit
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_results_do_not_depend_on_the_other_rows_or_the_batch_shape(
-    fit, dtype: torch.dtype
-) -> None:
+def test_results_do_not_depend_on_the_other_rows_or_the_batch_shape(fit, dtype):
     points, count = random_batch(dtype, batch=24)
     whole = tensors(fit(points, count))
     for rows in (slice(0, 1), slice(5, 6), slice(3, 20)):
@@ -220,9 +211,7 @@ degenerate = shapes | lists
 @pytest.mark.slow
 @steady
 @given(degenerate, st.sampled_from([0.0, 1e-4, 0.1, 10.0, 1e3]), st.booleans())
-def test_results_and_gradients_are_finite_for_any_points(
-    row: np.ndarray, smoothing: float, single: bool
-) -> None:
+def test_results_and_gradients_are_finite_for_any_points(row, smoothing, single):
     dtype = torch.float32 if single else torch.float64
     points = torch.from_numpy(row).to(dtype)[..., None].repeat(1, 1, SLOTS + 1)
     count = torch.arange(SLOTS + 1)
@@ -238,7 +227,7 @@ def test_results_and_gradients_are_finite_for_any_points(
 @pytest.mark.fast(3)
 @every_fit
 @pytest.mark.parametrize("n", [2, 3, 6])
-def test_gradients_agree_with_finite_differences(fit, n: int) -> None:
+def test_gradients_agree_with_finite_differences(fit, n):
     points, count = padded([separated(4, n), separated(8, n)], slots=6)
     assert torch.autograd.gradcheck(lambda p: tensors(fit(p, count))[1:], points.requires_grad_())
     fractions = torch.tensor([[0.3, 0.2], [0.9, 0.7]], dtype=torch.float64, requires_grad=True)

@@ -3,28 +3,25 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from torch import Tensor
 
-from coil_rl.envs import Track, random_tracks, shipped_tracks
+from coil_rl.envs import random_tracks, shipped_tracks
 from coil_rl.envs.track_map import TrackMap
 
-Array = NDArray[np.float64]
 POSES = 500
 
 
 @cache
-def tracks() -> list[Track]:
+def tracks():
     return [*shipped_tracks("all")[::2], *random_tracks(2, seed=21)]
 
 
 @cache
-def track_map(dtype: torch.dtype) -> TrackMap:
+def track_map(dtype):
     return TrackMap(tracks(), dtype=dtype)
 
 
-def random_poses(track: Track, seed: int, spread: float) -> Array:
+def random_poses(track, seed, spread):
     """Random poses around the cones of a track, within the area of the map: [POSES, 3]."""
     rng = np.random.default_rng(seed)
     cones = np.vstack([track.left, track.right])
@@ -33,27 +30,27 @@ def random_poses(track: Track, seed: int, spread: float) -> Array:
     return np.column_stack([position, rng.uniform(-10, 10, POSES)])
 
 
-def visible(pose: Array, ring: Array) -> Array:
+def visible(pose, ring):
     """Return which cones of a ring are visible: [poses, cones] bool."""
     offset = ring - pose[:, None, :2]
     angle = np.arctan2(offset[..., 1], offset[..., 0]) - pose[:, 2:]
     angle = np.abs((angle + np.pi) % (2 * np.pi) - np.pi)
-    mask: Array = (np.linalg.norm(offset, axis=-1) <= 7) & (angle <= np.pi / 3)
+    mask = (np.linalg.norm(offset, axis=-1) <= 7) & (angle <= np.pi / 3)
     return mask
 
 
-def candidates(lookup: TrackMap, track: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+def candidates(lookup, track, pose):
     return lookup.candidates(lookup.locate(track, pose[:2]), pose[2])
 
 
-def clearances(lookup: TrackMap, track: Tensor, position: Tensor) -> Tensor:
+def clearances(lookup, track, position):
     location = lookup.locate(track, position)
     return lookup.clearance(location, lookup.to_boundaries(location))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_candidates_include_all_visible_cones(dtype: torch.dtype) -> None:
+def test_candidates_include_all_visible_cones(dtype):
     lookup = track_map(dtype)
     for index, track in enumerate(tracks()):
         # Rounded to the precision of the env.
@@ -67,7 +64,7 @@ def test_candidates_include_all_visible_cones(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.slow
-def test_candidates_are_the_cones_of_their_slots() -> None:
+def test_candidates_are_the_cones_of_their_slots():
     lookup = track_map(torch.float64)
     for index, track in enumerate(tracks()):
         pose = torch.tensor(random_poses(track, index, spread=2))
@@ -81,7 +78,7 @@ def test_candidates_are_the_cones_of_their_slots() -> None:
             assert torch.equal(position[:, :, side], padded[place].movedim(-1, 0))
 
 
-def test_clearance_is_the_distance_to_the_nearest_crash() -> None:
+def test_clearance_is_the_distance_to_the_nearest_crash():
     lookup = track_map(torch.float64)
     for index, track in enumerate(tracks()):
         position = random_poses(track, index, spread=1)[:, :2]
@@ -102,7 +99,7 @@ def test_clearance_is_the_distance_to_the_nearest_crash() -> None:
         np.testing.assert_allclose(single[ours < 1], ours[ours < 1], rtol=0, atol=1e-4)
 
 
-def test_positions_far_from_the_track_have_no_cones_and_finite_clearance() -> None:
+def test_positions_far_from_the_track_have_no_cones_and_finite_clearance():
     lookup = track_map(torch.float32)
     which = torch.arange(len(lookup.tracks))
     for x, y in ((-1e3, 0.0), (1e3, 1e3), (0.0, -1e6)):
@@ -114,7 +111,7 @@ def test_positions_far_from_the_track_have_no_cones_and_finite_clearance() -> No
         assert (clearance > 0).all()
 
 
-def test_tables_of_a_track_do_not_depend_on_other_tracks() -> None:
+def test_tables_of_a_track_do_not_depend_on_other_tracks():
     lookup = track_map(torch.float64)
     for index in (0, len(tracks()) - 1):
         alone = TrackMap([tracks()[index]], dtype=torch.float64)

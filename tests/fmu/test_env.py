@@ -1,34 +1,33 @@
 import gc
 import os
 from pathlib import Path
-from typing import Any
 
 import fmus
 import numpy as np
 import pytest
 import torch
 
-from coil_fmu import FMU, Moment, fmu_env
-from coil_rl import GymnasiumEnv, check_env
+from coil_fmu import FMU, fmu_env
+from coil_rl import check_env
 
-FOLLOW: dict[str, Any] = {"step": 0.01, "seconds": 0.2, "setpoints": {"speed": 100.0}}
-DRAWN: dict[str, Any] = {
+FOLLOW = {"step": 0.01, "seconds": 0.2, "setpoints": {"speed": 100.0}}
+DRAWN = {
     **FOLLOW,
     "setpoints": {"speed": {"low": 50, "high": 150, "every": 0.05}},
     "parameters": {"inertia": {"low": 0.008, "high": 0.012}},
 }
 
 
-def motor(**settings: Any) -> GymnasiumEnv:
+def motor(**settings):
     return fmu_env(fmus.motor(), **{**FOLLOW, **settings})
 
 
-def tank(**settings: Any) -> GymnasiumEnv:
+def tank(**settings):
     wanted = {"step": 0.5, "seconds": 10.0, "setpoints": {"level": 0.8}}
     return fmu_env(fmus.tank(), **{**wanted, **settings})
 
 
-def driven(env: GymnasiumEnv, steps: int, action: float | None = None) -> Any:
+def driven(env, steps, action=None):
     torch.manual_seed(0)
     present, taken = env.reset(), []
     for _ in range(steps):
@@ -41,12 +40,12 @@ def driven(env: GymnasiumEnv, steps: int, action: float | None = None) -> Any:
     return torch.stack(taken, 1)
 
 
-def test_env_has_the_contract_of_an_env() -> None:
+def test_env_has_the_contract_of_an_env():
     check_env(motor(num_envs=3, **DRAWN))
     check_env(tank(num_envs=2))
 
 
-def test_description_gives_bounds_units_and_rate() -> None:
+def test_description_gives_bounds_units_and_rate():
     env = motor()
     assert env.action_spec.space.high.item() == 24.0
     assert env.rate == 100.0
@@ -60,7 +59,7 @@ def test_description_gives_bounds_units_and_rate() -> None:
     assert (low.item(), high.item()) == (0.0, 2.0)
 
 
-def test_step_has_the_solver_steps_that_the_fmu_prefers() -> None:
+def test_step_has_the_solver_steps_that_the_fmu_prefers():
     fine = driven(motor(step=0.01), 20, 12.0)["next", "speed"][0, -1]
     coarse = driven(motor(step=0.1), 2, 12.0)["next", "speed"][0, -1]
     one = driven(motor(step=0.1, substeps=1), 2, 12.0)["next", "speed"][0, -1]
@@ -68,7 +67,7 @@ def test_step_has_the_solver_steps_that_the_fmu_prefers() -> None:
     assert not torch.equal(fine, one)
 
 
-def test_reward_is_the_error_and_the_prices() -> None:
+def test_reward_is_the_error_and_the_prices():
     from coil_fmu import Follow
 
     env = motor(reward=Follow("squared", {"speed": 2.0}, action=0.1, change=0.5))
@@ -79,12 +78,12 @@ def test_reward_is_the_error_and_the_prices() -> None:
     torch.testing.assert_close(data["next", "reward"][0, :, 0].double(), wanted, rtol=1e-6, atol=0)
 
 
-def only_speed(now: Moment, before: Moment) -> tuple[float, bool]:
+def only_speed(now, before):
     return now.outputs["speed"][0] - before.outputs["speed"][0], now.time > 0.045
 
 
 @pytest.mark.parametrize("given", [only_speed, f"{__name__}:only_speed"])
-def test_reward_and_end_are_a_function_of_a_user(given: Any, monkeypatch: Any) -> None:
+def test_reward_and_end_are_a_function_of_a_user(given, monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, __name__, sys.modules[only_speed.__module__])
@@ -93,7 +92,7 @@ def test_reward_and_end_are_a_function_of_a_user(given: Any, monkeypatch: Any) -
     assert data["next", "terminated"][0, :, 0].tolist() == [False] * 4 + [True]
 
 
-def test_seed_draws_parameters_and_setpoints() -> None:
+def test_seed_draws_parameters_and_setpoints():
     env, other = (motor(num_envs=3, seed=seed, **DRAWN) for seed in (0, 1))
     first, again = (driven(env, 12) for _ in range(2))
     assert first["info", "inertia"][:, 0].unique().numel() == 3
@@ -104,7 +103,7 @@ def test_seed_draws_parameters_and_setpoints() -> None:
     assert torch.equal(driven(fixed, 12)["next", "speed"], driven(fixed, 12)["next", "speed"])
 
 
-def test_a_course_may_be_ramps_or_a_column_of_a_file(tmp_path: Path) -> None:
+def test_a_course_may_be_ramps_or_a_column_of_a_file(tmp_path):
     file = tmp_path / "courses.csv"
     file.write_text("time,slow,fast\n0,10,100\n0.05,20,200\n")
     held = driven(motor(setpoints={"speed": {"file": str(file)}}), 8)["speed_setpoint"][0, :, 0]
@@ -114,13 +113,13 @@ def test_a_course_may_be_ramps_or_a_column_of_a_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(rising[:6] / rising[0], [1, 1.2, 1.4, 1.6, 1.8, 2.0], rtol=1e-5)
 
 
-def rising(now: Moment, before: Moment) -> np.float32:
+def rising(now, before):
     rate = (now.outputs["level"] - before.outputs["level"]) / (now.time - before.time)
     return np.float32(-rate.item())
 
 
 @pytest.mark.parametrize("settings", [{}, {"reward": rising, "setpoints": {}}])
-def test_failure_ends_the_episode_and_is_said_and_counted(settings: Any) -> None:
+def test_failure_ends_the_episode_and_is_said_and_counted(settings):
     env = tank(**settings)
     with pytest.warns(UserWarning, match=r"tank.fmu failed after \S+ s .*overflows"):
         data = driven(env, 20, 0.5)["next"]
@@ -136,14 +135,14 @@ def test_failure_ends_the_episode_and_is_said_and_counted(settings: Any) -> None
     assert driven(tank(**settings, failure=-7.0), 20, 0.5)["next", "reward"][0, ends].item() == -7.0
 
 
-def test_env_goes_on_after_a_failure() -> None:
+def test_env_goes_on_after_a_failure():
     env = tank()
     before = driven(env, 10, 0.05)["next", "level"]
     driven(env, 20, 0.5)
     assert torch.equal(driven(env, 10, 0.05)["next", "level"], before)
 
 
-def test_restored_env_goes_on_to_the_bit() -> None:
+def test_restored_env_goes_on_to_the_bit():
     env, other = (motor(num_envs=2, **DRAWN) for _ in range(2))
     data = env.reset()
     for _ in range(7):
@@ -156,28 +155,28 @@ def test_restored_env_goes_on_to_the_bit() -> None:
         assert torch.equal(here[key], there[key])
 
 
-def test_workers_have_the_same_digits() -> None:
+def test_workers_have_the_same_digits():
     here, spread = (motor(num_envs=4, workers=n, **DRAWN) for n in (0, 2))
     assert torch.equal(driven(here, 15)["next", "speed"], driven(spread, 15)["next", "speed"])
     spread.close()
 
 
-def test_rows_are_instances_of_their_own() -> None:
+def test_rows_are_instances_of_their_own():
     data = driven(motor(num_envs=2), 5)
     assert not torch.equal(data["next", "speed"][0], data["next", "speed"][1])
 
 
-def open_files() -> int:
+def open_files():
     return len(os.listdir("/proc/self/fd")) + Path("/proc/self/maps").read_text().count(".so")
 
 
-def megabytes() -> float:
+def megabytes():
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="it counts handles as Linux does")
-def test_a_thousand_episodes_leave_no_handle_and_no_memory() -> None:
+def test_a_thousand_episodes_leave_no_handle_and_no_memory():
     env = tank(seconds=0.5)
     driven(env, 10)
     for _ in range(100):
@@ -192,7 +191,7 @@ def test_a_thousand_episodes_leave_no_handle_and_no_memory() -> None:
     assert open_files() - before < 5
 
 
-def test_unpacked_folders_are_removed() -> None:
+def test_unpacked_folders_are_removed():
     env = motor()
     place = env.held.plants[0].env.unwrapped.model.folder
     assert Path(place, "modelDescription.xml").exists()
@@ -202,7 +201,7 @@ def test_unpacked_folders_are_removed() -> None:
     assert not Path(place).exists()
 
 
-def test_gymnasium_sees_an_ordinary_env() -> None:
+def test_gymnasium_sees_an_ordinary_env():
     from gymnasium.utils.env_checker import check_env as check
 
     env = motor().held.plants[0].env

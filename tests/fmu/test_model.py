@@ -2,9 +2,6 @@
 
 import re
 import warnings
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import fmus
 import pytest
@@ -13,7 +10,7 @@ from torchrl.data import Bounded
 
 from coil_fmu import fmu_env
 
-SETTINGS: dict[str, Any] = {"step": 0.01, "seconds": 0.1, "setpoints": {"speed": 100.0}}
+SETTINGS = {"step": 0.01, "seconds": 0.1, "setpoints": {"speed": 100.0}}
 ODD = """
 class Odd(Fmi2Slave):
     def __init__(self, **kwargs):
@@ -38,29 +35,29 @@ class Odd(Fmi2Slave):
 """
 
 
-def odd(_: Path | None = None) -> Path:
+def odd(_=None):
     return fmus.built(ODD, "odd")
 
 
-def changed(changes: dict[str, str], files: dict[str, str] | None = None) -> Callable[[Path], Path]:
+def changed(changes, files=None):
     return lambda folder: fmus.edited(fmus.motor(), folder / "changed.fmu", changes, files)
 
 
-def text(folder: Path) -> Path:
+def text(folder):
     path = folder / "text.fmu"
     path.write_text("no archive")
     return path
 
 
-def motor(_: Path) -> Path:
+def motor(_):
     return fmus.motor()
 
 
-def tank(_: Path) -> Path:
+def tank(_):
     return fmus.tank()
 
 
-CASES: dict[str, tuple[Callable[[Path], Path], dict[str, Any], str]] = {
+CASES = {
     "missing": (lambda folder: folder / "none.fmu", {}, "does not exist"),
     "no archive": (text, {}, "text.fmu is no FMU: .*zip"),
     "FMI 1": (changed({'fmiVersion="2.0"': 'fmiVersion="1.0"'}), {}, "FMI 1.*export it again"),
@@ -144,7 +141,7 @@ CASES: dict[str, tuple[Callable[[Path], Path], dict[str, Any], str]] = {
 }
 
 
-def said(file: Path, settings: dict[str, Any]) -> str:
+def said(file, settings):
     """Return why an FMU is no env, what is said of a step, or what its numbers mean."""
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
@@ -157,23 +154,21 @@ def said(file: Path, settings: dict[str, Any]) -> str:
 
 
 @pytest.mark.parametrize(("make", "settings", "sentence"), CASES.values(), ids=CASES)
-def test_what_is_odd_is_one_sentence(
-    make: Callable[[Path], Path], settings: dict[str, Any], sentence: str, tmp_path: Path
-) -> None:
+def test_what_is_odd_is_one_sentence(make, settings, sentence, tmp_path):
     text = said(make(tmp_path), settings)
     assert re.search(sentence, text), text
     assert "\n" not in text
     assert "..." not in text  # what to do is at the end
 
 
-def test_texts_are_left_out_and_flags_are_numbers() -> None:
+def test_texts_are_left_out_and_flags_are_numbers():
     env = fmu_env(odd(), actions=["push"], **SETTINGS)
     data = env.step(env.reset().set("action", torch.ones(1, 1)))["next"]
     assert sorted(env.observation_spec.keys()) == ["info", "moving", "speed", "speed_setpoint"]
     assert (data["moving"].item(), data["speed"].item()) == (1.0, 1.0)
 
 
-def test_flags_and_whole_numbers_are_choices() -> None:
+def test_flags_and_whole_numbers_are_choices():
     env = fmu_env(
         odd(), actions=["open", "gear"], bounds={"gear": [2, 4]}, start={"push": 1.0}, **SETTINGS
     )
@@ -182,12 +177,12 @@ def test_flags_and_whole_numbers_are_choices() -> None:
     assert data["speed"].item() == 1.0 * 4 + 1
 
 
-def test_an_input_without_bounds_has_none() -> None:
+def test_an_input_without_bounds_has_none():
     assert not isinstance(fmu_env(odd(), actions=["push"], **SETTINGS).action_spec, Bounded)
 
 
 @pytest.mark.parametrize(("push", "said"), [(6.0, "fatal|error"), (-6.0, "its output speed is")])
-def test_an_exception_and_a_nan_are_failures(push: float, said: str) -> None:
+def test_an_exception_and_a_nan_are_failures(push, said):
     env = fmu_env(odd(), actions=["push"], **SETTINGS)
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
@@ -199,7 +194,7 @@ def test_an_exception_and_a_nan_are_failures(push: float, said: str) -> None:
     assert [re.search(said, str(each.message)) is None for each in warned] == [False]
 
 
-def test_two_fmus_with_one_name_stay_apart(tmp_path: Path) -> None:
+def test_two_fmus_with_one_name_stay_apart(tmp_path):
     faster = fmus.MOTOR.replace("0.02", "0.01")
     other = fmus.built(faster, "motor2")
     same_name = tmp_path / "motor.fmu"
@@ -214,7 +209,7 @@ def test_two_fmus_with_one_name_stay_apart(tmp_path: Path) -> None:
     assert speeds[0] != speeds[1]
 
 
-def test_an_fmu_of_which_a_process_holds_one_has_copies() -> None:
+def test_an_fmu_of_which_a_process_holds_one_has_copies():
     once = fmus.edited(
         fmus.motor(),
         fmus.folder() / "once.fmu",
@@ -226,7 +221,7 @@ def test_an_fmu_of_which_a_process_holds_one_has_copies() -> None:
     assert len(folders) == 2
 
 
-def test_fmi_3_has_arrays_and_flags() -> None:
+def test_fmi_3_has_arrays_and_flags():
     env = fmu_env(
         fmus.heaters(),
         step=0.1,

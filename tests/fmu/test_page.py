@@ -1,7 +1,6 @@
 """The motor and the reward of docs/fmu.md are what the page says."""
 
 import re
-from typing import Any
 
 import fmus
 import torch
@@ -13,8 +12,8 @@ PAGE = (ROOT / "docs" / "fmu.md").read_text(encoding="utf-8")
 MOTOR, REWARD = re.findall(r"^```python\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
 
 
-def test_motor_and_reward_of_the_page_are_an_env() -> None:
-    scope: dict[str, Any] = {}
+def test_motor_and_reward_of_the_page_are_an_env():
+    scope = {}
     exec(REWARD, scope)
     env = fmu_env(
         fmus.built(MOTOR, "page"),

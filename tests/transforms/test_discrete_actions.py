@@ -35,12 +35,6 @@ def close(tensor, numbers):
     return tensor.flatten().tolist() == pytest.approx(numbers)
 
 
-def test_env_gets_the_value_and_the_data_keep_the_choice():
-    after = step(advised([0.0] * 3, choices=[-0.5, 0.1, 0.75]), 0, 1, 2)
-    assert after["action"].tolist() == [0, 1, 2]
-    assert close(after["next", "steering"], [-0.5, 0.1, 0.75])
-
-
 def test_advice_is_one_hot_at_the_nearest_choice_and_kept_as_a_number():
     advice = [-0.9, -0.7, -0.25, 0.2, 0.26, 1.0]
     env = advised(advice)

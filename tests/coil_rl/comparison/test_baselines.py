@@ -1,9 +1,9 @@
 """What acts without learning in a comparison: its delay, and its file."""
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
+from plants import Plant
 from programs import composed
 
 import coil_rl.config.schema  # noqa: F401 registers the configuration schema
@@ -72,13 +72,7 @@ def box(low, high):
     ],
 )
 def test_neutral_action_is_called_what_it_is(space, action, words):
-    class Plant(gymnasium.Env):
-        observation_space, action_space = spaces.Box(-1, 1, (1,)), space
-
-        def reset(self, *, seed=None, options=None):
-            return np.zeros(1, np.float32), {}
-
-    env = GymnasiumEnv(Plant)
+    env = GymnasiumEnv(lambda: Plant(actions=space))
     policy, said = neutral(env)
     assert policy(env.reset())["action"][0].tolist() == action
     assert said == words

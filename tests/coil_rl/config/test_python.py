@@ -47,30 +47,6 @@ def proportional(observation):
     return np.clip(-0.2 * observation[0], 0, 1)
 
 
-def proportional_for_all(observation):
-    """Return the powers for observations [B, 2]."""
-    return (-0.2 * observation[:, :1]).clamp(0, 1)
-
-
-@pytest.mark.fast(2)
-@pytest.mark.parametrize(
-    ("guide", "expected"),
-    [
-        (Held(0.7), [0.7, 0.7, 0.0]),
-        (partial(Held, power=0.7), [0.7, 0.7, 0.0]),
-        (lambda observation: [0.4], [0.4, 0.4, 0.4]),
-        (proportional, [0.8, 0.2, 0.0]),
-        (proportional_for_all, [0.8, 0.2, 0.0]),
-    ],
-)
-def test_object_or_function_is_a_guide_and_acts_row_by_row(guide, expected, tmp_path):
-    run = coil_rl.prepare(ENV, guide=guide, method="guide", folder=tmp_path / "run")
-    controller = run.controller()
-    observations = [np.array([error, 3.0], np.float32) for error in (-4.0, -1.0, 2.0)]
-    sent = [float(controller.act(observation)[0]) for observation in observations]
-    assert sent == pytest.approx(expected)
-
-
 @pytest.mark.slow
 def test_folder_made_with_an_object_is_opened_with_the_object(tmp_path, monkeypatch):
     folder = tmp_path / "run"

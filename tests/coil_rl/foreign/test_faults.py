@@ -24,17 +24,15 @@ from programs import called, read_csv
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
-from torchrl.envs import Compose, ExplorationType, TransformedEnv, set_exploration_type
+from torchrl.envs import Compose, TransformedEnv
 
 import coil_rl
-from coil_rl import GymnasiumEnv, compose_train
-from coil_rl.envs import gym
+from coil_rl import GymnasiumEnv
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.guard import SETTINGS, hold
 from coil_rl.guides import (
     ConstantGuide,
     ControllerGuide,
-    EntryGuide,
     PerRow,
     RandomGuide,
     ZeroGuide,
@@ -779,23 +777,6 @@ class Valve(Plant):
         return self.good(), pay, False, self.time == 10, {}
 
 
-class Above:
-    """Gives 0.05 of the range more than the best action."""
-
-    def __init__(self, low, high):
-        self.low, self.span = low, high - low
-
-    def act(self, observation):
-        return [self.low + self.span * (0.35 + 0.2 * observation[0])]
-
-
-def run_of(folder, env, method, guide=None, words=(), frames=64):
-    words = [*PPO, *words]
-    return coil_rl.prepare(
-        env, guide=guide, method=method, frames=frames, folder=folder, overrides=words
-    )
-
-
 def got(space, guide, *transforms, rows=1, controllers=None):
     """Return the actions that an env gets while its guide acts."""
     seen = []
@@ -813,26 +794,6 @@ def got(space, guide, *transforms, rows=1, controllers=None):
 
 
 # Kind 1: actions in a unit and a numbering of the env.
-
-
-@pytest.mark.slow
-def test_residual_begins_as_its_guide(tmp_path):
-    run = run_of(tmp_path, partial(Valve, 200, 1000), "residual", Above(200, 1000))
-    env = run.make_env(2).eval()
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        rewards = env.rollout(100, run.make_learner(env).policy)["next", "reward"]
-    assert float(rewards.sum(1).mean()) == pytest.approx(-0.5, abs=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["coil", "ppo"])
-def test_digits_do_not_depend_on_the_unit_of_the_action(method, tmp_path):
-    logs = []
-    for box in ((0, 1), (0, 2000)):
-        folder, guide = tmp_path / str(box[1]), Above(*box) if method == "coil" else None
-        run_of(folder, partial(Valve, *box), method, guide).train()
-        logs.append([float(row["train/reward"]) for row in read_csv(folder / "metrics.csv")])
-    assert round(float(np.nanmax(np.abs(np.subtract(*logs)))), 4) == 0
 
 
 @pytest.mark.parametrize(
@@ -861,23 +822,6 @@ def test_advice_is_clamped_where_a_bound_is_finite():
     assert got(space, ConstantGuide([5.0, 5.0]))[0] == [1.0, 5.0]
 
 
-def test_actions_without_squash_are_not_all_at_the_bound(tmp_path):
-    run = run_of(tmp_path, partial(Valve, 200, 1000), "ppo", words=["learner.squash=false"])
-    env = run.make_env(2)
-    env.rollout(9, run.make_learner(env).policy)
-    assert len(np.unique(np.stack(env.base_env.actions))) > 9
-
-
-@pytest.mark.parametrize(
-    "guide",
-    [ConstantGuide(3), ControllerGuide(lambda seen: 3), EntryGuide(["controller", "its"])],
-    ids=["constant", "function", "controller beside its env"],
-)
-def test_choices_have_the_numbers_of_the_env(guide):
-    its = {"its": lambda env, seen: 3}
-    assert got(spaces.Discrete(3, start=1), guide, controllers=its) == [[3]] * 10
-
-
 # Kind 2: observations and rewards in a unit of the env.
 
 
@@ -897,13 +841,6 @@ def test_physical_units_are_normalised(learner, tmp_path, capsys):
 def test_statistics_of_a_wrapper_are_refused(wrapper):
     with pytest.raises(ValueError, match=r"statistics.* leave it out"):
         GymnasiumEnv(lambda: ClipReward(getattr(gymnasium.wrappers, wrapper)(Valve()), -1, 1))
-
-
-@pytest.mark.parametrize(
-    "words", [["method=ppo"], ["method=coil_anchored"], ["method=coil", "learner=sac"]]
-)
-def test_rewards_are_scaled_for_every_method(words):
-    assert compose_train([*words, "env=pendulum"]).learner.scale_rewards
 
 
 @pytest.mark.parametrize(
@@ -927,13 +864,6 @@ def test_picture_of_real_numbers_up_to_255_is_named():
 
 
 # Kind 5: what a person writes into a file.
-
-
-def test_file_that_is_no_yaml_is_named_with_its_line(tmp_path):
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment" / "mine.yaml").write_text("a: [1,\nb: }\n")
-    said = called("train", "--config-dir", str(tmp_path), "+experiment=mine", code=2).stderr
-    assert "mine.yaml, line 2: it is no YAML: " in said
 
 
 # Kind 6: how a run goes on.
@@ -960,41 +890,7 @@ def test_run_and_resume_take_one_spelling(tmp_path):
     assert found == ["1", "2", "3", "a=b ü"]
 
 
-def test_cars_of_the_vector_env_go_on_after_a_reset_of_others():
-    straight, mask = np.zeros((4, 1), np.float32), np.array([True, False, False, True])
-    envs, alone = (gymnasium.make_vec(gym.ID, num_envs=4) for _ in range(2))
-    for each in (envs, alone):
-        each.reset(seed=np.int64(3))
-        for _ in range(5):
-            before = each.step(straight)[0]
-    observation, _ = envs.reset(options={"reset_mask": mask})
-    np.testing.assert_array_equal(observation[~mask], before[~mask])
-    assert (observation[mask] != before[mask]).any(-1).all()
-    same = (envs.step(straight)[0] == alone.step(straight)[0]).all(-1)
-    assert same.tolist() == [False, True, True, False]
-
-
 # Kind 10: code that changes under a run.
-
-
-@pytest.mark.slow
-def test_changed_code_is_refused_at_a_resume_and_nothing_is_removed(tmp_path, monkeypatch):
-    source, run = tmp_path / "valve_of_mine.py", tmp_path / "run"
-    text = "from tests_of_faults import Valve as Theirs\n\nclass Valve(Theirs):\n    pass\n"
-    source.write_text(text)
-    monkeypatch.setitem(sys.modules, "tests_of_faults", sys.modules[__name__])
-    monkeypatch.syspath_prepend(tmp_path)
-    run_of(run, "valve_of_mine:Valve", "ppo").train()
-    words = [f"resume={run}", "trust=[valve_of_mine]", "budget.frames=128"]
-    source.write_text(f"{text}\n# another reward\n")
-    refused = called("train", *words, code=2).stderr
-    assert "begun with another file of valve_of_mine" in refused
-    source.rename(tmp_path / "aside.py")
-    called("train", *words, code=2)
-    (tmp_path / "aside.py").rename(source)
-    assert (run / "evaluation.csv").exists()
-    said = called("train", *words, "changed=accept").stderr
-    assert "goes on with another file of valve_of_mine" in said
 
 
 # Kind 12: what is asked of a run that has begun.

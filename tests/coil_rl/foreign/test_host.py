@@ -449,13 +449,6 @@ def test_table_of_numpy_gives_an_action_for_each_row_also_for_one(rows):
     assert np.array_equal(data["guide_action"][..., 0, :].numpy(), expected)
 
 
-def test_network_reads_choices_as_one_hot_vectors():
-    env = GymnasiumEnv(partial(Plant, spaces.MultiDiscrete([2, 3]), TWO), 2, max_steps=9)
-    advised = TransformedEnv(env, GuideActions({"net": ControllerGuide(torch.nn.Linear(5, 2))}))
-    data = advised.rollout(3)
-    assert torch.equal(data["observation"].sum(-1), torch.full((2, 3), 2.0))
-
-
 STEPS = 5
 
 

@@ -2,13 +2,13 @@
 
 import warnings
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
+from plants import Plant
 
-from coil_rl import AdviceObservation, GymnasiumEnv
+from coil_rl import AdviceObservation
 from coil_rl.foreign.faults import ForeignError
 
 VECTOR = spaces.Box(-1.0, 1.0, (3,), np.float64)
@@ -29,23 +29,12 @@ ACTIONS = {
 }
 
 
-class Spaces(gymnasium.Env):
-    """An env with any spaces, of four steps."""
-
-    metadata = {"render_modes": []}  # noqa: RUF012
-
-    def __init__(self, observation, action):
-        self.observation_space, self.action_space = observation, action
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.observation_space.seed(seed)
-        self.left = 4
-        return self.observation_space.sample(), {}
+class Spaces(Plant):
+    """Any spaces; an episode terminates in its fourth step."""
 
     def step(self, action):
-        self.left -= 1
-        return self.observation_space.sample(), 0.0, self.left == 0, False, {}
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, self.time == 4, False, info
 
 
 class Count:
@@ -97,26 +86,6 @@ def test_advice_is_normalised_as_networks_here_read_it(action, given, observed):
     observation, _ = env.reset(seed=0)
     assert observation[3:].tolist() == observed
     assert env.advice.tolist() == observed
-
-
-@pytest.mark.parametrize("id", ["CartPole-v1", "Pendulum-v1"])
-def test_observation_is_that_of_the_library_with_its_advice(id):
-    from torchrl.envs import TransformedEnv
-
-    from coil_rl.guides import EntryGuide
-    from coil_rl.transforms import GuideActions, NormalisedAction
-
-    def lean(env, observation):
-        action = env.action_space
-        return int(observation[2] > 0) if isinstance(action, spaces.Discrete) else observation[:1]
-
-    env = GymnasiumEnv(id, first_seed=3, controllers={"lean": lean})
-    guide = EntryGuide(("controller", "lean"))
-    library = TransformedEnv(TransformedEnv(env, NormalisedAction()), GuideActions({"lean": guide}))
-    ours = library.reset()
-    theirs, _ = AdviceObservation(gymnasium.make(id), lean).reset(seed=3)
-    expected = np.concatenate([ours["observation"][0].numpy(), ours["guide_action"][0, 0].numpy()])
-    np.testing.assert_array_equal(theirs, expected)
 
 
 def test_controller_with_a_memory_begins_each_episode_anew():

@@ -12,10 +12,6 @@ from coil_rl.learners.encoders import Cnn, Mlp, ObservationNetwork
 SMALL = {"channels": [4, 8], "kernels": [3, 3], "strides": [2, 1], "hidden": [16]}
 
 
-def linears(module):
-    return [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
-
-
 def images(*shape, dtype=torch.uint8, action=None):
     image = (
         Bounded(0, 255, shape, dtype=dtype)

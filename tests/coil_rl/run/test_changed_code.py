@@ -1,12 +1,13 @@
 """A run folder knows the files of a user that its env and its guide are defined in."""
 
 import importlib
+import re
 import sys
 
 import pytest
+from programs import called
 
 import coil_rl
-from coil_rl import UserError
 from coil_rl.record import GUIDE_RETURNS
 from coil_rl.run.folder import CODE, CODE_BEFORE, code_of
 
@@ -36,7 +37,7 @@ def place(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_change_of_a_file_is_said_and_refused_where_the_run_would_go_on(place, capsys):
+def test_change_of_a_file_is_said_and_refused_where_the_run_would_go_on(place):
     folder = place / "run"
     run = coil_rl.train("tank_of_mine:Tank", frames=32, folder=folder, overrides=TINY)
     begun = code_of(folder)[CODE]
@@ -50,12 +51,13 @@ def test_change_of_a_file_is_said_and_refused_where_the_run_would_go_on(place, c
     again = coil_rl.open_run(folder, trust=["tank_of_mine"])
     with pytest.warns(UserWarning, match="another file of rewards_of_mine"):
         again.controller()
-    with pytest.raises(UserError, match=r"another file of rewards_of_mine.* changed=accept"):
-        again.train(frames=64)
+    words = [f"resume={folder}", "trust=[tank_of_mine]", "budget.frames=64"]
+    refused = called("train", *words, code=2).stderr
+    assert re.search("another file of rewards_of_mine.* changed=accept", refused)
     assert code_of(folder)[CODE] == begun
     assert GUIDE_RETURNS.read(folder) == {"guide": -9.0}
-    again.train(frames=64, changed="accept")
-    assert "goes on with another file of rewards_of_mine" in capsys.readouterr().err
+    said = called("train", *words, "changed=accept").stderr
+    assert "goes on with another file of rewards_of_mine" in said
     now = code_of(folder)
     assert now[CODE_BEFORE] == begun
     assert GUIDE_RETURNS.read(folder) == {}  # measured anew, without a guide

@@ -88,14 +88,6 @@ def test_controller_has_normaliser_and_degraded_advice_inside(options, tmp_path)
 
 
 @pytest.mark.slow
-def test_action_is_in_the_numbering_of_the_env(tmp_path):
-    folder = learned(tmp_path / "run", "ppo", env="CartPole-v1")
-    _, actions, controller = check_same(folder)
-    assert set(actions) <= {0, 1}
-    assert controller.act([0.0, 0.0, 0.0, 0.0]) in (0, 1)
-
-
-@pytest.mark.slow
 def test_env_with_several_rows_is_refused(tmp_path):
     run = coil_rl.open_run(learned(tmp_path / "run", "ppo"))
     env = run.make_env(2)

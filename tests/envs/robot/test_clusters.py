@@ -7,26 +7,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
-from coil_rl.envs.robot.clusters import GAP, Points, measure, points_of, single_linkage
+from coil_rl.envs.robot.clusters import GAP, measure, points_of, single_linkage
 
 CIRCLE = np.arange(360) * 2 * np.pi / 360 - np.pi
 
 
-def dense(points: Points, scan: int, gap: float) -> list[frozenset[int]]:
+def dense(points, scan, gap):
     """The connected components of the full distance matrix of a scan, as sets of points."""
     rows = np.flatnonzero(points.scan == scan)
     x, y = (axis[rows][:, None] - axis[rows] for axis in (points.x, points.y))
     return as_sets(connected_components(x * x + y * y < gap * gap)[1], rows) if len(rows) else []
 
 
-def as_sets(labels, rows) -> list[frozenset[int]]:
-    groups: dict[int, set[int]] = {}
+def as_sets(labels, rows):
+    groups = {}
     for label, row in zip(labels.tolist(), rows.tolist(), strict=True):
         groups.setdefault(label, set()).add(row)
     return sorted(map(frozenset, groups.values()), key=min)
 
 
-def expect_exact(ranges, angles, range_min=0.02, range_max=1.15, gap=GAP) -> int:
+def expect_exact(ranges, angles, range_min=0.02, range_max=1.15, gap=GAP):
     points = points_of(ranges, angles, range_min, range_max)
     label = single_linkage(points, gap)
     for scan in range(points.scans):
@@ -38,7 +38,7 @@ def expect_exact(ranges, angles, range_min=0.02, range_max=1.15, gap=GAP) -> int
     return len(numbers)
 
 
-def scans(seed: int, count: int, beams: int = 360):
+def scans(seed, count, beams=360):
     """Discs, walls, dropouts and clutter, some in front of others."""
     rng = np.random.default_rng(seed)
     angles = np.linspace(-np.pi, np.pi, beams)

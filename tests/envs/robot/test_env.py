@@ -30,7 +30,7 @@ from coil_rl.transforms import GuideActions
 EXACT = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)
 
 
-def robots(count=2, **world) -> SimulatedRobotEnv:
+def robots(count=2, **world):
     return SimulatedRobotEnv(num_envs=count, **world)
 
 
