@@ -160,8 +160,7 @@ def _source(plant: GymnasiumEnv, given: Entry) -> dict[str, Any]:
     entry = {each.key: each for each in plant.codec.entries}.get(unravel_key(given.key))
     if entry is None:  # an entry beside the observation, such as the action of a controller
         return {}
-    start = torch.as_tensor(entry.start).reshape(-1)
-    start = start.expand(len(entry.choices)) if entry.choices else start[:0]
+    start = entry.lowest.expand(len(entry.choices)) if entry.choices else entry.lowest[:0]
     source = {"path": list(entry.path), "choices": entry.choices, "start": start.tolist()}
     about: dict[str, Any] = {"from": source}
     if entry.choices:

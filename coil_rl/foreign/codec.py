@@ -26,7 +26,7 @@ from torchrl.data import (
 
 from coil_rl.foreign.faults import FaultError, ForeignError, plain_array, shown
 from coil_rl.foreign.makers import Env
-from coil_rl.transforms.action_space import choices_of
+from coil_rl.transforms.action_space import OwnForms, choices_of
 
 MOST_CHOICES = 32  # of a whole number that is an action
 WATCHED = 256  # first observations, in which the range of each number is found
@@ -74,38 +74,10 @@ class Fineness:
             )
 
 
-class OwnForm:
-    """Conversion of an entry from the form of networks to that of the env.
+class Entry:
+    """One entry of the observation: where it is found, its spec, and its conversion, and back.
 
     Networks get floats, one-hot vectors for choices, and [1] for a number of the shape ().
-
-    Args:
-        space: of the entry, in which choices are one-hot vectors side by side.
-    """
-
-    def __init__(self, space: spaces.Space[Any]) -> None:
-        self.sizes, self.shape = _choices(space), tuple(space.shape or ())
-        self.whole = _is_whole(space)
-        self.first = torch.as_tensor(np.ravel(_start(space)).astype(np.int64))
-
-    def __call__(self, entry: torch.Tensor) -> torch.Tensor:
-        """Return the numbers, [*batch, *shape] with the shape of the space.
-
-        Args:
-            entry: [*batch, n] for choices, else [*batch, *shape], with a dimension more for a
-                single number.
-        """
-        if not self.sizes:
-            batch = entry.shape[: entry.ndim - max(1, len(self.shape))]
-            return (entry.long() if self.whole else entry).reshape((*batch, *self.shape))
-        parts = entry.split(self.sizes, -1)
-        indices = torch.stack([part.argmax(-1) for part in parts], -1)
-        own = indices + self.first.to(indices.device)
-        return own.reshape((*entry.shape[:-1], *self.shape))
-
-
-class Entry:
-    """One entry of the observation: where it is found, its spec, and its conversion to numbers.
 
     Args:
         id: of the env, for the `ValueError` about a space that is not supported.
@@ -117,7 +89,8 @@ class Entry:
     def __init__(
         self, id: str, path: tuple[str | int, ...], space: spaces.Space[Any], floats: np.dtype[Any]
     ) -> None:
-        self.path, self.dtype, self.start = path, floats, _start(space)
+        self.path, self.dtype, self.start = path, floats, np.ravel(_start(space))
+        self.lowest = torch.as_tensor(self.start.astype(np.int64))
         self.space, self.shape = space, tuple(space.shape or ())
         self.binary = isinstance(space, spaces.MultiBinary)
         # Not the entry of a Dict space: the observation itself, or within a Tuple.
@@ -189,6 +162,21 @@ class Entry:
             raise FaultError(f"{self.title} holds {wrong}, not a finite number of {self.dtype}")
         return converted
 
+    def own(self, entry: torch.Tensor) -> torch.Tensor:
+        """Return numbers as the env has them, [*batch, *shape] with the shape of the space.
+
+        Args:
+            entry: [*batch, n] for choices, else [*batch, *shape], with a dimension more for a
+                single number.
+        """
+        if not self.choices:
+            batch = entry.shape[: entry.ndim - max(1, len(self.shape))]
+            return (entry.long() if self.whole else entry).reshape((*batch, *self.shape))
+        parts = entry.split(self.choices, -1)
+        indices = torch.stack([part.argmax(-1) for part in parts], -1)
+        own = indices + self.lowest.to(indices.device)
+        return own.reshape((*entry.shape[:-1], *self.shape))
+
     @property
     def bounds(self) -> tuple[NDArray[Any], NDArray[Any]] | None:
         """Declared bounds, of the shape and dtype of `spec`; None for choices.
@@ -225,7 +213,7 @@ class Entry:
 
     def _one_hot(self, value: NDArray[Any]) -> NDArray[Any]:
         """Return choices as one-hot vectors side by side."""
-        chosen = np.ravel(value) - np.ravel(self.start)
+        chosen = np.ravel(value) - self.start
         sizes = np.array(self.choices)
         fits = (chosen >= 0) & (chosen < sizes) & (chosen == np.floor(chosen))
         self._check(value.reshape(-1), fits)
@@ -460,10 +448,10 @@ class Codec:
         self.largest = float(np.finfo(self.floats).max)  # number of a reward
 
     @property
-    def own_forms(self) -> dict[NestedKey, OwnForm]:
+    def own_forms(self) -> OwnForms:
         """What converts entries from the form of networks to that of the env, by key."""
         own = [each for each in self.entries if each.whole or each.given != each.shape]
-        return {entry.key: OwnForm(entry.space) for entry in own}
+        return {entry.key: entry.own for entry in own}
 
     def read(self, observation: Any) -> dict[NestedKey, NDArray[Any]]:
         """Return copies of the entries of an observation, by their keys.

@@ -21,7 +21,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from coil_rl.errors import did_you_mean
-from coil_rl.foreign.codec import OwnForm
+from coil_rl.foreign.codec import Entry
 from coil_rl.foreign.faults import action_array, foreign
 from coil_rl.foreign.guard import Numbers
 
@@ -144,7 +144,7 @@ def _in_space(entry: NDArray[Any], space: Any) -> Any:
     if space is None or entry.shape == space.shape:
         return entry
     if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
-        return OwnForm(space)(torch.from_numpy(entry)).numpy()[()]
+        return Entry("", (), space, entry.dtype).own(torch.from_numpy(entry)).numpy()[()]
     if isinstance(space, spaces.Box) and entry.size == math.prod(space.shape):
         return entry.reshape(space.shape)
     return entry
