@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from types import CellType, FunctionType, ModuleType
+from types import FunctionType, ModuleType
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -463,7 +463,7 @@ class Clock:
 
 
 class _Shared:
-    """What all objects of some classes share: attributes, defaults, variables around, the module.
+    """What all objects of some classes share: attributes, default arguments, the module.
 
     Args:
         kinds: the classes.
@@ -496,14 +496,6 @@ class _Shared:
                 if isinstance(value, FunctionType):
                     given = [each for each in value.__defaults__ or () if _is_data(each)]
                     yield f"a default of {title}", given, partial(_set_defaults, value)
-                    named = value.__kwdefaults__ or {}
-                    known = {key: each for key, each in named.items() if _is_data(each)}
-                    yield f"a keyword default of {title}", known, named.update
-                    cells = zip(value.__code__.co_freevars, value.__closure__ or (), strict=True)
-                    for variable, cell in cells:
-                        if cell != CellType() and _is_data(cell.cell_contents):
-                            put = partial(setattr, cell, "cell_contents")
-                            yield f"the variable {variable} of {title}", cell.cell_contents, put
                 elif _is_data(value) and not name.startswith("__"):
                     yield title, value, partial(setattr, kind, name)
             module = sys.modules.get(kind.__module__)
