@@ -209,23 +209,20 @@ class ActionSpace:
         indices = self._indices(action, batch)
         if not action.isfinite().all():
             raise ValueError("holds a number that is not finite")
-        if self.choices:
-            # The elements of a vector are 0 or 1.
-            limit = torch.tensor(2 if indices is None else self.choices, device=action.device)
-            numbers = action if indices is None else indices
-            if ((numbers >= 0) & (numbers < limit)).all():
-                if not (numbers == numbers.long()).all():
-                    raise ValueError("is no whole number, but must be the number of a choice")
-                if indices is None and self.size > len(self.choices):
-                    self._check_one_hot(action)
-                return
-            if self.first is not None:
-                low, high = self.first, self.first + torch.tensor(self.choices) - 1
-                raise ValueError(
-                    f"is neither a number from {low.tolist()} to {high.tolist()} nor a one-hot "
-                    "vector"
-                )
-            raise ValueError(f"is neither an index below {max(self.choices)} nor a one-hot vector")
+        if not self.choices:
+            return
+        # The elements of a vector are 0 or 1.
+        limit = torch.tensor(2 if indices is None else self.choices, device=action.device)
+        numbers = action if indices is None else indices
+        if not ((numbers >= 0) & (numbers < limit)).all():
+            low, high = (side.long().tolist() for side in (self.range.low, self.range.high))
+            raise ValueError(f"is neither a number from {low} to {high} nor a one-hot vector")
+        if not (numbers == numbers.long()).all():
+            raise ValueError("is no whole number, but must be the number of a choice")
+        if indices is None and self.size > len(self.choices):
+            chosen = torch.stack([part.sum(-1) for part in action.split(self.choices, -1)], -1)
+            if (chosen != 1).any():
+                raise ValueError("is no one-hot vector: it must have exactly one 1 for each choice")
 
     def takes(self, action: Tensor, batch: torch.Size) -> bool:
         """Return whether the action of a guide has a shape of which `advice` makes a vector."""
@@ -242,12 +239,6 @@ class ActionSpace:
         """
         is_number = self.continuous and self.event.numel() == 1
         return action.reshape(*batch, 1) if is_number and action.shape == batch else action
-
-    def _check_one_hot(self, vectors: Tensor) -> None:
-        """Raise a `ValueError` for vectors [..., A] without exactly one 1 for each choice."""
-        chosen = torch.stack([part.sum(-1) for part in vectors.split(self.choices, -1)], -1)
-        if (chosen != 1).any():
-            raise ValueError("is no one-hot vector: it must have exactly one 1 for each choice")
 
     def unfit_row(self, action: Tensor, batch: torch.Size) -> tuple[int, Tensor, str]:
         """Return the first row whose action does not fit the env, and the reason.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -155,20 +157,17 @@ def _found(observation: Any, entry: Mapping[str, Any], *, only: bool) -> Any:
             path = source["path"]
     elif only and not isinstance(observation, Mapping):
         path = []
-    missing = isinstance(observation, Mapping) and not path
-    for part in path:
-        try:
-            observation = observation[part]
-        except (IndexError, KeyError, TypeError):
-            missing = True
-            break
-    if missing:
+    try:
+        found = reduce(getitem, path, observation)
+    except (IndexError, KeyError, TypeError):
+        found = {}
+    if isinstance(found, Mapping):
         raise ValueError(
             f"the observation lacks {entry['name']}; the policy reads it, see its contract.json"
         )
     if source is not None and source["choices"]:
-        return _one_hot(observation, entry)
-    return observation
+        return _one_hot(found, entry)
+    return found
 
 
 def _one_hot(value: Any, entry: Mapping[str, Any]) -> Any:

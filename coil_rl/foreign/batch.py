@@ -46,7 +46,6 @@ class SeededRows(SeededEnv):
     """
 
     remedy: ClassVar[str] = ""  # what may help if running episodes cannot be repeated
-    optional: Sequence[tuple[str, ...]] = ()  # entries in which NaN is a number without a value
 
     def __init__(
         self,

@@ -179,7 +179,8 @@ def choose(
             )
         count = min(int(workers), rows)
         return count if count > 1 else 0
-    cores = min(_cores(), rows)
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = min(len(affinity(0)) if affinity else os.cpu_count() or 1, rows)
     # A process of a sweep has its share of the cores already.
     if not can_fork or cores < 2 or multiprocessing.parent_process() is not None:
         return 0
@@ -227,12 +228,6 @@ def timed(make: MakeRows, draw: Callable[[], Any]) -> float | None:
                 shard.begin({0: len(taken)}, {})
         return min(taken) + max(min(waits), 0.0)
     return None
-
-
-def _cores() -> int:
-    """Return the number of cores that this program may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def _started(make: MakeRows, own: range) -> tuple[Connection, Any]:

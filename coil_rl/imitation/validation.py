@@ -81,7 +81,6 @@ def group_splits(groups: Tensor) -> list[Split]:
             "all samples are from one track, so no track can be left out; set "
             "learner.group_key=null"
         )
-    require("the validation (learner.validate=true)", "imitate", "sklearn")
     from sklearn.model_selection import GroupKFold
 
     return list(GroupKFold(min(count, MAX_FOLDS)).split(labels, groups=labels))

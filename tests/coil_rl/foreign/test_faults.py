@@ -409,14 +409,14 @@ ROW = r"Gives \(row 0, step"
         (SWING, lambda x: x, r"has the shape \[2, 3\], but must have \[2, 1\]"),
         (SWING, nn.Identity(), r"Identity: its action has the shape .* but must have"),
         (SWING, NO_WEIGHTS, "Network: it raised RuntimeError: no weights at"),
-        (CART, lambda x: -1, "is neither an index below 2 nor a one-hot vector"),
-        (CART, lambda x: 2, "is neither an index below 2 nor a one-hot vector"),
+        (CART, lambda x: -1, r"is neither a number from \[0\] to \[1\] nor a one-hot vector"),
+        (CART, lambda x: 2, r"is neither a number from \[0\] to \[1\] nor a one-hot vector"),
         (CART, lambda x: 0.5, "is no whole number, but must be the number of a choice"),
         ({"action": PLANE}, Gives([1.0, 2.0]), rf"{ROW} 0.*\[1.0, 2.0\], .*\[2\], .* have \[1"),
         (
             {"action": spaces.Discrete(2)},
             Gives(0, 1, 2),
-            rf"{ROW} 2\): act returned \[2\], which is neither an index",
+            rf"{ROW} 2\): act returned \[2\], which is neither a number from \[0\]",
         ),
         (
             {"action": spaces.Discrete(3, start=5)},
