@@ -34,9 +34,9 @@ from coil_rl.output import say
 from coil_rl.plain_yaml import is_part, leaves
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
+from coil_rl.run.experiment import INIT
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, transformed, try_out
-from coil_rl.run.training import INIT
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key, written_key
 from coil_rl.transforms.guide_actions import UnfitActionError

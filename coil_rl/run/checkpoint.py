@@ -1,23 +1,30 @@
 """Checkpoint files: complete, unaltered and free of code, or refused."""
 
+from __future__ import annotations
+
 import hashlib
 import io
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from coil_rl.errors import UserError
+from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import folder_to_disk, read_file, whole_file
 from coil_rl.foreign.remembered import loaded
 from coil_rl.output import say
+from coil_rl.run.folder import check_same
+
+if TYPE_CHECKING:
+    from coil_rl.run.run import Run
 
 NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint_previous.pt"
 DIGITS = 64  # of a SHA-256
+PUT_BACK = "put the files of the run back, or train again in another folder"
 LARGEST_FILE = 16 * 2**30  # bytes
 
 
@@ -128,6 +135,43 @@ def load_newest(folder: Path) -> Any | None:
     previous.replace(newest)
     folder_to_disk(folder)
     return state
+
+
+def go_on(run: Run, load: Callable[[dict[str, Any]], object]) -> bool:
+    """Load the last intact checkpoint of a run; return whether there is one.
+
+    A run that was made longer has the checkpoint of the shorter one.
+
+    Args:
+        run: that goes on.
+        load: restores the state.
+
+    Raises:
+        UserError: if it is damaged, or belongs to a run with another configuration.
+    """
+    state = load_newest(run.folder)
+    if state is None:
+        return False
+    file = run.folder / NEWEST
+    with file_of_a_run(file, PUT_BACK):
+        saved, ours = dict(state["identity"]), dict(run.identity)
+        frames = saved.get("budget.frames")
+        if frames in (run.budget.frames, *run.budget.stages):
+            for each in (saved, ours):
+                each.pop("budget.frames", None)
+                each.pop("budget.stages", None)
+        check_same(saved, ours, f"{file} belongs to a run", PUT_BACK)
+        load(state)
+    return True
+
+
+def check_parameters(state: Any, update: int, name: str = "learner") -> None:
+    """Raise a `UserError` if a tensor of a nested state holds NaN; bounds may be infinite."""
+    if isinstance(state, Mapping):
+        for key, value in state.items():
+            check_parameters(value, update, f"{name}/{key}")
+    elif isinstance(state, torch.Tensor) and state.is_floating_point() and state.isnan().any():
+        raise UserError(f"{name} is nan after update {update}")
 
 
 def _check_archive(content: bytes) -> None:

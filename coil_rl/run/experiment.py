@@ -1,38 +1,48 @@
 """The training loop: collect a batch, learn from it, log, and let the callbacks act."""
 
+from __future__ import annotations
+
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.errors import UserError, file_of_a_run, is_outside
+from coil_rl.compiled import compile_steps
+from coil_rl.errors import UserError, is_outside
 from coil_rl.learners.anchor import rest_guides
-from coil_rl.learners.learner import Callback, Learner, Stateful
+from coil_rl.learners.learner import Callback, Stateful
 from coil_rl.output import decoration, progress, say
+from coil_rl.report.runs import EVALUATION
 from coil_rl.report.table import return_format
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases, guide_calls
 from coil_rl.run.curve import EvaluationCurve, Watch
-from coil_rl.run.folder import check_same, weights_file
+from coil_rl.run.delivery import Delivery
+from coil_rl.run.folder import weights_file
 from coil_rl.run.metrics import Metrics
+from coil_rl.run.parts import TESTS
 from coil_rl.run.reasons import start_test
 from coil_rl.run.rollout import Rollout
 from coil_rl.run.stopping import STOP
+from coil_rl.transforms.normalised_action import given_units, units_of
+
+if TYPE_CHECKING:
+    from coil_rl.run.run import Run
 
 REST = 0.1  # of the frames: a larger one that stays unused is said
-PUT_BACK = "put the files of the run back, or train again in another folder"
+INIT = "init.pt"  # the policy that a run began from
 
 
-@dataclass(eq=False)
 class Experiment(Stateful):
-    """The training of one run in one folder.
+    """The training of a run, whose env and learner are made here.
 
     Files: `metrics.csv` (a row for the state before the first update and after each update),
     `checkpoint.pt` (the complete state), `checkpoint_previous.pt`, `policy_last.pt` and `policies/`
@@ -40,49 +50,46 @@ class Experiment(Stateful):
     same files, to the bit on a CPU.
 
     Args:
+        run: whose training it is; its folder exists.
+        before: frames that were taken before it, by what prepared it.
+
+    Attributes:
         learner: learns from the batches.
-        rollout: collects them. Its env must write `episode_reward` (TorchRL's RewardSum), and
-            `task_reward` if a transform adds to the reward of the task.
-        frames: length of the run, with the steps of all tests; the last batch may exceed it.
-        folder: of the run; it exists.
-        logger: any TorchRL logger, in addition to the CSV file.
-        watch: further entries to log, as means over finished episodes ("episode") or over all steps
-            ("step"), without those that are NaN.
-        checkpoint_every: updates between two checkpoints.
+        rollout: collects them.
+        cases: in which callbacks compare policies; their steps are frames.
+        curve: keeps policies and evaluates them, after the row of an update was logged.
         callbacks: called before the first update, and after each one before its row is logged. The
             numbers that one returns are columns of the log.
-        curve: keeps policies and evaluates them, after the row of an update was logged.
-        cases: in which callbacks compare policies; their steps are frames.
         reserve: returns the frames that are kept for a test at the end, once the tests before the
             first update are over. None: there is no such test.
-        before: frames that were taken before the run, by what prepared it.
-        identity: values of the configuration, which a checkpoint keeps and a resumed run must have.
-        stages: earlier lengths of a run that was made longer, in frames.
-        resume_command: what to type to go on with it, for messages.
     """
 
     EPISODES: ClassVar[int] = 100  # the return is the mean over this many finished episodes
     parts: ClassVar = ("learner", "rollout", "cases", "updates", "first", "ends")
 
-    learner: Learner
-    rollout: Rollout
-    frames: int
-    folder: Path
-    _: KW_ONLY
-    curve: EvaluationCurve
-    cases: TrainingCases
-    logger: Any | None = None
-    watch: Watch = field(default_factory=dict)
-    checkpoint_every: int = 10
-    callbacks: Sequence[Callback] = ()
-    reserve: Callable[[], int] | None = None
-    before: int = 0
-    identity: Mapping[str, Any] = field(default_factory=dict)
-    stages: Sequence[int] = ()
-    resume_command: str = ""
-
-    def __post_init__(self) -> None:
-        self.metrics = Metrics(self.folder / "metrics.csv", self.logger)
+    def __init__(self, run: Run, before: int) -> None:
+        self.owner, self.budget, self.before = run, run.budget, before
+        env = run.make_env(run.budget.rows)
+        _say_units(env)
+        if run.compiled:
+            compile_steps(env)
+        learner = self.learner = run.require_agent()(env)
+        if run.init is not None:
+            init = _copy_of_init(run.folder, run.init)
+            checkpoint.put_weights(learner.policy, checkpoint.load(init, run.device), init)
+        keys = [*learner.keys, *watched_keys(env, run.watch)]
+        self.rollout = Rollout(env, learner.policy, run.budget.steps, keys, run.noise_correlation)
+        make_env = partial(run.make_env, cases=TESTS)
+        self.cases = TrainingCases(make_env, run.budget.frames, run.seed, run.noise_correlation)
+        self.curve = _curve_of(run, learner.policy)
+        self.callbacks: list[Callback] = [*learner.callbacks(self.cases), *run.callbacks(learner)]
+        self.reserve: Callable[[], int] | None = None
+        if run.delivery == "tested":
+            delivery = Delivery(learner, env, self.cases, self.curve, run.folder)
+            self.callbacks.append(delivery)
+            self.reserve = delivery.reserve
+        logger = run.logger() if run.logger is not None else None
+        self.metrics = Metrics(run.folder / "metrics.csv", logger)
         self.updates = 0  # so far
         self.calls_before = 0  # of the guides in the rollouts of earlier processes
         self.first: dict[str, float] = {}  # the row of the log before the first update
@@ -92,7 +99,7 @@ class Experiment(Stateful):
     @property
     def all_updates(self) -> int:
         """Number of updates of the whole run, once it is known."""
-        return self.ends[self.frames]
+        return self.ends[self.budget.frames]
 
     def _plan(self) -> None:
         """Fix at how many updates the run ends, and what the curve keeps.
@@ -103,16 +110,16 @@ class Experiment(Stateful):
         that is said.
         """
         kept = 0 if self.reserve is None else self.reserve()
-        batch = self.rollout.frames
-        for frames in (*self.stages, self.frames):
+        batch, length = self.rollout.frames, self.budget.frames
+        for frames in (*self.budget.stages, length):
             if frames not in self.ends:
                 whole = math.ceil((frames - self.before) / batch) * batch
                 updates = (whole - self.cases.steps - kept) // batch
                 self.ends[frames] = max(updates, self.updates + 1)
-        rest = self.frames - self.before - self.all_updates * batch - self.cases.steps - kept
-        if rest > REST * self.frames and not self.updates:
+        rest = length - self.before - self.all_updates * batch - self.cases.steps - kept
+        if rest > REST * length and not self.updates:
             say(
-                f"train: {rest:,} of {self.frames:,} frames stay unused, because they are no whole "
+                f"train: {rest:,} of {length:,} frames stay unused, because they are no whole "
                 f"batch of {batch:,}; take smaller batches (budget.steps) or more frames",
                 error=True,
             )
@@ -127,14 +134,13 @@ class Experiment(Stateful):
         Raises:
             UserError: if the checkpoint or the log is damaged, or belongs to another run.
         """
-        lengths = (self.frames, *self.stages)
-        known = go_on(self.folder, self.identity, lengths, self.load_state_dict)
+        known = checkpoint.go_on(self.owner, self.load_state_dict)
         self.metrics.truncate(self.updates + 1 if self.updates else 0)
         self.metrics.check_columns(self.curve.columns)
         where = f"after update {self.updates}"
         if not known:
             where = "from the beginning: there is no checkpoint yet"
-        say(f"{self.folder} continues {where}", error=True)
+        say(f"{self.owner.folder} continues {where}", error=True)
 
     def run(self, guide_return: float | None = None) -> list[dict[str, float]]:
         """Train to the end and return the rows of `metrics.csv`.
@@ -147,14 +153,16 @@ class Experiment(Stateful):
         Raises:
             UserError: for a NaN from the env, in the losses or in the weights.
         """
-        self.metrics.describe(self.identity)
+        self.metrics.describe(self.owner.identity)
         if not self.first:
             first = self._measure({})
             for sentence in start_test(first):
                 say(sentence, error=True)
             self.first = first | self._taken()
         self._plan()
-        read = [unravel_key(tuple(key)) for group in self.watch.values() for key in group.values()]
+        read = [
+            unravel_key(tuple(key)) for group in self.owner.watch.values() for key in group.values()
+        ]
         read += getattr(getattr(self.learner, "extensions", None), "keys", [])
         rest_guides(self.learner.policy, self.rollout.env, read)
         updates, frames = self.all_updates, self.rollout.frames
@@ -183,7 +191,7 @@ class Experiment(Stateful):
                     with decoration("the progress bar"):
                         self._show(bar, row, guide_return)
                     self._act(row)
-        checkpoint.save(self.learner.policy.state_dict(), weights_file(self.folder))
+        checkpoint.save(self.learner.policy.state_dict(), weights_file(self.owner.folder))
         return self.metrics.rows
 
     def update(self, progress: float) -> dict[str, float]:
@@ -210,7 +218,7 @@ class Experiment(Stateful):
     def _measure(self, row: Mapping[str, float]) -> dict[str, float]:
         """Return the numbers of the callbacks, NaN where they are not due."""
         numbers: dict[str, float] = {}
-        all_updates = self.ends.get(self.frames, -1)  # not known before the first update
+        all_updates = self.ends.get(self.budget.frames, -1)  # not known before the first update
         for callback in self.callbacks:
             if callback.due(self.updates, all_updates, row):
                 numbers |= callback.after_update(self.updates)
@@ -240,7 +248,9 @@ class Experiment(Stateful):
             row: of the log; empty before the first update.
         """
         update, updates = self.updates, self.all_updates
-        if row and (update % self.checkpoint_every == 0 or update == updates or STOP.requested):
+        if row and (
+            update % self.budget.checkpoint_every == 0 or update == updates or STOP.requested
+        ):
             self.save()
             if STOP.requested:
                 raise KeyboardInterrupt
@@ -277,10 +287,10 @@ class Experiment(Stateful):
             if not is_outside(error):
                 raise
             kept = ""
-            if (self.folder / checkpoint.NEWEST).exists():
+            if (self.owner.folder / checkpoint.NEWEST).exists():
                 kept = (
                     "; the last good checkpoint is kept: correct the cause and continue with "
-                    f"{self.resume_command}, or train again with other values"
+                    f"{self.owner.resume_command}, or train again with other values"
                 )
             raise UserError(f"{error}{kept}") from error
 
@@ -295,10 +305,10 @@ class Experiment(Stateful):
                 after["task_reward" if "task_reward" in after else "reward"].mean()
             ),
         }
-        for name, key in self.watch.get("episode", {}).items():
+        for name, key in self.owner.watch.get("episode", {}).items():
             ended = after[tuple(key)][done].float()
             row[f"train/{name}"] = float(ended.nanmean())
-        for name, key in self.watch.get("step", {}).items():
+        for name, key in self.owner.watch.get("step", {}).items():
             row[f"train/{name}"] = float(after[tuple(key)].float().nanmean())
         return row
 
@@ -306,14 +316,14 @@ class Experiment(Stateful):
         """Write the checkpoint; a NaN in it is a `UserError`."""
         state = self.state_dict()
         with self.resume_hint():
-            check_parameters(state["learner"], self.updates)
+            checkpoint.check_parameters(state["learner"], self.updates)
         self.metrics.flush()
-        checkpoint.save_newest(state, self.folder)
+        checkpoint.save_newest(state, self.owner.folder)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the rest of the run depends on."""
         return super().state_dict() | {
-            "identity": self.identity,
+            "identity": self.owner.identity,
             "calls": self.calls_before + guide_calls(self.rollout.env),
             "returns": list(self.returns),
             "torch_rng": torch.get_rng_state(),
@@ -333,40 +343,6 @@ class Experiment(Stateful):
             torch.cuda.set_rng_state_all(state["cuda_rng"])
 
 
-def go_on(
-    folder: Path,
-    identity: Mapping[str, Any],
-    lengths: Sequence[int],
-    load: Callable[[dict[str, Any]], object],
-) -> bool:
-    """Load the last intact checkpoint of a run; return whether there is one.
-
-    A run that was made longer has the checkpoint of the shorter one.
-
-    Args:
-        identity: of the run.
-        lengths: of the run, and earlier ones, in frames.
-        load: restores the state.
-
-    Raises:
-        UserError: if it is damaged, or belongs to a run with another configuration.
-    """
-    state = checkpoint.load_newest(folder)
-    if state is None:
-        return False
-    file = folder / checkpoint.NEWEST
-    with file_of_a_run(file, PUT_BACK):
-        saved, ours = dict(state["identity"]), dict(identity)
-        frames = saved.get("budget.frames")
-        if frames in lengths:
-            for each in (saved, ours):
-                each.pop("budget.frames", None)
-                each.pop("budget.stages", None)
-        check_same(saved, ours, f"{file} belongs to a run", PUT_BACK)
-        load(state)
-    return True
-
-
 def watched_keys(env: EnvBase, watch: Watch) -> list[NestedKey]:
     """Return the entries that `Experiment` needs in a rollout, besides those of the learner."""
     keys: list[NestedKey] = [("next", "done"), ("next", "reward"), ("next", "episode_reward")]
@@ -377,10 +353,39 @@ def watched_keys(env: EnvBase, watch: Watch) -> list[NestedKey]:
     return keys
 
 
-def check_parameters(state: Any, update: int, name: str = "learner") -> None:
-    """Raise a `UserError` if a tensor of a nested state holds NaN; bounds may be infinite."""
-    if isinstance(state, Mapping):
-        for key, value in state.items():
-            check_parameters(value, update, f"{name}/{key}")
-    elif isinstance(state, torch.Tensor) and state.is_floating_point() and state.isnan().any():
-        raise UserError(f"{name} is nan after update {update}")
+def _copy_of_init(folder: Path, init: Path) -> Path:
+    """Return a run's own copy of the policy that it begins with.
+
+    Args:
+        init: folder of the run whose policy that is.
+    """
+    copy = folder / INIT
+    if not copy.exists():
+        checkpoint.save(checkpoint.load(weights_file(Path(init))), copy)
+    return copy
+
+
+def _curve_of(run: Run, policy: TensorDictModuleBase) -> EvaluationCurve:
+    """Return the evaluation curve of a run; it has no sets where there are no such cases."""
+    sets = [*run.make_env.sizes] if EVALUATION in run.make_env.sizes else []
+    if run.delivery == "tested":  # an earlier policy is chosen by the test at the end
+        sets = [each for each in sets if each == EVALUATION]
+    return EvaluationCurve(
+        run.folder,
+        policy,
+        run.make_env,
+        sets,
+        watch=run.watch,
+        points=run.budget.points,
+        batches=run.budget.batches,
+    )
+
+
+def _say_units(env: EnvBase) -> None:
+    """Print the units in which an action that lacks bounds is normalised."""
+    if len(env.action_keys) != 1:
+        return
+    spec = env.full_action_spec[env.action_key]
+    units = given_units(env) or units_of(spec, len(env.batch_size))
+    if units is not None and units.assumed:
+        say(f"action: {'; '.join(units.assumed)}", error=True)

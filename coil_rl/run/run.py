@@ -30,7 +30,7 @@ from coil_rl.run.beside import Beside, Driver
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import Watch, guide_returns
 from coil_rl.run.delivery import guide_of
-from coil_rl.run.experiment import go_on
+from coil_rl.run.experiment import Experiment
 from coil_rl.run.folder import (
     CODE,
     CODE_BEFORE,
@@ -51,7 +51,6 @@ from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, try_out
 from coil_rl.run.reasons import SENTENCES, handed_over, next_step, start_test
 from coil_rl.run.shown import line_of, page_of
 from coil_rl.run.stopping import resume_command
-from coil_rl.run.training import training_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -426,8 +425,7 @@ class Run:
         Raises:
             UserError: if it differs from the one in the checkpoint.
         """
-        lengths = (self.budget.frames, *self.budget.stages)
-        go_on(self.folder, self.identity, lengths, lambda state: None)
+        checkpoint.go_on(self, lambda state: None)
 
     def finish(self, *, resumed: bool = False) -> float:
         """Train and evaluate in the folder, which is locked and holds the configuration."""
@@ -499,7 +497,7 @@ class Run:
         Args:
             before: frames that were taken before it.
         """
-        return training_of(self, before)
+        return Experiment(self, before)
 
     def _saved_guide_returns(self) -> dict[str, float]:
         """Return the mean return of each guide in the cases of the curve, measured once.

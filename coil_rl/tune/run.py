@@ -26,7 +26,6 @@ from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
 from coil_rl.run.curve import columns_of, evenly, means_of, measures
 from coil_rl.run.delivery import GUIDE, GuideActs
-from coil_rl.run.experiment import PUT_BACK, go_on
 from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.parts import TESTS
@@ -148,9 +147,7 @@ class TunedTraining:
 
     def resume(self) -> None:
         """Go on from the last intact checkpoint of the folder; without one begin anew."""
-        budget = self.tuned.budget
-        lengths = (budget.frames, *budget.stages)
-        go_on(self.folder, self.tuned.identity, lengths, self._load)
+        checkpoint.go_on(self.tuned, self._load)
         done = len(self.tuner.told)
         self.metrics.truncate(done + 1 if done else 0)
         say(f"{self.folder} continues after generation {done}", error=True)
@@ -270,7 +267,7 @@ def read_tuned(folder: Path, numbers: Sequence[Number]) -> Values | None:
     saved = record.TUNED.read(folder)
     if saved is None:
         return None
-    with file_of_a_run(folder / record.TUNED.name, PUT_BACK):
+    with file_of_a_run(folder / record.TUNED.name, checkpoint.PUT_BACK):
         values = {number.name: saved[number.name] for number in numbers}
         for number in numbers:
             low, high = min(number.low, number.own), max(number.high, number.own)

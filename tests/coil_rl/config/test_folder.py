@@ -17,7 +17,7 @@ import coil_rl
 from coil_rl.config import folder as folders
 from coil_rl.config.folder import CARD, CHECKSUMS, LARGEST, OLD_NAMES, renamed
 from coil_rl.errors import UserError
-from coil_rl.run.training import INIT
+from coil_rl.run.experiment import INIT
 
 PLACE = Path(folders.__file__).parents[1] / "policies"
 NAMES = coil_rl.pretrained_names()

@@ -11,7 +11,6 @@ from coil_rl.learners.anchor import hold_of
 from coil_rl.run.cases import TrainingCases, further_cases, guide_calls
 from coil_rl.run.delivery import GuideActs
 from coil_rl.run.parts import TESTS, TRAIN
-from coil_rl.run.training import training_of
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 pytest.importorskip("gymnasium.envs.classic_control")
@@ -212,7 +211,7 @@ def test_start_test_of_a_training_has_its_correlation(tmp_path):
     folder = f"run_dir={tmp_path}/run"
     config, _ = configured("env=pendulum", "training.noise_correlation=0.6", folder)
     run = assemble(config)
-    assert training_of(run, 0).cases.noise_correlation == run.noise_correlation == 0.6
+    assert run.training(0).cases.noise_correlation == run.noise_correlation == 0.6
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import pytest
 import torch
 from programs import read_csv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torchrl.envs import Compose, RewardSum, Transform, TransformedEnv
+from torchrl.envs import Transform
 from torchrl.record.loggers import TensorboardLogger
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -14,54 +14,50 @@ from coil_rl.guides import RandomGuide, SplineGuide, SplineMemoryGuide
 from coil_rl.learners import PPO
 from coil_rl.learners.anchor import Anchor
 from coil_rl.run import checkpoint
-from coil_rl.run.cases import TrainingCases
-from coil_rl.run.curve import EvaluationCurve
-from coil_rl.run.experiment import Experiment, watched_keys
 from coil_rl.run.metrics import Metrics
-from coil_rl.run.parts import EnvMaker
-from coil_rl.run.rollout import Rollout
-from coil_rl.run.stopping import STOP, resume_command
+from coil_rl.run.parts import TESTS, TRAIN, EnvMaker
+from coil_rl.run.run import Budget, Run
+from coil_rl.run.stopping import STOP
 from coil_rl.transforms import GuideActions
 
 WATCH = {"episode": {"crashed": ["info", "crashed"]}, "step": {"cone": ["info", "reward", "cone"]}}
 
 
-def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=(), anchor=None):
+def experiment(
+    folder, seed=0, frames=16 * 8 * 4, guide=SplineGuide, extra=(), anchor=None, identity=None
+):
+    def bare(rows, cases, count):
+        if cases == TRAIN:
+            return ConeTrackEnv(shipped_tracks("train"), 16, seed=seed)
+        options = {"rate": 6, "time_limit": 1}
+        if cases != TESTS:
+            options |= {"assignment": "cyclic"}
+        return ConeTrackEnv(shipped_tracks("train" if cases == TESTS else "test"), rows, **options)
+
+    def transforms(advice):
+        return [GuideActions({"guide": guide()})]
+
+    def disturb(cases):
+        return extra if cases == TRAIN else ()
+
+    def make_learner(env):
+        options = {"epochs": 2, "minibatches": 2, "anchor": anchor, "seed": seed}
+        return PPO(env, ["observation", "guide_action"], **options)
+
     torch.manual_seed(seed)
-    env = ConeTrackEnv(shipped_tracks("train"), 16, seed=seed)
-    env = TransformedEnv(
-        env, Compose(GuideActions({"guide": guide or SplineGuide()}), *extra, RewardSum())
-    )
-    options = {"epochs": 2, "minibatches": 2, "anchor": anchor, "seed": seed}
-    learner = PPO(env, ["observation", "guide_action"], **options)
-    rollout = Rollout(env, learner.policy, 8, [*learner.keys, *watched_keys(env, WATCH)])
     folder.mkdir(exist_ok=True)
-    sizes = {"evaluation": 3, "selection": 3}
     make_env = EnvMaker(
-        cases, transforms=lambda advice: [GuideActions({"guide": SplineGuide()})], sizes=sizes
+        bare,
+        disturb=disturb,
+        transforms=transforms,
+        sizes=dict.fromkeys(("evaluation", "selection"), 3),
     )
-    curve = EvaluationCurve(folder, learner.policy, make_env, sizes, points=4, batches=2)
-    return Experiment(
-        learner,
-        rollout,
-        frames,
-        folder,
-        watch=WATCH,
-        checkpoint_every=2,
-        curve=curve,
-        callbacks=learner.callbacks(tests := TrainingCases(of_tests, frames, seed)),
-        cases=tests,
-        resume_command=resume_command(folder, []),
+    budget = Budget(frames, steps=8, points=4, batches=2, checkpoint_every=2)
+    options = {"settings": {"label": "ppo"}, "identity": identity or {"label": "ppo"}}
+    run = Run(
+        folder, make_env, make_learner, None, budget, label="ppo", seed=seed, watch=WATCH, **options
     )
-
-
-def of_tests(rows):
-    env = ConeTrackEnv(shipped_tracks("train"), rows, rate=6, time_limit=1)
-    return TransformedEnv(env, Compose(GuideActions({"guide": SplineGuide()}), RewardSum()))
-
-
-def cases(rows, cases, count):
-    return ConeTrackEnv(shipped_tracks("test"), rows, assignment="cyclic", rate=6, time_limit=1)
+    return run.training(0)
 
 
 def contents(folder):
@@ -125,7 +121,7 @@ def test_stopped_and_resumed_run_ends_with_the_same_files(
     tmp_path, guide, place, last, anchor, capsys
 ):
     def make(name, seed=0):
-        options = {"guide": guide(), "anchor": anchor, "frames": 16 * 8 * 5}
+        options = {"guide": guide, "anchor": anchor, "frames": 16 * 8 * 5}
         return experiment(tmp_path / name, seed=seed, **options)
 
     rows = make("whole").run()
@@ -179,9 +175,7 @@ def test_learner_forgets_episodes_that_a_resumed_env_cannot_go_on_with(tmp_path,
 
 def test_checkpoint_of_another_run_is_refused(tmp_path):
     def resumed(**identity):
-        run = experiment(tmp_path, frames=16 * 8)
-        run.identity = identity
-        run.resume()
+        experiment(tmp_path, frames=16 * 8, identity=identity).resume()
 
     checkpoint.save_newest({"policy": 1}, tmp_path)
     with pytest.raises(UserError, match=r"checkpoint\.pt is damaged \(it lacks identity\); put"):
