@@ -25,10 +25,10 @@ from torchrl.envs import EnvBase, ExplorationType, exploration_type, set_explora
 
 from coil_rl.learners.critics import Critics
 from coil_rl.learners.encoders import Mlp
-from coil_rl.learners.n_step import discounted
+from coil_rl.learners.gradient import Weights
 from coil_rl.learners.policy import ByKey, Entries, Policy, next_of
+from coil_rl.learners.rewards import discounted
 from coil_rl.learners.sac import SAC, SACSettings
-from coil_rl.learners.weights import Weights
 from coil_rl.ranges import NonNegative, checked
 from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.transforms.guide_transform import check_advised

@@ -13,7 +13,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.learners.advantages import standardise as standardised
+from coil_rl.learners.minibatches import standardise as standardised
 from coil_rl.learners.policy import Entries
 from coil_rl.learners.ppo import PPO, OnPolicySettings
 from coil_rl.ranges import NonNegative, Share, checked

@@ -15,39 +15,7 @@ from coil_rl.learners.networks import Inputs, action_shape
 from coil_rl.learners.policy import read_through
 
 Norm = Literal["none", "layer", "batch"]
-
-
-class BatchNorm(nn.Module):
-    """Normalisation of the numbers of several networks over a batch, [critics, N, width].
-
-    Outside of the learning it normalises by running statistics of the batches that it has learned.
-
-    Args:
-        critics: number of networks.
-        width: numbers of each.
-        momentum: share of a batch in the running statistics.
-    """
-
-    def __init__(
-        self, critics: int, width: int, device: torch.device | None, momentum: float = 0.01
-    ) -> None:
-        super().__init__()
-        self.momentum = momentum
-        shape = (critics, 1, width)
-        self.gain = nn.Parameter(torch.ones(shape, device=device))
-        self.shift = nn.Parameter(torch.zeros(shape, device=device))
-        self.mean: Tensor = nn.Buffer(torch.zeros(shape, device=device))
-        self.variance: Tensor = nn.Buffer(torch.ones(shape, device=device))
-
-    def forward(self, x: Tensor, train: bool) -> Tensor:
-        """Normalise numbers; with `train` by those of this batch, which are learned."""
-        mean, variance = self.mean, self.variance
-        if train:
-            variance, mean = torch.var_mean(x, 1, keepdim=True, correction=0)
-            with torch.no_grad():
-                self.mean.lerp_(mean, self.momentum)
-                self.variance.lerp_(variance, self.momentum)
-        return (x - mean) * (variance + 1e-3).rsqrt() * self.gain + self.shift
+MOMENTUM = 0.01  # share of a batch in the running statistics
 
 
 class LayerNorm(nn.Module):
@@ -66,6 +34,28 @@ class LayerNorm(nn.Module):
     def forward(self, x: Tensor, train: bool) -> Tensor:
         """Normalise numbers, with or without `train`."""
         return torch.addcmul(self.shift, F.layer_norm(x, x.shape[-1:]), self.gain)
+
+
+class BatchNorm(LayerNorm):
+    """Normalisation of the numbers of several networks over a batch, [critics, N, width].
+
+    Outside of the learning it normalises by running statistics of the batches that it has learned.
+    """
+
+    def __init__(self, critics: int, width: int, device: torch.device | None) -> None:
+        super().__init__(critics, width, device)
+        self.mean: Tensor = nn.Buffer(torch.zeros_like(self.gain))
+        self.variance: Tensor = nn.Buffer(torch.ones_like(self.gain))
+
+    def forward(self, x: Tensor, train: bool) -> Tensor:
+        """Normalise numbers; with `train` by those of this batch, which are learned."""
+        mean, variance = self.mean, self.variance
+        if train:
+            variance, mean = torch.var_mean(x, 1, keepdim=True, correction=0)
+            with torch.no_grad():
+                self.mean.lerp_(mean, MOMENTUM)
+                self.variance.lerp_(variance, MOMENTUM)
+        return (x - mean) * (variance + 1e-3).rsqrt() * self.gain + self.shift
 
 
 class Layer(nn.Module):

@@ -20,10 +20,10 @@ from torchrl.modules import EGreedyModule, QValueModule
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import AnchoredInputs, AnchoredValues, hold_of
 from coil_rl.learners.encoders import Mlp, ObservationNetwork
-from coil_rl.learners.n_step import discounted
+from coil_rl.learners.gradient import Weights
 from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerStep
 from coil_rl.learners.policy import Entries, next_of, read_through
-from coil_rl.learners.weights import Weights
+from coil_rl.learners.rewards import discounted
 from coil_rl.ranges import NonNegative, Positive, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 

@@ -1,4 +1,4 @@
-"""How a batch of rollouts is divided for the steps of the optimiser, and into who acted."""
+"""How a batch of rollouts is made ready for an update: advantages, minibatches, and who acted."""
 
 from collections.abc import Iterator, Sequence
 from typing import ClassVar
@@ -6,12 +6,55 @@ from typing import ClassVar
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
+from torchrl.objectives.value import GAE
 
 from coil_rl.learners.learner import Stateful
 from coil_rl.learners.networks import REMEMBERED
 from coil_rl.learners.policy import Entries
+
+
+@torch.no_grad()
+def add_advantages(
+    batch: TensorDictBase, critic: TensorDictModuleBase, gamma: float, gae_lambda: float
+) -> TensorDictBase:
+    """Write `advantage` and `value_target` [B, T, 1] into a batch [B, T] of rollouts.
+
+    It is generalised advantage estimation (Schulman et al. 2016) with one critic evaluation per
+    state. The state after a step is the state before the next step, unless the episode ended. So
+    the critic evaluates each state once, and in addition the last states of the batch and those of
+    truncated episodes.
+
+    Args:
+        critic: writes `state_value`.
+        gae_lambda: weight of later steps, in [0, 1]; 0: one step and the value after it; 1: all
+            rewards to the end of the episode.
+    """
+
+    def values(states: TensorDictBase) -> Tensor:
+        return critic(states.select(*critic.in_keys))["state_value"]
+
+    after = batch["next"]
+    value = values(batch)
+    next_value = torch.cat([value[..., 1:, :], values(after[..., -1:])], -2)
+    truncated = (after["done"] & ~after["terminated"]).squeeze(-1)
+    next_value[truncated] = values(after.select(*critic.in_keys)[truncated])
+    batch["state_value"], batch["next", "state_value"] = value, next_value
+    estimate = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, vectorized=False)
+    return estimate(batch)
+
+
+def standardise(advantage: Tensor, least: float = 1e-6) -> Tensor:
+    """Scale to mean 0 and standard deviation 1 over all entries.
+
+    Args:
+        advantage: of any shape.
+        least: smaller standard deviations are taken as this one.
+    """
+    return (advantage - advantage.mean()) / advantage.std().clamp_min(least)
+
 
 AGENT_ACTS = "agent_acts"  # entry [*batch, 1]: whether the agent acted in a step
 

@@ -38,9 +38,17 @@ from coil_rl.learners.encoders import (
     Shapes,
     entry_specs,
 )
-from coil_rl.learners.heads import ChoicesHead, GaussianHead, GlobalScaleHead
 from coil_rl.learners.normaliser import Normaliser
-from coil_rl.learners.policy import ByKey, ClippedSample, Policy, Sample, read_through
+from coil_rl.learners.policy import (
+    ByKey,
+    ChoicesHead,
+    ClippedSample,
+    GaussianHead,
+    GlobalScaleHead,
+    Policy,
+    Sample,
+    read_through,
+)
 from coil_rl.transforms.action_space import ActionSpace, choices_of
 from coil_rl.transforms.normalised_action import units_of
 

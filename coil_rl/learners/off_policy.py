@@ -17,14 +17,12 @@ from coil_rl.learners import networks
 from coil_rl.learners.anchor import Anchor, start_tests
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension, Extensions
-from coil_rl.learners.gradient import GradientStep, means
+from coil_rl.learners.gradient import GradientStep, Weights, means
 from coil_rl.learners.learner import Callback, Cases, Learner, Stateful
 from coil_rl.learners.minibatches import AGENT_ACTS, guide_may_act
-from coil_rl.learners.n_step import NStep
 from coil_rl.learners.normaliser import RawObservations, normaliser
 from coil_rl.learners.policy import Entries, next_of
-from coil_rl.learners.reward_scale import RewardScale
-from coil_rl.learners.weights import Weights
+from coil_rl.learners.rewards import NStep, RewardScale
 from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Seed, Share, checked
 from coil_rl.schedules import Schedule, schedule
 from coil_rl.transforms.action_space import nested_key

@@ -5,11 +5,14 @@ With a small network the searches of a TensorDict take longer than the arithmeti
 updates use the latter.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
+import torch
 from tensordict import NestedKey, unravel_key
 from tensordict.nn import (
+    NormalParamExtractor,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
@@ -18,7 +21,8 @@ from tensordict.nn import (
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from coil_rl.learners.density import Density, Normal
+from coil_rl.learners.density import Density, Normal, padding
+from coil_rl.learners.encoders import ObservationNetwork
 
 UNCLIPPED = "unclipped_action"  # sample of a policy whose actions are clipped
 NOISE = "exploration_noise"  # standard normal numbers that a rollout may write
@@ -172,3 +176,79 @@ class Policy(ProbabilisticTensorDictSequential):
         for module in before:
             entries = module(entries)
         return last.get_dist(entries)
+
+
+class GlobalScaleHead(nn.Module):
+    """Normal distribution with a mean from a network, and one standard deviation for all states.
+
+    Args:
+        network: gives the mean of each number of an action.
+        event: shape of an action.
+        scale: initial standard deviation.
+    """
+
+    outputs = 1  # of the network for each number of an action
+
+    def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
+        super().__init__()
+        self.network, self.event = network, event
+        self.log_scale = nn.Parameter(
+            torch.full(event, math.log(scale), device=next(network.parameters()).device)
+        )
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation, [*batch, *event] each."""
+        loc = shaped(self.network(*inputs), self.event)
+        return loc, self.log_scale.exp().to(loc.dtype).expand_as(loc)
+
+
+class GaussianHead(nn.Module):
+    """Normal distribution with mean and standard deviation from a network.
+
+    Args:
+        network: gives the means of the numbers of an action, then as many outputs that become
+            standard deviations.
+        event: shape of an action.
+        scale: standard deviation where the network gives 0.
+    """
+
+    outputs = 2
+
+    def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
+        super().__init__()
+        self.network, self.event = network, event
+        self.split = NormalParamExtractor(f"biased_softplus_{scale}", scale_lb=1e-3)
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation, [*batch, *event] each."""
+        loc, scale = self.split(self.network(*inputs))
+        return shaped(loc, self.event), shaped(scale, self.event)
+
+
+class ChoicesHead(nn.Module):
+    """Logits of several choices at once from a network.
+
+    They are padded to the longest choice with a number so low that its probability is exactly 0. It
+    is finite, because a number that is not in recorded data is a fault.
+
+    Args:
+        network: gives logits for all choices, of each as many as the longest one has.
+        event: shape of an action, which is one index for each choice.
+        options: number of options of each choice, of shape `event`.
+    """
+
+    def __init__(self, network: ObservationNetwork, event: torch.Size, options: Tensor) -> None:
+        super().__init__()
+        self.network, self.event = network, event
+        longest = torch.arange(int(options.max()), device=options.device)
+        self.valid: Tensor = nn.Buffer(longest < options.unsqueeze(-1), persistent=False)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Return the logits, [*batch, *event, n]."""
+        logits = shaped(self.network(*inputs), self.valid.shape)
+        return logits.masked_fill(~self.valid, padding(logits.dtype))
+
+
+def shaped(vectors: Tensor, event: torch.Size) -> Tensor:
+    """Return vectors [*batch, n] as [*batch, *event]."""
+    return vectors.reshape(*vectors.shape[:-1], *event)

@@ -19,7 +19,6 @@ from torch.nn import functional as F
 from torchrl.envs import EnvBase
 
 from coil_rl.learners import networks
-from coil_rl.learners.advantages import Advantages, standardise
 from coil_rl.learners.anchor import Anchor, start_tests
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension, Extensions, SummedRewards
@@ -29,13 +28,15 @@ from coil_rl.learners.minibatches import (
     AGENT_ACTS,
     Minibatches,
     RowMinibatches,
+    add_advantages,
     guide_may_act,
     of_agent,
+    standardise,
 )
 from coil_rl.learners.normaliser import RawObservations, RunningStatistics, normaliser
 from coil_rl.learners.policy import UNCLIPPED, Entries, Policy, by_key
 from coil_rl.learners.ppo_report import OF_POLICY, SEEN, report_of
-from coil_rl.learners.reward_scale import RewardScale
+from coil_rl.learners.rewards import RewardScale
 from coil_rl.ranges import Count, NonNegative, Positive, Seed, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.action_space import nested_key
@@ -182,7 +183,7 @@ class PPO(Stateful, Learner):
         statistics = [RewardScale(gamma)] if scale_rewards else []
         self.extensions = self._extensions(env, in_keys, statistics, auxiliary)
 
-        self.advantage = Advantages(self.critic, gamma, gae_lambda)
+        self.gamma, self.gae_lambda = gamma, gae_lambda
         # As TorchRL, in float32.
         self.clip_bounds = torch.tensor([-clip, clip]).log1p().tolist()
         self.critic_coefficient, self.has_bonus = critic, self.entropy(0) > 0
@@ -276,7 +277,7 @@ class PPO(Stateful, Learner):
         """Apply the schedules and compute advantages; returns what minibatches are drawn from."""
         self.gradient.begin(progress)
         self.extensions.prepare(batch)
-        self.advantage(batch)
+        add_advantages(batch, self.critic, self.gamma, self.gae_lambda)
         rows = self.sampler.rows(batch, self.minibatch_keys)
         rows["action"] = rows.pop(self.sample_key)
         if self.first_inputs is not None:

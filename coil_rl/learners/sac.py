@@ -29,11 +29,10 @@ from coil_rl.learners import networks
 from coil_rl.learners.critics import Critics, Norm
 from coil_rl.learners.encoders import Mlp
 from coil_rl.learners.extension import Extension
-from coil_rl.learners.heads import GaussianHead
-from coil_rl.learners.n_step import discounted
+from coil_rl.learners.gradient import Weights
 from coil_rl.learners.off_policy import OffPolicy, ReplaySettings, UpdatesPerStep
-from coil_rl.learners.policy import ByKey, Entries, Policy, next_of
-from coil_rl.learners.weights import Weights
+from coil_rl.learners.policy import ByKey, Entries, GaussianHead, Policy, next_of
+from coil_rl.learners.rewards import discounted
 from coil_rl.ranges import Interval, NonNegative, Positive, Share, checked
 from coil_rl.schedules import Schedule
 

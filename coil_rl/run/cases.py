@@ -15,9 +15,9 @@ from coil_rl.learners.learner import Stateful
 from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, episodes
-from coil_rl.run.exploration import exploring
 from coil_rl.run.parts import SOME_ROWS
 from coil_rl.run.policy_batch import Acting, OnRows, traced
+from coil_rl.run.rollout import exploring
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.chain import memory_keys
 from coil_rl.transforms.guide_transform import SeededGenerator
@@ -114,8 +114,6 @@ class TrainingCases(Stateful):
 
     def _build(self, rows: int) -> EnvBase:
         """Return the env with that many rows; it is made unless it has them."""
-        if rows == 0:
-            raise RuntimeError("there are no cases yet; call renew first")
         if self.env is None or self.env.batch_size.numel() != rows:
             with torch.random.fork_rng():
                 self.env = self.build(rows)

@@ -140,10 +140,7 @@ class Totals:
             after = after.copy().update({"reward": after["task_reward"]})
         self.steps = self.steps.to(running.device) + running.long()
         entries = [after[each.entry].double().reshape(len(running), -1) for each in measures]
-        if all(entry.shape[1] == 1 for entry in entries):
-            values = torch.stack(entries).sum(-1)
-        else:
-            values = torch.stack([entry.sum(-1) for entry in entries])
+        values = torch.stack([entry.sum(-1) for entry in entries])
         if not self.values.numel():
             self._begin(values)
         mask = running & ((values != 0) | self.with_zeros) & ~(values.isnan() & self.without_nan)

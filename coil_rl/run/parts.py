@@ -8,7 +8,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Protocol
 
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import (
@@ -48,11 +47,9 @@ WRITTEN = {
 }
 
 
-class BareEnv(Protocol):
-    """Maker of an env without the transforms of a method."""
-
-    def __call__(self, rows: int | None, cases: str, count: int | None) -> EnvBase:
-        """Return an env of some rows in a set of cases; arguments as for `EnvMaker`."""
+# Makes an env without the transforms of a method, for the arguments `rows`, `cases` and `count` of
+# `EnvMaker`.
+BareEnv = Callable[[int | None, str, int | None], EnvBase]
 
 
 @dataclass(eq=False)

@@ -48,8 +48,7 @@ from coil_rl.run.folder import (
 )
 from coil_rl.run.judge import Judgement, Trial, judge, report_outcome
 from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, try_out
-from coil_rl.run.reasons import SENTENCES, handed_over, next_step, start_test
-from coil_rl.run.shown import line_of, page_of
+from coil_rl.run.reasons import SENTENCES, handed_over, line_of, next_step, page_of, start_test
 from coil_rl.run.stopping import resume_command
 
 if TYPE_CHECKING:

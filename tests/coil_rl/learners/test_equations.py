@@ -7,6 +7,7 @@ import torch
 import worlds
 
 from coil_rl.learners import A2C, TRPO, Reinforce
+from coil_rl.learners.minibatches import add_advantages
 from coil_rl.run.rollout import Rollout
 
 GAMMA, LAMBDA = 0.9, 0.8
@@ -59,7 +60,7 @@ def backwards(learner, batch, decay):
 
 
 def losses_of(learner, batch):
-    learner.advantage(batch)
+    add_advantages(batch, learner.critic, GAMMA, learner.gae_lambda)
     losses = learner.losses(batch.select(*learner.minibatch_keys).reshape(-1))
     return losses["loss_objective"].detach(), losses["loss_critic"].detach()
 
@@ -91,7 +92,7 @@ def test_equations_67_and_76(kind, decay, weight, options):
 def test_equations_89_and_90():
     """The metrics of a step: mean of ratio times advantage, and divergence of the distributions."""
     learner, batch = make(TRPO, gae_lambda=LAMBDA, max_kl=0.05)
-    learner.advantage(batch)
+    add_advantages(batch, learner.critic, GAMMA, learner.gae_lambda)
     rows = batch.select(*learner.minibatch_keys).reshape(-1)
     with torch.no_grad():
         mean, scale = learner.policy.module[0].module(rows["observation"])

@@ -10,9 +10,9 @@ from tensordict import TensorDict
 from torchrl.envs import PendulumEnv
 
 from coil_rl.learners import DQN, SAC, Mlp
-from coil_rl.learners.n_step import NStep, discounted
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.learners.policy import Entries
+from coil_rl.learners.rewards import NStep, discounted
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import DiscreteActions, GradualResidual, JumpStart, MixedAction, Takeover
 

@@ -13,7 +13,7 @@ from torchrl.objectives.value import GAE
 from coil_rl.envs import ConeTrackEnv
 from coil_rl.guides import RandomGuide
 from coil_rl.learners import A2C, PPO, TRPO, Reinforce
-from coil_rl.learners.advantages import Advantages
+from coil_rl.learners.minibatches import add_advantages
 from coil_rl.learners.networks import critic
 from coil_rl.learners.policy import Entries
 from coil_rl.run.rollout import Rollout
@@ -107,7 +107,7 @@ def test_advantages_equal_those_of_torchrl_with_two_evaluations_per_state(ring):
     assert terminated.any()
     assert (done & ~terminated).any()
     values = critic(env, ["observation"])
-    ours = Advantages(values, 0.98, 0.9)(batch.clone())
+    ours = add_advantages(batch.clone(), values, 0.98, 0.9)
     with torch.no_grad():
         expected = GAE(gamma=0.98, lmbda=0.9, value_network=values)(batch.clone())
     for key in ("advantage", "value_target", "state_value"):

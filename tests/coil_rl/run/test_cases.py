@@ -81,12 +81,6 @@ def test_comparison_leaves_policy_and_random_numbers_alone():
     assert not torch.equal(cases.returns(learner.policy), sampled)
 
 
-def test_no_case_without_renew():
-    cases, learner = built(*SHORT)
-    with pytest.raises(RuntimeError, match="call renew"):
-        cases.returns(learner.policy)
-
-
 @pytest.mark.parametrize("action", ["continuous", "choices"])
 def test_first_policy_has_the_returns_of_its_guide(action):
     cases, learner = built(*SHORT, f"action={action}")

@@ -241,7 +241,7 @@ def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, 
     ours, theirs = (checkpoint.load(tmp_path / name / "checkpoint.pt") for name in ("run", "good"))
     assert ours["updates"] == theirs["updates"] == 2
     assert torch.equal(ours["rollout"]["env"]["pose"], theirs["rollout"]["env"]["pose"])
-    corrected = experiment(tmp_path / "run", seed=9)
+    corrected = experiment(tmp_path / "run", seed=9, extra=[WriteNaN(key, 0, 5)])
     corrected.resume()
     corrected.run()
 

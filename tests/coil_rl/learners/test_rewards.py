@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from coil_rl.learners import DQN, PPO, SAC, TRPO
 from coil_rl.learners.normaliser import Moments
-from coil_rl.learners.reward_scale import RewardScale
+from coil_rl.learners.rewards import RewardScale
 
 
 def batch_of(rewards, ended):
