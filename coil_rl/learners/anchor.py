@@ -251,10 +251,7 @@ class AnchoredValues(nn.Module):
 
 def hold_of(policy: nn.Module) -> Hold | None:
     """Return the weights of an anchored policy; None for another policy."""
-    for module in policy.modules():
-        if isinstance(module, Hold):
-            return module
-    return None
+    return next((part for part in policy.modules() if isinstance(part, Hold)), None)
 
 
 def rest_guides(policy: nn.Module, env: EnvBase, others: Sequence[NestedKey]) -> None:

@@ -199,11 +199,8 @@ class Moments(nn.Module):
 
 def advice_keys(env: EnvBase) -> set[NestedKey]:
     """Return the entries of an env that hold advice."""
-    keys: set[NestedKey] = set()
-    for module in env.modules():
-        if isinstance(module, GuideActions):
-            keys |= set(module.out_keys)
-    return keys
+    advised = [part.out_keys for part in env.modules() if isinstance(part, GuideActions)]
+    return set().union(*advised)
 
 
 def unmeasured(env: EnvBase, keys: Sequence[NestedKey]) -> dict[NestedKey, str]:
@@ -270,14 +267,14 @@ class RawObservations(Extension):
     ) -> None:
         others = unmeasured(env, in_keys)
         self.images = [key for key, why in others.items() if why == PICTURE]
-        decide: dict[NestedKey, Any] = {}
+        looked_at = [key for key in in_keys if key not in others or key in self.images]
+        # Which moments decide; None: the entry stays as it is.
+        self.each: dict[NestedKey, Any] = dict.fromkeys(looked_at)
         if normaliser is not None:
-            decide = dict(zip(normaliser.in_keys, normaliser.moments, strict=True))
-        self.each: dict[NestedKey, Moments | None] = {}  # which decide; None: it stays as it is
-        for key in in_keys:
-            is_looked_at = key not in decide or decide[key].used is not None
-            if is_looked_at and (key not in others or key in self.images):
-                self.each[key] = decide.get(key)
+            self.each |= zip(normaliser.in_keys, normaliser.moments, strict=True)
+        self.each = {
+            key: own for key, own in self.each.items() if own is None or own.used is not None
+        }
         self.batch_dims, self.count = len(env.batch_size), 0
 
     def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:

@@ -338,7 +338,7 @@ class OffPolicy(Stateful, Learner):
         entries = Entries(drawn.items(True, True))
         reward = ("next", "reward")
         if self.reward_scale is not None:
-            entries[reward] = self.reward_scale.scaled(entries[reward])
+            entries[reward] = entries[reward] / self.reward_scale.scale
         if self.inputs is not None:
             after = self.inputs(next_of(entries))
             entries = self.inputs(entries)

@@ -34,25 +34,15 @@ def of_minibatches(
 ) -> dict[str, Tensor]:
     """Return what is reported of some minibatches [S, N, 1], with one number for each."""
     share = (log_ratio.clamp(*clip) != log_ratio).to(log_ratio.dtype).mean((-2, -1))
-    ratio = log_ratio.exp()
+    ratio, log_weights = log_ratio.exp(), log_ratio.squeeze(-1)
+    unexplained = torch.var(target - value, correction=0, dim=-2)
+    variance = torch.var(target, correction=0, dim=-2) + torch.finfo(target.dtype).eps
+    effective_size = (2 * log_weights.logsumexp(-1) - (2 * log_weights).logsumexp(-1)).exp()
     return {
         "clip_fraction": share,
         "kl_approx": (-log_ratio).mean((-2, -1)),
-        "explained_variance": explained_variance(target, value),
-        "ESS": effective_share(log_ratio.squeeze(-1)),
+        "explained_variance": 1.0 - unexplained / variance,
+        "ESS": effective_size / log_weights.shape[-1],
         "max_ratio": ratio.amax((-2, -1)),
         "mean_ratio": ratio.mean((-2, -1)),
     }
-
-
-def explained_variance(target: Tensor, value: Tensor) -> Tensor:
-    """Return the share of the variance of targets [..., N, 1] that values explain, [..., 1]."""
-    unexplained = torch.var(target - value, correction=0, dim=-2)
-    variance = torch.var(target, correction=0, dim=-2) + torch.finfo(target.dtype).eps
-    return 1.0 - unexplained / variance
-
-
-def effective_share(log_ratio: Tensor) -> Tensor:
-    """Return the effective sample size as a share of all N, [...] from log-weights [..., N]."""
-    size = (2 * log_ratio.logsumexp(-1) - (2 * log_ratio).logsumexp(-1)).exp()
-    return size / log_ratio.shape[-1]

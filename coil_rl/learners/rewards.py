@@ -62,15 +62,11 @@ class RewardScale(Extension):
         self.learn(episode)
         self.running = running
 
-    def scaled(self, rewards: Tensor) -> Tensor:
-        """Return rewards of any shape, divided by the scale."""
-        return rewards / self.scale
-
     def prepare(self, batch: TensorDictBase) -> None:
         """Learn from a batch [B, T], and divide its rewards until the end of the update."""
         self.learn(batch)
         self.given = batch["next", "reward"]
-        batch["next", "reward"] = self.scaled(self.given)
+        batch["next", "reward"] = self.given / self.scale
 
     def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Put the rewards back, and return what they were divided by, `reward_scale`."""

@@ -131,27 +131,24 @@ class TrainingCases(Stateful):
             sampled: whether each samples its actions, as in training; None: none does.
         """
         sampled = [False] * len(policies) if sampled is None else sampled
-        pairs = list(zip(policies, sampled, strict=True))
-        if len(pairs) > 1 and self._can_act_beside(policies):
-            env = self.env_of(len(pairs))
+        noise = [self.noise_correlation if samples else 0.0 for samples in sampled]
+        each, parts = list(zip(policies, sampled, noise, strict=True)), len(policies)
+        if parts > 1 and self._can_act_beside(policies):
+            env = self.env_of(parts)
             beside = [
-                Acting(exploring(traced(policy), env, self._noise(samples), len(pairs)), samples)
-                for policy, samples in pairs
+                Acting(exploring(traced(policy), env, correlation, parts), samples)
+                for policy, samples, correlation in each
             ]
             totals = self._acted(env, OnRows(beside))
             self.taken = [int(part.sum()) for part in totals.steps.split(self.count)]
             return list(totals.results()["return"].split(self.count))
         env = self.env_of(1)
         alone = [
-            self._acted(env, exploring(policy, env, self._noise(samples)), sampled=samples)
-            for policy, samples in pairs
+            self._acted(env, exploring(policy, env, correlation), sampled=samples)
+            for policy, samples, correlation in each
         ]
         self.taken = [int(totals.steps.sum()) for totals in alone]
         return [totals.results()["return"] for totals in alone]
-
-    def _noise(self, samples: bool) -> float:
-        """Return the correlation of the noise of a policy that may sample its actions."""
-        return self.noise_correlation if samples else 0.0
 
     def _can_act_beside(self, policies: Sequence[TensorDictModuleBase]) -> bool:
         """Return whether policies can act side by side in one env."""

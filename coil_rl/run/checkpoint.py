@@ -137,14 +137,14 @@ def load_newest(folder: Path) -> Any | None:
     return state
 
 
-def go_on(run: Run, load: Callable[[dict[str, Any]], object]) -> bool:
+def go_on(run: Run, load: Callable[[dict[str, Any]], object] = lambda state: None) -> bool:
     """Load the last intact checkpoint of a run; return whether there is one.
 
     A run that was made longer has the checkpoint of the shorter one.
 
     Args:
         run: that goes on.
-        load: restores the state.
+        load: restores the state; by default the configuration is checked only.
 
     Raises:
         UserError: if it is damaged, or belongs to a run with another configuration.

@@ -221,9 +221,9 @@ class Delivery:
         An earlier policy is left out where the frames do not allow for it.
         """
         returns, reserve = dict[str, Tensor](), self._affordable()
-        policies = {
-            name: policy_of(state, self.learner, self.env) for name, state in candidates.items()
-        }
+        policies, file = dict[str, TensorDictModuleBase](), weights_file(self.folder)
+        for name, state in candidates.items():
+            policies[name] = policy_of(state, copy.deepcopy(self.learner.policy), self.env, file)
         earlier = policies.pop("earlier", None)
         self.cases.taught = None  # what is handed over is the policy that was tested
         self.cases.begin()
@@ -277,20 +277,21 @@ class Delivery:
         record.DELIVERY.write(self.folder, report)
 
 
-def policy_of(state: dict[str, Any], learner: Learner, env: EnvBase) -> TensorDictModuleBase:
-    """Return the policy that a file of weights stands for: a guide, or a copy of the learner's.
+def policy_of(
+    state: Mapping[str, Any], policy: TensorDictModuleBase, env: EnvBase, path: Path
+) -> TensorDictModuleBase:
+    """Return the policy that a file of weights stands for: a guide, or `policy` with them.
 
     Args:
-        learner: has the policy, which stays as it is.
+        state: what the file holds.
+        policy: gets the weights.
+        env: with the transforms of the run.
+        path: of the file, for messages.
+
+    Raises:
+        UserError: if the weights do not fit the policy, or are not finite.
     """
-    guide = guide_of(state, env)
-    if guide is not None:
-        return guide
-    policy = copy.deepcopy(learner.policy)
-    policy.load_state_dict(state)
+    if GUIDE in state:
+        return GuideActs(env, int(state[GUIDE]))
+    checkpoint.put_weights(policy, state, path)
     return policy
-
-
-def guide_of(state: Mapping[str, Any], env: EnvBase) -> GuideActs | None:
-    """Return the guide that a file of weights stands for; None for a file of a policy."""
-    return GuideActs(env, int(state[GUIDE])) if GUIDE in state else None

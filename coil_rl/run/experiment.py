@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from coil_rl.run.run import Run
 
 REST = 0.1  # of the frames: a larger one that stays unused is said
-INIT = "init.pt"  # the policy that a run began from
+INIT = "init.pt"  # a copy of the policy that a run began from
 
 
 class Experiment(Stateful):
@@ -75,7 +75,9 @@ class Experiment(Stateful):
             compile_steps(env)
         learner = self.learner = run.require_agent()(env)
         if run.init is not None:
-            init = _copy_of_init(run.folder, run.init)
+            init = run.folder / INIT
+            if not init.exists():
+                checkpoint.save(checkpoint.load(weights_file(Path(run.init))), init)
             checkpoint.put_weights(learner.policy, checkpoint.load(init, run.device), init)
         keys = [*learner.keys, *watched_keys(env, run.watch)]
         self.rollout = Rollout(env, learner.policy, run.budget.steps, keys, run.noise_correlation)
@@ -351,18 +353,6 @@ def watched_keys(env: EnvBase, watch: Watch) -> list[NestedKey]:
     for group in watch.values():
         keys += [("next", *key) for key in group.values()]
     return keys
-
-
-def _copy_of_init(folder: Path, init: Path) -> Path:
-    """Return a run's own copy of the policy that it begins with.
-
-    Args:
-        init: folder of the run whose policy that is.
-    """
-    copy = folder / INIT
-    if not copy.exists():
-        checkpoint.save(checkpoint.load(weights_file(Path(init))), copy)
-    return copy
 
 
 def _curve_of(run: Run, policy: TensorDictModuleBase) -> EvaluationCurve:

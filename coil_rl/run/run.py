@@ -29,7 +29,7 @@ from coil_rl.run import checkpoint
 from coil_rl.run.beside import Beside, Driver
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import Watch, guide_returns
-from coil_rl.run.delivery import guide_of
+from coil_rl.run.delivery import policy_of
 from coil_rl.run.experiment import Experiment
 from coil_rl.run.folder import (
     CODE,
@@ -361,7 +361,7 @@ class Run:
             )
         begun = is_begun(self.folder)
         if begun:
-            self.check_unchanged()
+            checkpoint.go_on(self)
             self._take_code(changed)
         stages = [*budget.stages, budget.frames] if begun else []
         self.budget = replace(budget, frames=frames, stages=stages)
@@ -390,7 +390,7 @@ class Run:
             UserError: if its configuration or its code was edited since it began.
         """
         if is_evaluated(self.folder):
-            self.check_unchanged()
+            checkpoint.go_on(self)
             say(f"{self.folder} is finished already, and not trained or drawn again", error=True)
             reward = report_outcome(self.folder)
             self._say_next()
@@ -417,14 +417,6 @@ class Run:
             write_config(self.folder, saved)
             (self.folder / record.GUIDE_RETURNS.name).unlink(missing_ok=True)  # of the other code
             say(f"{self.folder} goes on with another file of {names}", error=True)
-
-    def check_unchanged(self) -> None:
-        """Check that the configuration of a run was not edited.
-
-        Raises:
-            UserError: if it differs from the one in the checkpoint.
-        """
-        checkpoint.go_on(self, lambda state: None)
 
     def finish(self, *, resumed: bool = False) -> float:
         """Train and evaluate in the folder, which is locked and holds the configuration."""
@@ -539,12 +531,7 @@ class Run:
             UserError: if the file is missing, damaged, or does not fit the policy.
         """
         path = self.weights(which)
-        state = checkpoint.load(path, self.device)
-        guide = guide_of(state, env)
-        if guide is not None:
-            return guide
-        checkpoint.put_weights(policy, state, path)
-        return policy
+        return policy_of(checkpoint.load(path, self.device), policy, env, path)
 
     def reasons(self) -> list[str]:
         """Return the sentences on how the training began, and on its tests."""

@@ -139,11 +139,12 @@ class CountedCases(TrainingCases):
 @pytest.mark.parametrize(("length", "is_compared"), [(8, True), (9, False)])
 def test_earlier_policy_is_compared_if_its_episodes_fit(length, is_compared, monkeypatch, tmp_path):
     # The test has 50 frames; two cases take 2 x `length` for each of three policies.
-    monkeypatch.setattr("coil_rl.run.delivery.policy_of", lambda state, learner, env: state)
+    monkeypatch.setattr("coil_rl.run.delivery.policy_of", lambda state, *given: state)
     cases = CountedCases(build=lambda rows: None, frames=1000)
     cases.length = length
     cases.teach([], lambda steps: None)
-    delivery = Delivery(learner=None, env=None, cases=cases, curve=None, folder=tmp_path)
+    learner = SimpleNamespace(policy=None)
+    delivery = Delivery(learner=learner, env=None, cases=cases, curve=None, folder=tmp_path)
     delivery.cases.renew = lambda count: setattr(cases, "count", count)
     returns = delivery._tested({name: {} for name in ("last", "guide", "earlier")})
     assert ("earlier" in returns) == is_compared
