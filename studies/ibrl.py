@@ -26,7 +26,7 @@ from torchrl.envs import EnvBase, ExplorationType, exploration_type, set_explora
 from coil_rl.learners.critics import Critics
 from coil_rl.learners.encoders import Mlp
 from coil_rl.learners.gradient import Weights
-from coil_rl.learners.policy import ByKey, Entries, Policy, next_of
+from coil_rl.learners.policy import ByKey, Entries, KeyModule, Policy, next_of
 from coil_rl.learners.rewards import discounted
 from coil_rl.learners.sac import SAC, SACSettings
 from coil_rl.ranges import NonNegative, checked
@@ -138,7 +138,7 @@ class IBRL(SAC):
         return losses
 
 
-class Proposals(TensorDictModuleBase):
+class Proposals(KeyModule):
     """The choice between the actions of guide, policy and perhaps an editor; it writes `action`.
 
     Args:
@@ -151,8 +151,6 @@ class Proposals(TensorDictModuleBase):
         edit: largest change of the guide's action, as a fraction of half the range of the action.
     """
 
-    by_key = True
-
     def __init__(
         self,
         actor: Policy,
@@ -164,8 +162,7 @@ class Proposals(TensorDictModuleBase):
         sharpness: float | None,
         edit: float,
     ) -> None:
-        self.in_keys, self.out_keys = list(dict.fromkeys([*actor.in_keys, ADVICE])), ["action"]
-        super().__init__()
+        super().__init__(list(dict.fromkeys([*actor.in_keys, ADVICE])), ["action"])
         self.actor, self.critics, self.editor, self.space = actor, critics, editor, space
         self.guide, self.sharpness, self.edit = guide, sharpness, edit
 

@@ -29,13 +29,12 @@ from typing import Annotated, Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase, Transform
 
 from coil_rl.learners.learner import Callback, Cases
 from coil_rl.learners.normaliser import Normaliser
-from coil_rl.learners.policy import UNCLIPPED, Sample
+from coil_rl.learners.policy import UNCLIPPED, KeyModule, Sample
 from coil_rl.ranges import Interval, Positive, Share, checked
 from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.transforms.guide_actions import GuideActions
@@ -119,7 +118,7 @@ class Hold(nn.Module):
         return weight.clamp(min=0) @ advice + (-weight).clamp(min=0) @ self.space.mirrored(advice)
 
 
-class ShownAdvice(TensorDictModuleBase):
+class ShownAdvice(KeyModule):
     """The advice as networks see it: 0 if no guide is held. It is written as `("shown", KEY)`.
 
     Args:
@@ -127,12 +126,8 @@ class ShownAdvice(TensorDictModuleBase):
         key: entry with the advice.
     """
 
-    by_key = True
-
     def __init__(self, hold: Hold, key: NestedKey) -> None:
-        self.in_keys: list[NestedKey] = [key]
-        self.out_keys: list[NestedKey] = [unravel_key(("shown", key))]
-        super().__init__()
+        super().__init__([key], [unravel_key(("shown", key))])
         self.hold = hold
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -141,7 +136,7 @@ class ShownAdvice(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], advice * self.hold.held.to(advice.dtype))
 
 
-class AnchoredInputs(TensorDictModuleBase):
+class AnchoredInputs(KeyModule):
     """What the networks of an anchored learner read: normalised entries, and shown advice.
 
     Args:
@@ -149,14 +144,13 @@ class AnchoredInputs(TensorDictModuleBase):
         shown: the advice.
     """
 
-    by_key = True
-
     def __init__(self, normaliser: Normaliser | None, shown: ShownAdvice) -> None:
         parts: list[Normaliser | ShownAdvice] = [] if normaliser is None else [normaliser]
         parts.append(shown)
-        self.in_keys = [key for part in parts for key in part.in_keys]
-        self.out_keys = [key for part in parts for key in part.out_keys]
-        super().__init__()
+        super().__init__(
+            [key for part in parts for key in part.in_keys],
+            [key for part in parts for key in part.out_keys],
+        )
         self.parts = nn.ModuleList(parts)
 
     @property

@@ -5,14 +5,13 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.encoders import ACTIVATIONS, ConcatObservations, Mlp
 from coil_rl.learners.networks import Inputs, action_shape
-from coil_rl.learners.policy import read_through
+from coil_rl.learners.policy import KeyModule, read_through
 
 Norm = Literal["none", "layer", "batch"]
 MOMENTUM = 0.01  # share of a batch in the running statistics
@@ -75,7 +74,7 @@ class Layer(nn.Module):
         return torch.baddbmm(self.bias, x, self.weight)
 
 
-class Critics(TensorDictModuleBase):
+class Critics(KeyModule):
     """Networks that estimate the return of an action, with one tensor for a layer of all of them.
 
     As a module it writes their uncertainty: the standard deviation of the values of an action, in
@@ -95,8 +94,6 @@ class Critics(TensorDictModuleBase):
         inputs: writes, before these are asked, what they read in place of some of `in_keys`.
     """
 
-    by_key = True
-
     def __init__(
         self,
         env: EnvBase,
@@ -111,9 +108,7 @@ class Critics(TensorDictModuleBase):
         inputs: Inputs | None = None,
     ) -> None:
         keys: list[NestedKey] = [*in_keys, "action"]
-        self.in_keys = read_through(inputs, keys)
-        self.out_keys: list[NestedKey] = [("next", "uncertainty")]
-        super().__init__()
+        super().__init__(read_through(inputs, keys), [("next", "uncertainty")])
         self.count, self.dropout, self.gain = count, dropout, gain
         self.concat = ConcatObservations(env, keys, {"action": action_shape(env)}, network)
         own = type(network).layers is not Mlp.layers

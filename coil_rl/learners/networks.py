@@ -45,6 +45,7 @@ from coil_rl.learners.policy import (
     ClippedSample,
     GaussianHead,
     GlobalScaleHead,
+    KeyModule,
     Policy,
     Sample,
     read_through,
@@ -57,24 +58,21 @@ DEFAULT = Mlp()
 Inputs = Normaliser | AnchoredInputs  # what networks read in place of entries of the env
 
 
-class FastTensorDictModule(TensorDictModuleBase):
+class FastTensorDictModule(KeyModule):
     """A `TensorDictModule` with less overhead per call.
 
     There is no dispatch, and no search for optional packages.
 
     Args:
         module: takes the entries `in_keys`, and returns a tensor or a tuple of them.
-        in_keys: entries that it reads.
-        out_keys: entries that it writes.
+        in_keys: as of `KeyModule`.
+        out_keys: as of `KeyModule`.
     """
-
-    by_key = True
 
     def __init__(
         self, module: nn.Module, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
     ) -> None:
-        self.in_keys, self.out_keys = list(in_keys), list(out_keys)
-        super().__init__()
+        super().__init__(in_keys, out_keys)
         self.module = module
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -12,13 +12,13 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Categorical, OneHot
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.encoders import entry_specs
 from coil_rl.learners.extension import Extension
+from coil_rl.learners.policy import KeyModule
 from coil_rl.output import say
 from coil_rl.transforms.guide_actions import GuideActions
 
@@ -33,7 +33,7 @@ MOST_SHOWN = 4  # elements in a message
 PICTURE = "it is a picture"
 
 
-class Normaliser(TensorDictModuleBase):
+class Normaliser(KeyModule):
     """Entries of an env, normalised by mean and standard deviation of all that `learn` has seen.
 
     The results are written as `("normalised", KEY)`. Before the first `learn` they are 0, so that
@@ -50,8 +50,6 @@ class Normaliser(TensorDictModuleBase):
             part of the state.
     """
 
-    by_key = True
-
     def __init__(
         self,
         env: EnvBase,
@@ -59,9 +57,7 @@ class Normaliser(TensorDictModuleBase):
         *,
         enough: int | None = None,
     ) -> None:
-        self.in_keys = list(keys)
-        self.out_keys: list[NestedKey] = [unravel_key(("normalised", key)) for key in keys]
-        super().__init__()
+        super().__init__(keys, [unravel_key(("normalised", key)) for key in keys])
         advice = advice_keys(env)
         self.moments = nn.ModuleList()
         for key, spec in zip(keys, entry_specs(env, keys), strict=True):

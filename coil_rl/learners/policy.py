@@ -7,7 +7,7 @@ updates use the latter.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import NestedKey, unravel_key
@@ -58,6 +58,20 @@ def next_of(entries: Entries) -> Entries:
     )
 
 
+class KeyModule(TensorDictModuleBase):
+    """Base class of modules that only read and write entries by key, so that `Entries` will do.
+
+    Args:
+        in_keys: entries that it reads.
+        out_keys: entries that it writes.
+    """
+
+    def __init__(self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:
+        self.in_keys: list[NestedKey] = list(in_keys)
+        self.out_keys: list[NestedKey] = list(out_keys)
+        super().__init__()
+
+
 class Sample(ProbabilisticTensorDictModule):
     """The last module of a policy, which samples from its distribution.
 
@@ -72,8 +86,6 @@ class Sample(ProbabilisticTensorDictModule):
         options: further arguments of the distribution by name; None: there are none.
         action_key: entry for the action; None: the sample is the action.
     """
-
-    by_key: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -147,9 +159,9 @@ class ClippedSample(Sample):
 
 def by_key(module: nn.Module) -> bool:
     """Return whether a module only reads and writes by key, so that `Entries` will do."""
-    if isinstance(module, TensorDictSequential):
-        return isinstance(module, Policy | ByKey) and all(map(by_key, module.module))
-    return bool(getattr(module, "by_key", False))
+    if isinstance(module, Policy | ByKey):
+        return all(map(by_key, module.module))
+    return isinstance(module, KeyModule | Sample)
 
 
 class ByKey(TensorDictSequential):
