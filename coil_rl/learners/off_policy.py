@@ -15,11 +15,11 @@ from torchrl.envs import EnvBase
 from coil_rl import output
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import Anchor, start_tests
+from coil_rl.learners.batches import AGENT_ACTS, guide_may_act
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension, Extensions
 from coil_rl.learners.gradient import GradientStep, Weights, means
 from coil_rl.learners.learner import Callback, Cases, Learner, Stateful
-from coil_rl.learners.minibatches import AGENT_ACTS, guide_may_act
 from coil_rl.learners.normaliser import RawObservations, normaliser
 from coil_rl.learners.policy import Entries, next_of
 from coil_rl.learners.rewards import NStep, RewardScale

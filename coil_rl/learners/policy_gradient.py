@@ -26,8 +26,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from coil_rl.learners.batches import standardise as standardised
 from coil_rl.learners.encoders import Mlp
-from coil_rl.learners.minibatches import standardise as standardised
 from coil_rl.learners.networks import FastTensorDictModule
 from coil_rl.learners.policy import Entries
 from coil_rl.learners.ppo import PPO, OnPolicySettings

@@ -20,22 +20,24 @@ from torchrl.envs import EnvBase
 
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import Anchor, start_tests
-from coil_rl.learners.encoders import Mlp, without_memory
-from coil_rl.learners.extension import Extension, Extensions, SummedRewards
-from coil_rl.learners.gradient import GradientStep, means, tensors_of
-from coil_rl.learners.learner import Callback, Cases, Learner, Stateful
-from coil_rl.learners.minibatches import (
+from coil_rl.learners.batches import (
     AGENT_ACTS,
+    OF_POLICY,
+    SEEN,
     Minibatches,
     RowMinibatches,
     add_advantages,
     guide_may_act,
     of_agent,
+    report_of,
     standardise,
 )
+from coil_rl.learners.encoders import Mlp, without_memory
+from coil_rl.learners.extension import Extension, Extensions, SummedRewards
+from coil_rl.learners.gradient import GradientStep, means, tensors_of
+from coil_rl.learners.learner import Callback, Cases, Learner, Stateful
 from coil_rl.learners.normaliser import RawObservations, RunningStatistics, normaliser
 from coil_rl.learners.policy import UNCLIPPED, Entries, Policy, by_key
-from coil_rl.learners.ppo_report import OF_POLICY, SEEN, report_of
 from coil_rl.learners.rewards import RewardScale
 from coil_rl.ranges import Count, NonNegative, Positive, Seed, Share, checked
 from coil_rl.schedules import Linear, Schedule, schedule

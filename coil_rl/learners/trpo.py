@@ -15,8 +15,8 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from coil_rl.learners.batches import of_agent, standardise
 from coil_rl.learners.gradient import Weights
-from coil_rl.learners.minibatches import of_agent, standardise
 from coil_rl.learners.policy import Entries
 from coil_rl.learners.ppo import PPO, OnPolicySettings
 from coil_rl.ranges import Count, Index, Interval, NonNegative, Positive, Share, checked

@@ -6,7 +6,7 @@ import worlds
 from tensordict import TensorDict
 
 from coil_rl.learners import PPO, KickstartLoss
-from coil_rl.learners.minibatches import standardise
+from coil_rl.learners.batches import standardise
 from coil_rl.run.rollout import Rollout
 from coil_studies import Advisor
 

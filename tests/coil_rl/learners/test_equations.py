@@ -7,7 +7,7 @@ import torch
 import worlds
 
 from coil_rl.learners import A2C, TRPO, Reinforce
-from coil_rl.learners.minibatches import add_advantages
+from coil_rl.learners.batches import add_advantages
 from coil_rl.run.rollout import Rollout
 
 GAMMA, LAMBDA = 0.9, 0.8

@@ -8,9 +8,9 @@ from any_env import AnyEnv
 from torchrl.data import Bounded, Unbounded
 
 from coil_rl.learners import A2C, PPO, TRPO, KickstartLoss, Reinforce
+from coil_rl.learners.batches import Minibatches
 from coil_rl.learners.extension import Extension, Extensions, SummedRewards
 from coil_rl.learners.learner import Learner
-from coil_rl.learners.minibatches import Minibatches
 from coil_rl.learners.policy import Entries
 from coil_rl.run.rollout import Rollout
 

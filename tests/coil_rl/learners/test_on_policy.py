@@ -13,7 +13,7 @@ from torchrl.objectives.value import GAE
 from coil_rl.envs import ConeTrackEnv
 from coil_rl.guides import RandomGuide
 from coil_rl.learners import A2C, PPO, TRPO, Reinforce
-from coil_rl.learners.minibatches import add_advantages
+from coil_rl.learners.batches import add_advantages
 from coil_rl.learners.networks import critic
 from coil_rl.learners.policy import Entries
 from coil_rl.run.rollout import Rollout

@@ -1,6 +1,10 @@
-"""How a batch of rollouts is made ready for an update: advantages, minibatches, and who acted."""
+"""Batches of rollouts: their advantages, minibatches, who acted in them, and what is reported.
 
-from collections.abc import Iterator, Sequence
+The report says, besides the losses, how far the policy moved and what the critic fits. It is
+computed at the end for all minibatches together, because single ones take too long.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar
 
 import torch
@@ -14,6 +18,10 @@ from torchrl.objectives.value import GAE
 from coil_rl.learners.learner import Stateful
 from coil_rl.learners.networks import REMEMBERED
 from coil_rl.learners.policy import Entries
+
+AGENT_ACTS = "agent_acts"  # entry [*batch, 1]: whether the agent acted in a step
+SEEN = ("log_ratio", "value", "value_target")  # of the losses, for `report_of`
+OF_POLICY = ("clip_fraction", "kl_approx")
 
 
 @torch.no_grad()
@@ -54,9 +62,6 @@ def standardise(advantage: Tensor, least: float = 1e-6) -> Tensor:
         least: smaller standard deviations are taken as this one.
     """
     return (advantage - advantage.mean()) / advantage.std().clamp_min(least)
-
-
-AGENT_ACTS = "agent_acts"  # entry [*batch, 1]: whether the agent acted in a step
 
 
 class Minibatches(Stateful):
@@ -149,3 +154,39 @@ def of_agent(steps: Entries) -> Entries:
         return steps
     acted = steps[AGENT_ACTS].squeeze(-1)
     return Entries({key: steps[key][acted] for key in steps})
+
+
+@torch.no_grad()
+def report_of(steps: Sequence[Mapping[str, Tensor]], clip: Sequence[float]) -> dict[str, float]:
+    """Return the means over the minibatches of what is reported, by TorchRL's names.
+
+    Args:
+        steps: the entries `SEEN` of each minibatch, [N, 1] each; N may differ.
+    """
+    of_size: dict[int, list[Mapping[str, Tensor]]] = {}
+    for step in steps:
+        of_size.setdefault(len(step["log_ratio"]), []).append(step)
+    parts = []
+    for group in of_size.values():
+        log_ratio, value, target = (torch.stack([step[name] for step in group]) for name in SEEN)
+        parts.append(of_minibatches(log_ratio, value, target, clip))
+    return {name: float(torch.cat([part[name] for part in parts]).mean()) for name in parts[0]}
+
+
+def of_minibatches(
+    log_ratio: Tensor, value: Tensor, target: Tensor, clip: Sequence[float]
+) -> dict[str, Tensor]:
+    """Return what is reported of some minibatches [S, N, 1], with one number for each."""
+    share = (log_ratio.clamp(*clip) != log_ratio).to(log_ratio.dtype).mean((-2, -1))
+    ratio, log_weights = log_ratio.exp(), log_ratio.squeeze(-1)
+    unexplained = torch.var(target - value, correction=0, dim=-2)
+    variance = torch.var(target, correction=0, dim=-2) + torch.finfo(target.dtype).eps
+    effective_size = (2 * log_weights.logsumexp(-1) - (2 * log_weights).logsumexp(-1)).exp()
+    return {
+        "clip_fraction": share,
+        "kl_approx": (-log_ratio).mean((-2, -1)),
+        "explained_variance": 1.0 - unexplained / variance,
+        "ESS": effective_size / log_weights.shape[-1],
+        "max_ratio": ratio.amax((-2, -1)),
+        "mean_ratio": ratio.mean((-2, -1)),
+    }
