@@ -162,9 +162,9 @@ class Experiment(Stateful):
                 say(sentence, error=True)
             self.first = first | self._taken()
         self._plan()
-        read = [
-            unravel_key(tuple(key)) for group in self.owner.watch.values() for key in group.values()
-        ]
+        read: list[NestedKey] = []
+        for group in self.owner.watch.values():
+            read += [unravel_key(tuple(key)) for key in group.values()]
         read += getattr(getattr(self.learner, "extensions", None), "keys", [])
         rest_guides(self.learner.policy, self.rollout.env, read)
         updates, frames = self.all_updates, self.rollout.frames
