@@ -144,7 +144,7 @@ class Trial:
             return self.env.rollout(self.steps, policy, break_when_any_done=False)
 
     def _look_at_numbers(self, rollout: TensorDictBase) -> None:
-        known = getattr(self.env, "optional", ())
+        known = self.base.optional if isinstance(self.base, SeededRows) else ()
         optional = {part for key in known for part in (key, ("next", *key))}
         for key, value in rollout.items(True, True):
             numbers = value.nan_to_num() if key in optional else value
