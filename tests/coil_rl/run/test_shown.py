@@ -9,8 +9,8 @@ from run_folders import driven, make_run
 from coil_rl.measures import measures_of
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.judge import Judgement
+from coil_rl.run.reasons import page_of
 from coil_rl.run.run import Run
-from coil_rl.run.shown import page_of
 
 pytest.importorskip("pandas")
 
