@@ -4,9 +4,14 @@ The names in `__all__` are the public API. They are imported on first use, so th
 is fast.
 """
 
+import logging
+import os
 from typing import TYPE_CHECKING
 
 from coil_rl.lazy import lazy_names
+
+# TorchRL logs each storage that it makes. It reads the variable when it is imported, maybe before.
+logging.getLogger("torchrl").setLevel(os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING"))
 
 if TYPE_CHECKING:
     from coil_rl.comparison.compare import compare as compare

@@ -263,7 +263,6 @@ def program(name: str) -> Iterator[None]:
     STOP.received = False
     listen()
     _draw_into_files()
-    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # read when torchrl is imported, later
     warnings.formatwarning = _saying_once(name)
     threading.excepthook = _end_of_thread
     out = SafeStream(sys.stdout)
