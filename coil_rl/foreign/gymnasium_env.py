@@ -6,6 +6,8 @@ beside the env that need the env itself, not only its observation.
 """
 
 import math
+import os
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -136,6 +138,9 @@ class GymnasiumEnv(SeededRows):
             self.shown = render and "rgb_array" in metadata_of(make(), "render_modes", ())
         drawn, every = make, cases or num_envs
         if self.shown:
+            # Without a screen pygame prints an error in the middle of a run.
+            if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+                os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
             drawn = Anew(make_env, maker, wrappers, settings | {"render_mode": "rgb_array"})
         name = name_of(maker)
 

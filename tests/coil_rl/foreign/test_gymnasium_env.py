@@ -455,6 +455,15 @@ def test_pictures_show_the_first_row():
     assert [plant.env.render_mode for plant in env.held.plants] == ["rgb_array", None, None]
 
 
+def test_env_is_drawn_without_a_screen_in_silence(capfd, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "XDG_RUNTIME_DIR", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    env = GymnasiumEnv("CartPole-v1", 1, render=True)
+    env.reset()
+    assert env.render().any()
+    assert capfd.readouterr().err == ""
+
+
 def renamed(env):
     """Return an env whose observation is an entry that the project uses itself."""
     space = spaces.Dict(info=env.observation_space)
