@@ -37,6 +37,7 @@ NO_INTEGER = re.compile(
     r"override ([\w.]+)=.*Value '([\d.eE+]+)' of type 'float' could not be converted to Integer",
     re.DOTALL,
 )
+NO_NUMBER = re.compile(r"could not be converted to (Integer|Float)")
 # Names of hyper-parameters elsewhere (Stable-Baselines3, CleanRL, rsl_rl), and ours.
 OTHER_NAMES = {
     "lr": "learning_rate",
@@ -175,6 +176,9 @@ def _wrong_kind(override: str, cause: str) -> str:
             f"{number[1]}={number[2]} must be a whole number; "
             f"write {number[1]}={int(float(number[2])):_}"
         )
+    kind = NO_NUMBER.search(cause)
+    if kind is not None:
+        return f"{override} must be a {'whole ' if kind[1] == 'Integer' else ''}number"
     if "is not a ListConfig" in cause:
         return f"{override} must be a list; write {key}=[{value}]"
     return ""
@@ -204,7 +208,7 @@ def _unknown_file(error: MissingConfigException) -> str:
             f"hydra/launcher={name} is not installed: "
             f"python -m pip install 'coil-rl[{LAUNCHERS[name]}]'"
         )
-    options = sorted(error.options or [])
+    options = sorted(error.options or schema.shipped(group))  # Hydra knows none of a list
     if not options:
         return f"there is no {group}={name}{choice(group, name, options)}"
     return (
