@@ -46,6 +46,7 @@ class SeededRows(SeededEnv):
     """
 
     remedy: ClassVar[str] = ""  # what may help if running episodes cannot be repeated
+    optional: Sequence[tuple[str, str]] = ()  # entries that may lack a number
 
     def __init__(
         self,
