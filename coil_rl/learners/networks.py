@@ -70,7 +70,10 @@ class FastTensorDictModule(KeyModule):
     """
 
     def __init__(
-        self, module: nn.Module, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
+        self,
+        module: Callable[..., Any],
+        in_keys: Sequence[NestedKey],
+        out_keys: Sequence[NestedKey],
     ) -> None:
         super().__init__(in_keys, out_keys)
         self.module = module

@@ -23,7 +23,7 @@ from typing import Literal, Unpack
 import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.batches import standardise as standardised
@@ -126,20 +126,8 @@ class Reinforce(A2C):
             return super().build_critic(env, in_keys, network)
         key = in_keys[0]
         dims = len(env.observation_spec[key].shape) - len(env.batch_size)
-        return FastTensorDictModule(Zero(dims), [key], ["state_value"])
 
+        def zero(entry: Tensor) -> Tensor:
+            return torch.zeros(*entry.shape[: entry.ndim - dims], 1, device=entry.device)
 
-class Zero(nn.Module):
-    """The value 0 of a state.
-
-    Args:
-        dims: number of dimensions of the entry that is read, after those of a batch.
-    """
-
-    def __init__(self, dims: int) -> None:
-        super().__init__()
-        self.dims = dims
-
-    def forward(self, entry: Tensor) -> Tensor:
-        """Return the value, [*batch, 1]."""
-        return torch.zeros(*entry.shape[: entry.ndim - self.dims], 1, device=entry.device)
+        return FastTensorDictModule(zero, [key], ["state_value"])

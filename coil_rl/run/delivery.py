@@ -121,7 +121,7 @@ class Delivery:
             return True
         if self.cases.episodes:
             length = self.cases.steps / self.cases.episodes
-            return self._first_episodes() * length <= self._left()
+            return self._first_episodes() * length <= self._affordable(2)
         return self._first_episodes() * self._length_in_training() <= self._affordable()
 
     def _length_in_training(self) -> float:
@@ -144,22 +144,15 @@ class Delivery:
         hold = hold_of(self.learner.policy)
         return hold is not None and bool(hold.held)
 
-    def _share(self) -> int:
-        """Return the number of frames that one of the two tests may take."""
-        return math.ceil(SHARE * self.cases.frames)
+    def _affordable(self, shares: int = 1) -> int:
+        """Return the frames that the test may take: its share, or what the start test has left.
 
-    def _left(self) -> int:
-        """Return the number of frames that the start test has left for the test at the end.
-
-        If it found a guide ahead but had too few cases to hold it, its own frames do not count, so
-        that the test has more cases.
+        The two tests together have two shares. If the start test found a guide ahead but had too
+        few cases to hold it, its own frames do not count, so that this test has more cases.
         """
+        share = math.ceil(SHARE * self.cases.frames)
         taken = 0 if self.cases.guide_ahead else self.cases.steps
-        return max(2 * self._share() - taken, 0)
-
-    def _affordable(self) -> int:
-        """Return the frames that the test may take: its share, or what the start test has left."""
-        return min(self._share(), self._left())
+        return max(min(shares * share, 2 * share - taken), 0)
 
     def after_update(self, update: int) -> dict[str, float]:
         """Test, hand over, and return the mean returns by name."""

@@ -27,7 +27,18 @@ def policy_batch(
     copies = [copy.deepcopy(policy) for _ in states]
     for each, state in zip(copies, states, strict=True):
         each.load_state_dict(state)
-    return StackedPolicies(copies) if is_tensors(policy) else OnRows(list(map(Acting, copies)))
+    if not is_tensors(policy):
+        return OnRows(list(map(Acting, copies)))
+    weights = torch.stack([TensorDict.from_module(each) for each in copies]).detach()
+
+    def act_with(own: TensorDictBase, rows: TensorDictBase) -> Tensor:
+        with own.to_module(copies[0]):
+            return copies[0](rows)["action"]
+
+    def act(rows: TensorDictBase) -> Tensor:
+        return torch.vmap(act_with)(weights, rows.view(len(copies), -1)).flatten(0, 1)
+
+    return TracedPolicy(policy.in_keys, act)
 
 
 def is_tensors(policy: TensorDictModuleBase) -> bool:
@@ -44,7 +55,9 @@ def is_tensors(policy: TensorDictModuleBase) -> bool:
 
 def traced(policy: TensorDictModuleBase) -> TensorDictModuleBase:
     """Return a policy for an evaluation, traced if it is one of tensors only."""
-    return TracedPolicy(policy) if is_tensors(policy) else policy
+    if not is_tensors(policy):
+        return policy
+    return TracedPolicy(policy.in_keys, lambda rows: policy(rows)["action"])
 
 
 def acted(policy: TensorDictModuleBase, entries: TensorDictBase, sampled: bool) -> TensorDictBase:
@@ -113,12 +126,18 @@ class TracedPolicy(TensorDictModuleBase):
     Its operations are traced at the first call for a number of rows, once for each type of
     exploration, and repeated afterwards, which takes half of the time or less. Exploration noise
     that somebody has written is read.
+
+    Args:
+        in_keys: entries that it reads.
+        act: returns the action for entries of rows.
     """
 
-    def __init__(self, policy: TensorDictModuleBase) -> None:
-        self.in_keys, self.out_keys = list(policy.in_keys), ["action"]
+    def __init__(
+        self, in_keys: Sequence[NestedKey], act: Callable[[TensorDictBase], Tensor]
+    ) -> None:
+        self.in_keys, self.out_keys = list(in_keys), ["action"]
         super().__init__()
-        self._policy = (policy,)  # a tuple, so that it is no submodule
+        self.act = act
         self.traced: dict[Any, Callable[..., Sequence[Tensor]]] = {}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -133,28 +152,4 @@ class TracedPolicy(TensorDictModuleBase):
 
     def _actions(self, keys: Sequence[NestedKey], *entries: Tensor) -> list[Tensor]:
         rows = TensorDict(dict(zip(keys, entries, strict=True)), [len(entries[0])])
-        return [self._act(rows)]
-
-    def _act(self, rows: TensorDictBase) -> Tensor:
-        (policy,) = self._policy
-        action: Tensor = policy(rows)["action"]
-        return action
-
-
-class StackedPolicies(TracedPolicy):
-    """Copies of a policy with different weights, computed in one batch.
-
-    Each acts on its own part of the rows.
-    """
-
-    def __init__(self, policies: Sequence[TensorDictModuleBase]) -> None:
-        super().__init__(copy.deepcopy(policies[0]))
-        self.states = torch.stack([TensorDict.from_module(each) for each in policies]).detach()
-
-    def _act(self, rows: TensorDictBase) -> Tensor:
-        actions: Tensor = torch.vmap(self._act_in)(self.states, rows.view(len(self.states), -1))
-        return actions.flatten(0, 1)
-
-    def _act_in(self, state: TensorDictBase, rows: TensorDictBase) -> Tensor:
-        with state.to_module(self._policy[0]):
-            return super()._act(rows)
+        return [self.act(rows)]

@@ -12,10 +12,9 @@ from coil_rl.learners import DQN, PPO, SAC, Anchor
 from coil_rl.run.policy_batch import (
     Acting,
     OnRows,
-    StackedPolicies,
     TracedPolicy,
-    is_tensors,
     policy_batch,
+    traced,
 )
 from coil_rl.transforms import DiscreteActions
 
@@ -45,7 +44,7 @@ def test_batch_of_policies_acts_like_each_of_them(learner):
         states = [perturbed(policy, seed) for seed in range(3)]
     rows = observations(env)
     batch = policy_batch(policy, states)
-    assert isinstance(batch, OnRows if learner == "forest" else StackedPolicies)
+    assert isinstance(batch, OnRows if learner == "forest" else TracedPolicy)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         together = batch(rows.clone())["action"]
         for index, state in enumerate(states):
@@ -58,8 +57,7 @@ def test_batch_of_policies_acts_like_each_of_them(learner):
 def test_recorded_policy_acts_and_draws_like_the_policy_on_any_number_of_rows(learner):
     env = cones(*([DiscreteActions()] if learner == "dqn" else []))
     policy = MAKE[learner](env, KEYS).policy
-    assert is_tensors(policy)
-    recorded = TracedPolicy(policy)
+    recorded = traced(policy)
     for kind in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
         for count in (15, 4):
             actions = []
@@ -82,7 +80,7 @@ def test_recorded_policy_takes_any_layout_in_memory(learner, choices):
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         expected = policy(rows.clone())["action"]
         for each in ([rows, turned], [turned, rows]):
-            recorded = TracedPolicy(policy)
+            recorded = traced(policy)
             for part in each:
                 torch.testing.assert_close(recorded(part.copy())["action"], expected)
 
