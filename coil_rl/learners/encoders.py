@@ -5,7 +5,7 @@ A YAML file names an architecture by `learner.network`.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 from tensordict import NestedKey
@@ -204,19 +204,15 @@ class Mlp:
 
         An architecture of your own is a subclass that has this method.
         """
-        norm: dict[str, Any] = {}
-        if self.layer_norm:
-            norm = {
-                "norm_class": nn.LayerNorm,
-                "norm_kwargs": [{"normalized_shape": width} for width in self.hidden],
-            }
+        widths = [{"normalized_shape": width} for width in self.hidden]
         layers = MLP(
             inputs,
             outputs,
             num_cells=list(self.hidden),
             activation_class=ACTIVATIONS[self.activation],
             device=device,
-            **norm,
+            norm_class=nn.LayerNorm if self.layer_norm else None,
+            norm_kwargs=widths if self.layer_norm else None,
         )
         if self.activation == "tanh":
             linear = [layer for layer in layers if isinstance(layer, nn.Linear)]

@@ -261,8 +261,14 @@ class OffPolicy(Stateful, Learner):
         minibatches: Iterable[Entries] = self.samples()
         due = int(self.pending_updates)
         if due > AT_ONCE:  # to make a bar takes as long as a small minibatch
-            shown = {"iterable": minibatches, "total": due, "unit": "minibatch", "desc": "learn"}
-            minibatches = output.progress(**shown, leave=False, delay=2.0)
+            minibatches = output.progress(
+                iterable=minibatches,
+                total=due,
+                unit="minibatch",
+                desc="learn",
+                leave=False,
+                delay=2.0,
+            )
         for minibatch in minibatches:
             reports.append(self.gradient(minibatch, weights))
         found = means(reports)

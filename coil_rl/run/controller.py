@@ -100,7 +100,10 @@ class Controller:
         Raises:
             ValueError: if the observation does not fit the env, or lacks what is read.
         """
-        return self._decoded(self.act_on(self._entries(observation)))
+        action = self.act_on(self._entries(observation))
+        if isinstance(self.plant, GymnasiumEnv):
+            return self.plant.decode(action)
+        return action.reshape(action.shape[len(self.env.batch_size) :]).cpu().numpy()
 
     @torch.no_grad()
     def act_on(self, entries: TensorDictBase) -> Tensor:
@@ -172,11 +175,6 @@ class Controller:
             if key in self.read and not entries[key].isfinite().all():
                 raise ValueError(f"{key} holds a number that is not finite")
         return entries
-
-    def _decoded(self, action: Tensor) -> Any:
-        if isinstance(self.plant, GymnasiumEnv):
-            return self.plant.decode(action)
-        return action.reshape(action.shape[len(self.env.batch_size) :]).cpu().numpy()
 
 
 def _plain(value: Any) -> Any:
