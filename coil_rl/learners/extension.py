@@ -1,9 +1,9 @@
 """What is not part of an algorithm but changes its updates: statistics, further losses."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -64,7 +64,7 @@ class Extension:
         """Restore a state that `state_dict` returned."""
 
 
-class Extensions(Extension):
+class Extensions:
     """Several extensions as one; they act one after the other.
 
     Args:
@@ -84,18 +84,17 @@ class Extensions(Extension):
         for extension in self.each:
             extension.prepare(batch)
 
-    @property
-    def has_losses(self) -> bool:
-        """Whether any of them adds losses."""
-        return any(type(each).losses is not Extension.losses for each in self.each)
-
     def losses(
-        self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase
+        self, policy: ProbabilisticTensorDictSequential, minibatch: Mapping[NestedKey, Tensor]
     ) -> dict[str, Tensor]:
         """Return the losses of all by name, scalars, for a minibatch [N]."""
+        adding = [each for each in self.each if type(each).losses is not Extension.losses]
+        if not adding:  # to make a TensorDict takes as long as a small loss
+            return {}
+        steps = TensorDict(dict(minibatch), len(next(iter(minibatch.values()))))
         losses: dict[str, Tensor] = {}
-        for extension in self.each:
-            losses |= extension.losses(policy, minibatch)
+        for extension in adding:
+            losses |= extension.losses(policy, steps)
         return losses
 
     def weights(self, weights: dict[str, float], progress: float) -> dict[str, float]:

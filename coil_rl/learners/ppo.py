@@ -296,11 +296,7 @@ class PPO(Stateful, Learner):
 
     def all_losses(self, minibatch: Entries) -> dict[str, Tensor]:
         """Return all losses of a minibatch [N] by name, and other values that are reported."""
-        losses = self.losses_of_agent(minibatch)
-        if self.extensions.has_losses:
-            steps = TensorDict(dict(minibatch), len(minibatch["advantage"]))
-            losses |= self.extensions.losses(self.head, steps)
-        return losses
+        return self.losses_of_agent(minibatch) | self.extensions.losses(self.head, minibatch)
 
     def losses_of_agent(self, minibatch: Entries) -> dict[str, Tensor]:
         """Return `losses` of the steps in which the agent acted, that of the critic of all."""

@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from typing import Annotated, ClassVar, Unpack
 
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -213,9 +212,7 @@ class SAC(OffPolicy):
                 losses = self.critic_losses(minibatch)
             with self.of_critics.used(fixed=True):
                 losses |= self.actor_losses(minibatch)
-                if self.extensions.has_losses:
-                    steps = TensorDict(dict(minibatch), len(minibatch["action"]))
-                    losses |= self.extensions.losses(self.actor, steps)
+                losses |= self.extensions.losses(self.actor, minibatch)
         return losses
 
     @property

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Unpack
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
@@ -125,7 +125,6 @@ class TRPO(PPO):
             weights: of the losses by name.
         """
         agent_rows = of_agent(rows)
-        steps = TensorDict(dict(rows), len(rows["advantage"]))
         advantage = standardise(agent_rows["advantage"]).squeeze(-1)
         with torch.no_grad():
             before = self.head.density(Entries(agent_rows))
@@ -135,7 +134,7 @@ class TRPO(PPO):
             ratio = (after.log_prob(agent_rows["action"]) - agent_rows["action_log_prob"]).exp()
             losses = {"loss_objective": -(ratio * advantage).mean()}
             total = weights["loss_objective"] * losses["loss_objective"]
-            for name, loss in self.extensions.losses(self.head, steps).items():
+            for name, loss in self.extensions.losses(self.head, rows).items():
                 losses[name] = loss
                 total = total + weights[name] * loss
             return total, before.divergence(after).mean(), losses
