@@ -88,17 +88,6 @@ def test_imitator_learns_from_the_guide_alone_and_tells_what_it_can_predict():
     )
 
 
-@pytest.mark.fast(1)
-@pytest.mark.parametrize("options", [{}, {"normalise": True}, {"squash": False}])
-def test_state_contains_everything_the_next_update_depends_on(options):
-    first, rollout = make(**options)
-    first.update(rollout.collect())
-    second, _ = make(seed=3, **options)
-    second.load_state_dict(copy.deepcopy(first.state_dict()))
-    batch = rollout.collect()
-    assert first.update(batch.clone()) == second.update(batch.clone())
-
-
 def test_negative_alpha_is_refused():
     with pytest.raises(ValueError, match="alpha=-1 must be"):
         make(alpha=-1)

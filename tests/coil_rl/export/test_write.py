@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from learned_runs import ON_POLICY, REPLAY, learned
-from outside_package.install import SOURCE
 from programs import shipped
 from torchrl.envs import Transform
 
@@ -26,10 +25,7 @@ OBSERVATIONS = 30
 MEMORY = {f"guide_state.controller.{name}" for name in ("integral", "wish")}  # of BatchedPI
 
 
-@pytest.fixture(autouse=True)
-def package(monkeypatch):
-    """Make the user's package importable, as one that is installed."""
-    monkeypatch.syspath_prepend(SOURCE)
+pytestmark = pytest.mark.usefixtures("thermostat")
 
 
 def exported(folder, method, *overrides, **parts):

@@ -50,16 +50,6 @@ def first(experiment, run_dir):
     return composed(f"+experiment={experiment}", *chosen, *tiny, f"run_dir={run_dir}")
 
 
-@pytest.mark.fast(1)
-@pytest.mark.parametrize(
-    "experiment", ["coil_vs_ppo", "driving_guides", "guide_benchmark/pendulum"]
-)
-def test_experiment_passes_the_check_and_can_be_resumed(experiment, tmp_path):
-    config = first(experiment, tmp_path / "run")
-    check(config)
-    assert config.existing == "resume"
-
-
 @pytest.mark.slow
 def test_every_experiment_trains_and_evaluates(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -6,7 +6,6 @@ from run_folders import driven, make_run, make_sweep
 from coil_rl.errors import UserError
 from coil_rl.report.comparison import compare, paired
 from coil_rl.report.runs import read_runs
-from coil_rl.report.statistics import estimate
 
 CASES = {"a": 500.0, "b": 600.0}
 
@@ -32,29 +31,12 @@ def sweep(tmp_path):
     return make_sweep(tmp_path / "sweep")
 
 
-def test_numbers_are_those_of_the_runs(sweep):
-    rows = table(sweep, against="ppo")
-    assert list(rows) == [("guide", ""), ("ppo", ""), ("coil", ""), ("coil", "zeroed")]
-    assert [row["seeds"] for row in rows.values()] == [None, 3, 3, 3]
-    assert [row["needs_guide"] for row in rows.values()] == [None, False, True, None]
-    coil, zeroed = rows["coil", ""], rows["coil", "zeroed"]
-    assert coil["reward"] == pytest.approx(571)
-    means = [570 + seed for seed in range(3)]
-    assert (coil["reward"], coil["low"], coil["high"]) == pytest.approx(estimate(means)[:3])
-    assert (coil["crashes"], zeroed["crashes"]) == ("0 of 3 (0% to 71%)", "3 of 3 (29% to 100%)")
-    assert rows["guide", ""]["crashes"] == "0 of 2 cases (0% to 84%)"
-    assert (coil["smoothness"], coil["lap_time"], coil["completed"]) == (pytest.approx(0.2), 50, 1)
-    assert math.isnan(zeroed["lap_time"])
-    assert math.isnan(rows["guide", ""]["low"])
-    assert [row["better"] for row in rows.values()] == [None, None, 0, 0]
-    assert coil["difference"] == pytest.approx(-20)
+# The other numbers of a sweep are those of the page, see test_page.
+def test_policies_are_better_than_the_guide_or_with_sampled_actions_than_another(sweep):
     assert [row["better"] for row in table(sweep, against="guide").values()] == [None, 1, 1, 0]
-    cases = compare(read_runs([sweep])).case_table()
-    by_case = {(row["driver"], row["advice"], row["case"]): row["reward"] for row in cases}
-    assert len(by_case) == 8
-    assert by_case["coil", "", "b"] == pytest.approx(621)
     rows = table(sweep, "ppo", "sampled")
     assert list(rows) == [("guide", ""), ("coil", ""), ("ppo", "")]
+    assert math.isnan(rows["guide", ""]["low"])
     assert rows["coil", ""]["reward"] == pytest.approx(561)
     assert rows["coil", ""]["better"] == 0.5, "better on a, worse on b"
 

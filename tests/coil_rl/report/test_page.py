@@ -39,6 +39,7 @@ def test_section_has_a_table_of_drivers_and_one_of_cases(tmp_path):
     assert coil[11:] == ["50.00", "0.200", "0.30", "yes"]
     assert ppo[8:11] == ["-", "-", "-"]
     assert (ppo[-1], zeroed[:2], zeroed[-1]) == ("no", ["coil", "zeroed"], "-")
+    assert zeroed[5] == "3 of 3 (29% to 100%)"
     assert cells(rewards)[0] == ["mean reward", "a", "b"]
     assert cells(rewards)[-1] == ["coil, zeroed", "-100.0 (0% completed)", "-201.0 (0% completed)"]
 

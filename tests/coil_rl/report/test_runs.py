@@ -83,11 +83,3 @@ def test_error_names_the_damaged_file(sweep, file, text, message):
         read_runs([sweep])
     assert str(error.value).startswith(str(sweep / "1_coil" / file))
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"), [("", "holds no run of coil-train"), ("nowhere", "does not exist")]
-)
-def test_folder_without_runs_is_an_error(name, message, tmp_path):
-    with pytest.raises(UserError, match=message):
-        read_runs([tmp_path / name])

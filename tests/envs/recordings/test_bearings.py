@@ -50,11 +50,6 @@ def test_scan_over_many_turns_is_said_to_be_one(step, turns):
     assert f"has ranges over {turns} turns, so its angles mean little" in remarks[0]
 
 
-def test_scans_with_one_bearing_are_refused():
-    with pytest.raises(ValueError, match="all its ranges have the same bearing"):
-        taken(0.0, 0.0, 0.0)
-
-
 def test_short_scan_has_the_step_of_the_others():
     angles = [Angles(-math.pi, LAST, STEP)] * 3
     found, remarks = bearings(angles, np.array([360, 360, 90]))

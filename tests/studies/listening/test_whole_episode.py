@@ -8,7 +8,6 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 from worlds import Script
 
-from coil_rl.measures import Measure
 from coil_rl.run.judge import Evaluation
 from coil_rl.transforms import GuideActions
 from coil_studies.listening import WholeEpisode
@@ -106,13 +105,3 @@ def test_guides_are_removed_everywhere_only(found):
     for slot, row in enumerate(rows):
         for measure, values in found.measures.items():
             assert row[measure] == pytest.approx(values[:, slot].mean())
-
-
-def test_completed_share_is_shown_if_it_is_measured(found):
-    measures = {"completed": Measure("reward", "sum", at_least=100)}
-    evaluation = Evaluation(["a", "b"], measures, {})
-    intact = survey(world(), FOLLOW, SECTIONS, evaluation, donors=2)
-    removed, zero = [Ablation(0)], torch.zeros(2, 1)
-    (episodes,) = drive_ablated(world(), FOLLOW, SECTIONS, evaluation, removed, zero)
-    (row,) = table_by_section(intact, SECTIONS, evaluation, {removed[0]: episodes})
-    assert row["completed"] == 0.5
