@@ -37,7 +37,7 @@ from coil_rl.transforms.normalised_action import given_units, units_of
 if TYPE_CHECKING:
     from coil_rl.run.run import Run
 
-REST = 0.1  # of the frames: a larger one that stays unused is said
+REST = 0.1  # of the frames: a larger one that stays unused or is added is said
 INIT = "init.pt"  # a copy of the policy that a run began from
 
 
@@ -109,7 +109,7 @@ class Experiment(Stateful):
         The frames are rounded up to whole batches. What tests have taken, and what is kept for the
         last one, is left out of these, so that a run with tests takes no more frames than one
         without. At least one further update is left. If more than `REST` of the frames stay unused,
-        that is said.
+        or are added, that is said.
         """
         kept = 0 if self.reserve is None else self.reserve()
         batch, length = self.rollout.frames, self.budget.frames
@@ -119,9 +119,10 @@ class Experiment(Stateful):
                 updates = (whole - self.cases.steps - kept) // batch
                 self.ends[frames] = max(updates, self.updates + 1)
         rest = length - self.before - self.all_updates * batch - self.cases.steps - kept
-        if rest > REST * length and not self.updates:
+        if abs(rest) > REST * length and not self.updates:
+            done = "of {:,} frames stay unused" if rest > 0 else "frames are added to {:,}"
             say(
-                f"train: {rest:,} of {length:,} frames stay unused, because they are no whole "
+                f"train: {abs(rest):,} {done.format(length)}, because they are no whole "
                 f"batch of {batch:,}; take smaller batches (budget.steps) or more frames",
                 error=True,
             )

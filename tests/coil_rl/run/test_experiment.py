@@ -91,13 +91,25 @@ def test_tests_that_take_all_frames_leave_one_further_update(tmp_path):
     assert run.all_updates == 4
 
 
-@pytest.mark.parametrize(("kept", "rest"), [(0, None), (30, 98), (70, 58), (90, None)])
-def test_frames_that_are_no_whole_batch_beside_the_tests_are_said(tmp_path, capsys, kept, rest):
-    run = experiment(tmp_path / "run", frames=512)  # batches of 128
+@pytest.mark.parametrize(
+    ("frames", "kept", "message"),
+    [
+        (512, 0, ""),
+        (512, 30, "train: 98 of 512 frames stay unused, "),
+        (512, 70, "train: 58 of 512 frames stay unused, "),
+        (512, 90, ""),
+        (500, 0, ""),
+        (50, 0, "train: 78 frames are added to 50, because they are no whole batch of 128; "),
+    ],
+)
+def test_frames_that_are_no_whole_batch_beside_the_tests_are_said(
+    tmp_path, capsys, frames, kept, message
+):
+    run = experiment(tmp_path / "run", frames=frames)  # batches of 128
     run.reserve, run.first = lambda: kept, {"frames": 0}
     run._plan()
     said = capsys.readouterr().err
-    assert (f"{rest} of 512 frames stay unused" in said) if rest else not said
+    assert message in said if message else not said
 
 
 class Killed(BaseException):
