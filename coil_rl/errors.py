@@ -72,9 +72,12 @@ def file_of_a_run(path: Path, remedy: str) -> Iterator[None]:
 def did_you_mean(given: str, known: Iterable[str]) -> str:
     """Return `; did you mean X?` with the most similar known name, or an empty string.
 
+    Of several similar ones it is one that begins with the given name.
+
     Args:
         given: the unknown name.
         known: the names that exist.
     """
-    similar = difflib.get_close_matches(given, list(known), n=1)
-    return f"; did you mean {similar[0]}?" if similar else ""
+    similar = difflib.get_close_matches(given, list(known))  # the most similar first
+    best = max(similar, key=lambda name: name.startswith(given), default="")
+    return f"; did you mean {best}?" if best else ""

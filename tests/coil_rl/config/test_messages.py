@@ -63,6 +63,7 @@ IN_CONES = [
     # groups
     ("guide=[spline,centre_fst]", "guide can be authors, "),
     ("degrade=[noise]", "; did you mean noisy?"),
+    ("guide=centre", "; did you mean centre_fast?"),
     ("+guide=random", "To override a value use 'override guide: random'"),
     ("hydra/launcher=submitit_slurm", "not installed: python -m pip install 'coil-rl[slurm]'"),
     ("+degrade=${pid:}", "cannot be composed; give each group a name, GROUP=CHOICE"),
