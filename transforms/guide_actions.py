@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
@@ -33,18 +33,9 @@ from coil_rl.transforms.normalised_action import ActionUnits
 
 
 class UnfitActionError(ValueError):
-    """The action of a guide does not fit the env.
-
-    Args:
-        guide: name of the guide.
-        problem: says why, as the end of a sentence.
-    """
+    """The action of a guide does not fit the env."""
 
     outside: ClassVar[bool] = True  # the cause is not in this program
-
-    def __init__(self, guide: str, problem: str) -> None:
-        super().__init__(f"the action of guide {guide!r} {problem}")
-        self.problem = problem
 
 
 def unfit_action(
@@ -65,7 +56,7 @@ def unfit_action(
     own = None
     if isinstance(guide, HostedGuide):
         own = guide.unfit(action, batch, space, problem)
-    return own or UnfitActionError(name, problem)
+    return own or UnfitActionError(f"the action of guide {name!r} {problem}")
 
 
 @dataclass(frozen=True)
@@ -192,7 +183,8 @@ class Guides(TensorDictModuleBase):
         guide = self.guides[name]
         data = tensordict.select(*self._in_keys_of[name], strict=False)
         if name in self._input_dtype:
-            data = data.apply(partial(_converted, dtype=self._input_dtype[name]))
+            dtype = self._input_dtype[name]
+            data = data.apply(lambda each: each.to(dtype) if each.is_floating_point() else each)
         if memory is not None and name in self.memories:
             data = guide(self.memories[name].given_to(data, memory))
             self.memories[name].kept(data, memory)
@@ -238,11 +230,6 @@ def _check_guide(name: str, guide: TensorDictModuleBase, action_key: NestedKey) 
         raise ValueError(
             f"{name!r} cannot be the name of a guide: PyTorch reserves it; use another name"
         )
-
-
-def _converted(value: Tensor, dtype: torch.dtype) -> Tensor:
-    """Convert floating-point numbers to another dtype, and leave other entries as they are."""
-    return value.to(dtype) if value.is_floating_point() else value
 
 
 class GuideActions(ActionTransform):
@@ -298,6 +285,8 @@ class GuideActions(ActionTransform):
         if any(map(_is_by_row, module.guides.values())):
             self.passed = (self.out_keys[0],)
         self.calls = 0  # number of actions that guides were asked for
+        # Their last advice by name in the unit of the env, where somebody listens.
+        self.heard: dict[str, Tensor] | None = None
         self.rests = False
 
     @cached_property
@@ -464,6 +453,8 @@ class GuideActions(ActionTransform):
                     self.guide_space.check_advice(action, batch)
                     self._checked.add(name)
             advice = self.guide_space.advice(action, batch)
+            if self.heard is not None:
+                self.heard[name] = advice.clone()
         except ValueError as error:
             raise unfit_action(name, guide, action, batch, self.guide_space, str(error)) from None
         return self.observed(advice)

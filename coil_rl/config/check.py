@@ -39,7 +39,6 @@ from coil_rl.run.folder import HANDED_OVER, weights_file
 from coil_rl.run.parts import SOME_ROWS, TEST, TRAIN, EnvMaker, transformed, try_out
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key, written_key
-from coil_rl.transforms.guide_actions import UnfitActionError
 
 # Kind of a learner: description and example.
 KINDS = {
@@ -477,7 +476,7 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
         UserError: if the env lacks an entry that the guide reads, or its action does not fit.
     """
     try:
-        transform = GuideActions({"guide": guide})
+        transform = GuideActions({name.rpartition(".")[2]: guide})
         memory = (key for each in transform.guides.memories.values() for key in each.specs)
         known = [*env.observation_spec.keys(True), *transform.supplied, *memory]
         for key in guide.in_keys:
@@ -491,8 +490,6 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
         advised = TransformedEnv(env, transform)
         advised.step(FollowAdvice(advised)(advised.reset()))
         advised.state_dict()  # a state that no checkpoint can hold is refused before the training
-    except UnfitActionError as error:
-        raise UserError(f"{name}: its action {error.problem}") from error
     except ForeignError as error:  # its sentence says whether the env or the guide is at fault
         raise UserError(str(error)) from error
     except (KeyError, TypeError, ValueError) as error:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,7 +93,8 @@ def record(
     env = transformed(bare(1, TRAIN, None), [], "env").eval()
     env.set_seed(seed)
     steps = list[Step]()
-    heard = None if controller.guides is None else Heard(controller.guides)
+    if controller.guides is not None:
+        controller.guides.heard = {}
     episode, age, done = -1, 0, True
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -106,8 +106,8 @@ def record(
             copied, before = entries.clone(), time.process_time()
             action = controller.act_on(copied)
             seconds = time.process_time() - before
-            if heard is not None:
-                entries[ADVICE] = heard.advice()
+            if controller.guides is not None:
+                entries[ADVICE] = heard(controller.guides)
             steps.append(Step(entries, age == 0, action.clone(), seconds))
             carrier.set(env.action_key, action)
             if episode % 2 and float(torch.rand(())) < DRAWN:
@@ -115,40 +115,19 @@ def record(
             after = env.step(carrier)
             carrier, age, done = env.step_mdp(after), age + 1, bool(after["next", "done"].any())
             tick()
-    if heard is not None:
-        heard.close()
+    if controller.guides is not None:
+        controller.guides.heard = None
     return steps
 
 
-class Heard:
-    """The last advice of the guides of a controller, of which there is at least one.
+def heard(guides: GuideActions) -> Tensor:
+    """Return the last actions of all guides in the unit and numbering of the env.
 
     Args:
-        guides: of the controller.
+        guides: whose `heard` was not None.
     """
-
-    def __init__(self, guides: GuideActions) -> None:
-        self.guides = guides
-        self.actions: dict[str, Tensor] = {}
-        self.hooks = [
-            guide.register_forward_hook(partial(self._listen, name))
-            for name, guide in guides.guides.guides.items()
-        ]
-
-    def _listen(self, name: str, module: Any, arguments: Any, written: TensorDictBase) -> None:
-        self.actions[name] = written[self.guides.action_key].clone()
-
-    def advice(self) -> Tensor:
-        """Return the last actions of all guides in the unit and numbering of the env."""
-        space: ActionSpace = self.guides.guide_space
-        own = [self.actions[name] for name in self.guides.names]
-        vectors = [space.advice(action, action.shape[:1]) for action in own]
-        return torch.stack([numbered(space, each) for each in vectors], -2)
-
-    def close(self) -> None:
-        """Listen no longer."""
-        for hook in self.hooks:
-            hook.remove()
+    vectors = [(guides.heard or {})[name] for name in guides.names]
+    return torch.stack([numbered(guides.guide_space, each) for each in vectors], -2)
 
 
 def numbered(space: ActionSpace, vectors: Tensor) -> Tensor:

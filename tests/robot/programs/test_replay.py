@@ -220,7 +220,7 @@ def test_equal_labels_are_distinguished_by_seed_and_then_by_number():
         ("recording=drive.mcap guide=[]", "there is no policy; give a guide"),
         (
             "recording=drive.mcap guide=constant guide.constant.value=[1,2]",
-            "its action has the shape [1, 2]",
+            "guide.constant: the action of guide 'constant' has the shape [1, 2]",
         ),
         ("recording=drive.mcap runs=[nowhere]", "nowhere is not the folder of a run"),
         ("recording=drive.mcap runs=[guide]", "guide has no agent: its guide drives alone"),
