@@ -37,16 +37,6 @@ def checksum(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def place_of(file: str | Path) -> Path:
-    """Return the file of an exported policy for its own name or that of its folder.
-
-    Args:
-        file: `policy.onnx`, or the folder that holds it.
-    """
-    path = Path(file).expanduser()
-    return path / ONNX if path.is_dir() else path
-
-
 def read_contract(file: Path) -> tuple[dict[str, Any], bytes]:
     """Return the contract of an exported policy, and the content of its file.
 

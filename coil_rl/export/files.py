@@ -17,6 +17,7 @@ from torch.export import Dim, ExportedProgram
 from torchrl.envs import ExplorationType, set_exploration_type
 
 from coil_rl.export.step import NotExportableError, PolicyStep
+from coil_rl.foreign.guard import Guard
 
 OPSET = 20
 ROWS = 3  # of the example with which a step is traced
@@ -158,16 +159,12 @@ def explained(content: bytes, contract: Mapping[str, Any]) -> bytes:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence what the libraries say about themselves in the block."""
-    disabled = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
-            with redirect_stderr(io.StringIO()):
-                yield
-    finally:
-        logging.disable(disabled)
+    """Silence what the libraries say about themselves in the block, and undo what they set."""
+    said = redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO())
+    with Guard(), warnings.catch_warnings(), said[0], said[1]:
+        logging.disable(logging.WARNING)
+        warnings.simplefilter("ignore")
+        yield
 
 
 def _reason(error: BaseException) -> str:

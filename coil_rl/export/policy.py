@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coil_rl.export.contract import ADVICE, place_of, read_contract
+from coil_rl.export.contract import ADVICE, ONNX, read_contract
 from coil_rl.export.session import Session
 from coil_rl.foreign.faults import shown
 
@@ -40,7 +40,8 @@ class ExportedPolicy:
     """
 
     def __init__(self, file: str | Path, threads: int = 1) -> None:
-        self.file = place_of(file)
+        path = Path(file).expanduser()
+        self.file = path / ONNX if path.is_dir() else path
         self.contract, content = read_contract(self.file)
         names = ["action", *(entry["output"] for entry in self.contract["state"])]
         self.session = Session(content, names, threads)
