@@ -81,32 +81,26 @@ def _checking(function: Any, title: str) -> Any:
     """Return a function that checks its arguments; `title` is its name in messages."""
 
     @cache  # not before the first call, because pydantic takes a while
-    def bounds() -> tuple[inspect.Signature, dict[str, "TypeAdapter[Any]"], tuple[str, set[str]]]:
+    def bounds() -> tuple[inspect.Signature, dict[str, "TypeAdapter[Any]"], dict[str, set[str]]]:
         signature = inspect.signature(function, eval_str=True)
         annotations = {name: each.annotation for name, each in signature.parameters.items()}
         adapters = {name: adapter(each) for name, each in annotations.items() if bounded(each)}
-        return signature, adapters, _settings(signature)
+        settings = {name: settings_of(each) for name, each in signature.parameters.items()}
+        return signature, adapters, {k: each for k, each in settings.items() if each is not None}
 
     @wraps(function)
     def call(*given: Any, **named: Any) -> Any:
-        signature, adapters, (settings, known) = bounds()
+        signature, adapters, settings = bounds()
         arguments = signature.bind(*given, **named).arguments
-        if unknown := set(arguments.get(settings, ())) - known:
-            raise TypeError(f"{title} takes no {', '.join(sorted(unknown))}")
+        for name, known in settings.items():
+            if unknown := set(arguments.get(name, ())) - known:
+                raise TypeError(f"{title} takes no {', '.join(sorted(unknown))}")
         for name, allowed in adapters.items():
             if name in arguments:
                 _check(name, arguments[name], allowed)
         return function(*given, **named)
 
     return call
-
-
-def _settings(signature: inspect.Signature) -> tuple[str, set[str]]:
-    """Return the name of `**settings: Unpack[Settings]`, and the arguments it stands for."""
-    for name, parameter in signature.parameters.items():
-        if (known := settings_of(parameter)) is not None:
-            return name, known
-    return "", set()
 
 
 def settings_of(parameter: inspect.Parameter) -> set[str] | None:

@@ -295,17 +295,14 @@ class Actions:
         is_box = isinstance(space, spaces.Box)
         self.whole = is_box and np.issubdtype(space.dtype, np.integer)
         self.real = is_box and not self.whole
-        self._check()
         self.spec = self._spec()
         self.own_shape = space.shape if self.real and len(space.shape) > 1 else None
         self.lowest = space.low.astype(np.int64) if self.whole else _start(space)
         lowest = torch.as_tensor(self.lowest).reshape(-1)
         self.first = lowest if lowest.any() else None
 
-    def _check(self) -> None:
+    def _check_box(self) -> None:
         space = self.space
-        if not isinstance(space, spaces.Box):
-            return
         if 0 in space.shape:
             raise ValueError(
                 f"the action of {self.name} has the shape {list(space.shape)}: it has no number"
@@ -320,10 +317,9 @@ class Actions:
 
     def _spec(self) -> TensorSpec:
         space = self.space
-        if self.whole:
-            return self._of_whole_numbers()
-        if self.real:
-            return self._of_real_numbers()
+        if isinstance(space, spaces.Box):
+            self._check_box()
+            return self._of_whole_numbers() if self.whole else self._of_real_numbers()
         if isinstance(space, spaces.Discrete):
             return Categorical(int(space.n), dtype=torch.int64)
         if isinstance(space, spaces.MultiDiscrete) and len(space.shape) == 1:

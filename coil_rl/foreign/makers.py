@@ -20,6 +20,11 @@ from coil_rl.foreign.limit import layers
 # What an error about a missing package mentions, and the extra of coil-rl that installs it.
 EXTRAS = {"box2d": "gym", "pygame": "gym", "mujoco": "mujoco", "minigrid": "babyai"}
 
+# Wrappers that normalise by statistics, and what to do instead.
+STATISTICS = {
+    "NormalizeObservation": " and give learner.normalise=true",
+    "NormalizeReward": ", returns are the env's own",
+}
 SPACES = ("action_space", "observation_space")
 Env = gymnasium.Env[Any, Any]
 
@@ -97,18 +102,12 @@ def make_env(
 def _check_statistics(env: Env, name: str) -> None:
     """Refuse wrappers that normalise by statistics, which a new env of an evaluation lacks."""
     for layer in layers(env):
-        kinds = {kind.__name__ for kind in type(layer).__mro__}
-        if any(kind.startswith("NormalizeObservation") for kind in kinds):
-            raise ValueError(
-                f"the env {name} has the wrapper {type(layer).__name__}, whose statistics an "
-                "evaluation begins anew; leave it out and give learner.normalise=true"
-            )
-        if any(kind.startswith("NormalizeReward") for kind in kinds):
-            raise ValueError(
-                f"the env {name} has the wrapper {type(layer).__name__}, which changes the returns "
-                "that a table shows by statistics of its own; leave it out, returns are the env's "
-                "own"
-            )
+        for kind, remedy in STATISTICS.items():
+            if any(each.__name__.startswith(kind) for each in type(layer).__mro__):
+                raise ValueError(
+                    f"the env {name} has the wrapper {type(layer).__name__}, whose statistics an "
+                    f"evaluation begins anew; leave it out{remedy}"
+                )
 
 
 def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:

@@ -206,27 +206,26 @@ def choose(
 def timed(make: MakeRows, draw: Callable[[], Any]) -> float | None:
     """Return the duration of a step of one row in seconds; None if a step fails.
 
-    It is the shortest CPU time of some steps plus the shortest time that one of them waited, so
-    that a busy machine changes little. The first step is left out.
+    It is that of the shortest of some steps, which a busy machine changes little. The first step is
+    left out.
     """
     with (
         warnings.catch_warnings(action="ignore"),
         suppress(Exception),  # the rows of the batch raise the same error
         closing(make(range(1))) as shard,
     ):
-        taken, waits = list[float](), list[float]()
+        taken = list[float]()
         shard.begin({0: 0}, {})
         shard.step([draw()])
         for number in range(MOST_STEPS):
-            if number >= LEAST_STEPS and sum(taken + waits) >= LONGEST:
+            if number >= LEAST_STEPS and sum(taken) >= LONGEST:
                 break
-            began, own = time.perf_counter(), time.process_time()
+            began = time.perf_counter()
             (entries,) = shard.step([draw()])
-            taken.append(time.process_time() - own)
-            waits.append(time.perf_counter() - began - taken[-1])
+            taken.append(time.perf_counter() - began)
             if entries["done"].any():
                 shard.begin({0: len(taken)}, {})
-        return min(taken) + max(min(waits), 0.0)
+        return min(taken)
     return None
 
 

@@ -183,13 +183,11 @@ class Imitation(Learner):
             raise UserError(f"there is no data set {file}; give the dataset.pt of a run")
         dataset = _from_dict(checkpoint.load(file))
         expected = self._pairs(env.fake_tensordict())
-        keys = list(expected.keys(True, True))
+        keys, known = list(expected.keys(True, True)), dataset.keys(True, True)
         for key in keys:
             needed = list(expected[key].shape[1:])
-            found = "missing"
-            if key in dataset.keys(True, True):
-                found = str(list(dataset[key].shape[1:]))
-            if found != str(needed):
+            found = list(dataset[key].shape[1:]) if key in known else "missing"
+            if found != needed:
                 raise UserError(
                     f"{file} is a data set of another env: {key} is {found}, but must be {needed}; "
                     "give another data set, or none"
