@@ -5,7 +5,6 @@ with it, and a rollout does so in each step. The samples are the same to the bit
 """
 
 import math
-from abc import ABC, abstractmethod
 
 import torch
 from torch import Tensor
@@ -15,43 +14,7 @@ from torch.nn import functional as F
 LOG_ROOT = math.log(math.sqrt(2 * math.pi))  # of a normal density
 
 
-class Density(ABC):
-    """A distribution of actions, of `event_dims` dimensions, for each row of a batch."""
-
-    event_dims: int
-
-    @abstractmethod
-    def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return a sample [*batch, *event] and its logarithmic density [*batch].
-
-        Args:
-            noise: standard normal numbers of the shape of an action, which a normal distribution
-                takes; None: new random numbers.
-        """
-
-    @abstractmethod
-    def log_prob(self, sample: Tensor) -> Tensor:
-        """Return the logarithmic density [*batch] of a sample."""
-
-    @abstractmethod
-    def entropy(self) -> Tensor:
-        """Return the entropy [*batch]; where it has no formula, an estimate by one sample."""
-
-    @property
-    @abstractmethod
-    def mode(self) -> Tensor:
-        """The deterministic action."""
-
-    @abstractmethod
-    def divergence(self, other: "Density") -> Tensor:
-        """Return the divergence KL(self || other) [*batch] from a distribution of this kind."""
-
-    def summed(self, values: Tensor) -> Tensor:
-        """Return the sums over the numbers or choices of an action."""
-        return values.flatten(-self.event_dims).sum(-1) if self.event_dims else values
-
-
-class Normal(Density):
+class Normal:
     """Independent normal numbers.
 
     Args:
@@ -66,11 +29,15 @@ class Normal(Density):
     def drawn(self) -> tuple[Tensor, Tensor]:
         """Return random normal numbers, and their logarithmic normal density [*batch]."""
         noise = torch.empty(self.loc.shape, dtype=self.loc.dtype, device=self.loc.device).normal_()
-        log_prob = self.summed(-noise.square() / 2 - self.scale.log() - LOG_ROOT)
+        log_prob = summed(-noise.square() / 2 - self.scale.log() - LOG_ROOT, self.event_dims)
         return self.loc + noise * self.scale, log_prob
 
     def draw(self, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return a sample and its logarithmic density."""
+        """Return a sample [*batch, *event] and its logarithmic density [*batch].
+
+        Args:
+            noise: standard normal numbers of the shape of an action; None: new random numbers.
+        """
         if noise is None:
             return self.drawn()
         number = self.loc + noise * self.scale
@@ -79,22 +46,21 @@ class Normal(Density):
     def log_prob(self, sample: Tensor) -> Tensor:
         """Return the logarithmic density of a sample."""
         squares = -(sample - self.loc).square() / (2 * self.scale.square())
-        return self.summed(squares - self.scale.log() - LOG_ROOT)
+        return summed(squares - self.scale.log() - LOG_ROOT, self.event_dims)
 
     def entropy(self) -> Tensor:
         """Return the entropy."""
-        return self.summed(0.5 + 0.5 * math.log(2 * math.pi) + self.scale.log())
+        return summed(0.5 + 0.5 * math.log(2 * math.pi) + self.scale.log(), self.event_dims)
 
     @property
     def mode(self) -> Tensor:
         """The means."""
         return self.loc
 
-    def divergence(self, other: Density) -> Tensor:
-        """Return KL(self || other); squashing both does not change it."""
-        loc, scale = other.loc, other.scale  # type: ignore[attr-defined]
-        ratio, distance = self.scale / scale, (self.loc - loc) / scale
-        return self.summed(0.5 * (ratio.square() + distance.square() - 1) - ratio.log())
+    def divergence(self, other: "Normal") -> Tensor:
+        """Return the divergence KL(self || other) [*batch]; squashing both does not change it."""
+        ratio, distance = self.scale / other.scale, (self.loc - other.loc) / other.scale
+        return summed(0.5 * (ratio.square() + distance.square() - 1) - ratio.log(), self.event_dims)
 
 
 class SquashedNormal(Normal):
@@ -161,7 +127,7 @@ class SquashedNormal(Normal):
         slopes = 2.0 * (math.log(2.0) - number - F.softplus(-2.0 * number))
         if self.bounds is not None:
             slopes = slopes + ((self.bounds[1] - self.bounds[0]) / 2).log()
-        return self.summed(slopes)
+        return summed(slopes, self.event_dims)
 
     def _clamp(self, sample: Tensor) -> Tensor:
         """Return samples as TorchRL keeps them from the bounds."""
@@ -169,7 +135,7 @@ class SquashedNormal(Normal):
         return sample.clamp(-limit, limit)
 
 
-class Choices(Density):
+class Choices:
     """Independent choices, each as the index of one of several options.
 
     Args:
@@ -188,12 +154,16 @@ class Choices(Density):
 
     def log_prob(self, sample: Tensor) -> Tensor:
         """Return the logarithmic probability of a sample."""
-        return self.summed(self.logits.gather(-1, sample.long().unsqueeze(-1)).squeeze(-1))
+        return summed(
+            self.logits.gather(-1, sample.long().unsqueeze(-1)).squeeze(-1), self.event_dims
+        )
 
     def entropy(self) -> Tensor:
         """Return the entropy."""
         floor = torch.finfo(self.logits.dtype).min
-        return self.summed(-(self.logits.clamp(min=floor) * self.logits.softmax(-1)).sum(-1))
+        return summed(
+            -(self.logits.clamp(min=floor) * self.logits.softmax(-1)).sum(-1), self.event_dims
+        )
 
     @property
     def mode(self) -> Tensor:
@@ -206,10 +176,10 @@ class Choices(Density):
         event = self.logits[(0,) * (self.logits.ndim - self.event_dims - 1)]
         return event > padding(self.logits.dtype) / 2
 
-    def divergence(self, other: Density) -> Tensor:
-        """Return KL(self || other)."""
-        own, others = (Categorical(logits=each.logits) for each in (self, other))  # type: ignore[attr-defined]
-        return self.summed(kl_divergence(own, others))
+    def divergence(self, other: "Choices") -> Tensor:
+        """Return the divergence KL(self || other) [*batch]."""
+        own, others = (Categorical(logits=each.logits) for each in (self, other))
+        return summed(kl_divergence(own, others), self.event_dims)
 
 
 class OneHotChoice(Choices):
@@ -233,3 +203,11 @@ class OneHotChoice(Choices):
 def padding(dtype: torch.dtype) -> float:
     """Return the logit of what is no option: finite, with a probability of exactly 0."""
     return torch.finfo(dtype).min / 2
+
+
+def summed(values: Tensor, event_dims: int) -> Tensor:
+    """Return the sums over the numbers or choices of an action, of `event_dims` dimensions."""
+    return values.flatten(-event_dims).sum(-1) if event_dims else values
+
+
+Density = Normal | Choices  # what a policy samples from
