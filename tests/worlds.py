@@ -41,11 +41,14 @@ def cones(*transforms, cars=6) -> TransformedEnv:
     return TransformedEnv(env, Compose(GuideActions({"spline": SplineGuide()}), *transforms))
 
 
+def acting(function, *keys, out="action") -> TensorDictModule:
+    """Return a module that writes what a function makes of some entries."""
+    return TensorDictModule(function, in_keys=[*keys], out_keys=[out])
+
+
 def pendulum(*transforms) -> TransformedEnv:
     """Return one pendulum without a batch, torque in [-2, 2]; the guide damps it."""
-    damp = TensorDictModule(
-        lambda speed: -speed.unsqueeze(-1).clamp(-2, 2), in_keys=["thdot"], out_keys=["action"]
-    )
+    damp = acting(lambda speed: -speed.unsqueeze(-1).clamp(-2, 2), "thdot")
     return TransformedEnv(PendulumEnv(), Compose(GuideActions({"damp": damp}), *transforms))
 
 
@@ -59,7 +62,7 @@ def carts(*transforms, categorical=True) -> TransformedEnv:
     def make() -> EnvBase:
         return GymEnv("CartPole-v1", categorical_action_encoding=categorical)
 
-    guide = TensorDictModule(lean, in_keys=["observation"], out_keys=["action"])
+    guide = acting(lean, "observation")
     return TransformedEnv(SerialEnv(2, make), Compose(GuideActions({"lean": guide}), *transforms))
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 import worlds
 from gymnasium import spaces
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Unbounded
 from torchrl.envs import (
     GymEnv,
@@ -116,13 +116,9 @@ def test_guides_with_a_memory_pass():
     check_guide(Guide(), cones())
     check_guide(PerRow(OneNumber, ["steering"]), cones())
     check_guide(SplineGuide(), cones())
-    lean = TensorDictModule(
-        lambda x: (x[..., 2] > 0).long(), in_keys=["observation"], out_keys=["action"]
-    )
+    lean = worlds.acting(lambda x: (x[..., 2] > 0).long(), "observation")
     check_guide(lean, worlds.carts().base_env)
-    turn = TensorDictModule(
-        lambda x: -x.unsqueeze(-1).clamp(-2, 2), in_keys=["thdot"], out_keys=["action"]
-    )
+    turn = worlds.acting(lambda x: -x.unsqueeze(-1).clamp(-2, 2), "thdot")
     check_guide(turn, PendulumEnv())
 
 

@@ -1,16 +1,14 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from worlds import acting
 
 from coil_rl.run.evaluation import EvaluationResult
 from coil_studies.fallback import FallbackPolicy
 
 
 def constant(number):
-    return TensorDictModule(
-        lambda x: torch.full_like(x, number), in_keys=["observation"], out_keys=["action"]
-    )
+    return acting(lambda x: torch.full_like(x, number), "observation")
 
 
 def result_of(rewards, steps=1):
@@ -18,7 +16,7 @@ def result_of(rewards, steps=1):
 
 
 def test_guide_acts_from_a_low_value_on_until_a_high_one():
-    critic = TensorDictModule(lambda x: x, in_keys=["observation"], out_keys=["state_value"])
+    critic = acting(lambda x: x, "observation", out="state_value")
     fallback = FallbackPolicy(constant(0.0), critic, constant(1.0), leave=2.0, back=5.0)
     values = torch.tensor([[3.0, 1, 4, 6, 3, 1], [6.0, 6, 2, 1.9, 2.1, 4.9]])
     actions = [

@@ -3,7 +3,6 @@
 import pytest
 import torch
 from any_env import AnyEnv
-from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.nn.functional import one_hot
 from torchrl.data import (
@@ -16,6 +15,7 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import Compose, TransformedEnv
+from worlds import acting
 
 from coil_rl.guides import FollowAdvice, RandomGuide
 from coil_rl.testing import check_env
@@ -50,7 +50,7 @@ class Copies(AnyEnv):
 
 
 def guided(action, give, **options):
-    guide = TensorDictModule(give, in_keys=["observation"], out_keys=["action"])
+    guide = acting(give, "observation")
     return TransformedEnv(Copies(action, **options), GuideActions({"give": guide}))
 
 
@@ -125,10 +125,10 @@ KEYS = {"action_key": ("agents", "action"), "advice_key": ("agents", "advice")}
 def test_advice_of_several_agents(number):
     """Each agent of a row has its own advice; the other transforms find it under nested keys."""
     spec = Bounded(-9, 9, (4, 3, 1)) if number else Categorical(5, (4, 3))
-    guide = TensorDictModule(
+    guide = acting(
         lambda x: (x[..., :1] if number else x[..., 0].long()).clamp(max=4),
-        in_keys=[("agents", "observation")],
-        out_keys=[("agents", "action")],
+        ("agents", "observation"),
+        out=("agents", "action"),
     )
     guides = GuideActions({"count": guide}, ["agents", "action"], ["agents", "advice"])
     mixed = [ResidualAction(0.0, **KEYS), MixedAction(1.0, **KEYS)]
@@ -149,9 +149,7 @@ def test_advice_of_several_agents(number):
 
 def test_removed_advice_is_the_last_action_of_several_choices():
     spec = MultiCategorical([3, 2], (4, 2))
-    guide = TensorDictModule(
-        lambda x: MULTI[x[:, 0].long()], in_keys=["observation"], out_keys=["action"]
-    )
+    guide = acting(lambda x: MULTI[x[:, 0].long()], "observation")
     env = TransformedEnv(Copies(spec), Compose(GuideActions({"a": guide}), RemovedAdvice()))
     check_env(env, steps=2)
     action = torch.tensor([[2, 1], [0, 0], [1, 1], [0, 1]])

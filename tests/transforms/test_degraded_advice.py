@@ -104,7 +104,7 @@ def test_files_compose_in_the_given_order_with_the_seed():
 )
 def test_known_numbers_within_the_bounds_of_the_env_and_in_stored_data(transforms, expected):
     advice = torch.tensor([-0.5, 0.25, 0.5] * 2).view(CARS, 1, 1)
-    guide = TensorDictModule(lambda _: advice.squeeze(1), in_keys=["steering"], out_keys=["action"])
+    guide = worlds.acting(lambda _: advice.squeeze(1), "steering")
     env = cone_env(*transforms, guide=guide)
     assert env.reset()["guide_action"].flatten().tolist() == expected * 2
     if len(transforms) == 1:
@@ -156,9 +156,7 @@ def test_nothing_is_said_where_choices_are_degraded(make):
 @pytest.mark.filterwarnings("error:degrade=")
 def test_choices_made_of_a_number_are_degraded_as_numbers():
     say_for_numbers.cache_clear()
-    guide = TensorDictModule(
-        lambda _: torch.full((CARS, 1), 0.5), in_keys=["steering"], out_keys=["action"]
-    )
+    guide = worlds.acting(lambda _: torch.full((CARS, 1), 0.5), "steering")
     env = cone_env(ScaledAdvice(0.5), DiscreteActions(5), guide=guide)
     assert env.reset()["guide_number"].eq(0.25).all()
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
+from worlds import acting
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.transforms import (
@@ -18,9 +18,7 @@ from coil_rl.transforms import (
 def advised(advice, *transforms, choices=5):
     """One car for each number, with that number as constant advice."""
     env = ConeTrackEnv(shipped_tracks("test")[:1], len(advice), rate=6)
-    guide = TensorDictModule(
-        lambda _: torch.tensor(advice).unsqueeze(-1), in_keys=["steering"], out_keys=["action"]
-    )
+    guide = acting(lambda _: torch.tensor(advice).unsqueeze(-1), "steering")
     env = TransformedEnv(
         env, Compose(GuideActions({"constant": guide}), *transforms, DiscreteActions(choices))
     )

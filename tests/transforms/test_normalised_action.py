@@ -5,8 +5,8 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from plants import Plant
-from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
+from worlds import acting
 
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
 from coil_rl.guides import ConstantGuide, ZeroGuide
@@ -153,7 +153,7 @@ def test_guide_reads_its_last_action_in_the_unit_of_the_env():
         seen.append(last.clone())
         return torch.full_like(last, 140.0)
 
-    guide = TensorDictModule(act, in_keys=["last_action"], out_keys=["action"])
+    guide = acting(act, "last_action")
     followed(advised(box([100], [300]), guide))
     assert [round(float(each)) for each in seen[1:]] == [140, 140, 140]
 
@@ -167,7 +167,7 @@ def test_action_beyond_the_bounds_counts_as_the_bound_in_any_unit(low, high, nor
         seen.append(float(last))
         return torch.full_like(last, low)
 
-    guide = TensorDictModule(act, in_keys=["last_action"], out_keys=["action"])
+    guide = acting(act, "last_action")
     env = advised(box([low], [high]), guide, RewardCoupling(1.0), normalised=normalised)
     below = -3.0 if normalised else low - 3.0
     after = env.step(env.reset().set("action", torch.tensor([[below]])))["next"]

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 from tabular_env import TabularEnv
-from tensordict.nn import TensorDictModule
 from torch.nn import functional as F
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from worlds import acting
 
 from coil_paper.tabular import garnet, toymaker, value_iteration
 from coil_rl.learners import DQN
@@ -81,9 +81,7 @@ def test_epsilon_follows_its_schedule():
 )
 def test_dqn_finds_the_optimal_policy_of_a_table(mdp, key):
     optimal = torch.as_tensor(value_iteration(mdp).policy)
-    guide = TensorDictModule(
-        lambda state: optimal[state.argmax(-1)], in_keys=["observation"], out_keys=["action"]
-    )
+    guide = acting(lambda state: optimal[state.argmax(-1)], "observation")
     env = TransformedEnv(table(mdp, max_steps=1_000), GuideActions({"optimal": guide}))
     options = {
         "gamma": mdp.gamma,

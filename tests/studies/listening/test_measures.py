@@ -1,10 +1,10 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictSequential
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from worlds import cones
+from worlds import acting, cones
 
 from coil_rl.learners import PPO
 from coil_studies.listening.measures import (
@@ -92,9 +92,7 @@ def double(state):
 
 
 def test_intercepted_policy_acts_on_changed_advice_and_leaves_that_of_the_env():
-    follow = TensorDictModule(
-        lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"]
-    )
+    follow = acting(lambda advice: advice[:, 0], "guide_action")
     state = cones().reset()
     advice = state["guide_action"].clone()
     acted = InterceptedPolicy(follow, double)(state)
@@ -106,9 +104,7 @@ def test_intercepted_policy_acts_on_changed_advice_and_leaves_that_of_the_env():
 def test_advice_of_the_first_module_of_a_policy_is_intercepted(mode):
     env = cones()
     actor = PPO(env, ["observation", "guide_action"], action_gain=1.0).policy
-    advise = TensorDictModule(
-        lambda seen: seen[:, None, :1], in_keys=["observation"], out_keys=["guide_action"]
-    )
+    advise = acting(lambda seen: seen[:, None, :1], "observation", out="guide_action")
     dynamic = ProbabilisticTensorDictSequential(advise, *actor.module)
     state = env.reset().exclude("guide_action")
     actions = []

@@ -2,9 +2,8 @@ import pytest
 import torch
 from ovals import oval_track
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
-from worlds import driving_measures
+from worlds import acting, driving_measures
 
 from coil_rl.envs import ConeTrackEnv, SimulatedRobotEnv
 from coil_rl.guides import RandomGuide, SplineGuide
@@ -28,9 +27,7 @@ EVALUATION = Evaluation(
 
 def follow(slot):
     """Return a policy that does what a guide says."""
-    return TensorDictModule(
-        lambda advice: advice[:, slot], in_keys=["guide_action"], out_keys=["action"]
-    )
+    return acting(lambda advice: advice[:, slot], "guide_action")
 
 
 FOLLOW = follow(0)
@@ -84,7 +81,7 @@ def test_advice_is_replaced_in_its_section_only():
         return advice[:, 1]
 
     keys = ["guide_action", ("info", "pose"), ("info", "track")]
-    agent = TensorDictModule(act, in_keys=keys, out_keys=["action"])
+    agent = acting(act, *keys)
     guides = {"noise": RandomGuide(0.5, 1.0), "spline": SplineGuide()}
     env = TransformedEnv(cars(4, seconds=15), GuideActions(guides))
     left, replacement = SECTIONS.index("left"), torch.tensor([[0.25], [0.0]])

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 from programs import read_csv
-from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
-from worlds import Script
+from worlds import Script, acting
 
 from coil_rl.run.judge import Evaluation
 from coil_rl.transforms import GuideActions
@@ -22,9 +21,8 @@ from coil_studies.listening.survey import (
 LENGTHS = [250, 3, 7, 120]
 SECTIONS = WholeEpisode()
 EVALUATION = Evaluation(["a", "b"], {}, {})
-KEYS = {"in_keys": ["guide_action"], "out_keys": ["action"]}
-FOLLOW = TensorDictModule(lambda advice: advice[:, 0], **KEYS)
-CHOOSE = TensorDictModule(lambda advice: (advice[:, 0] > 0).to(advice.dtype), **KEYS)
+FOLLOW = acting(lambda advice: advice[:, 0], "guide_action")
+CHOOSE = acting(lambda advice: (advice[:, 0] > 0).to(advice.dtype), "guide_action")
 FILES = {"listening.csv", "listening.png", "listening_agreement.png", "listening_gradient.png"}
 
 
@@ -32,10 +30,9 @@ def world(copies=1):
     """Episodes of LENGTHS, with a guide that shows the time and one that does the opposite."""
     lengths = torch.tensor(LENGTHS * copies)
     time = torch.linspace(-1, 1, 256)[:, None, None].repeat(1, len(lengths), 1)
-    keys = {"in_keys": ["time"], "out_keys": ["action"]}
     guides = {
-        "time": TensorDictModule(lambda seen: seen.clone(), **keys),
-        "opposite": TensorDictModule(lambda seen: -seen, **keys),
+        "time": acting(lambda seen: seen.clone(), "time"),
+        "opposite": acting(lambda seen: -seen, "time"),
     }
     return TransformedEnv(Script(lengths, torch.ones_like(time), time=time), GuideActions(guides))
 
@@ -89,7 +86,7 @@ def test_guides_are_removed_everywhere_only(found):
 
     removed = ablations(2, len(SECTIONS.names))
     assert removed == [Ablation(0), Ablation(1)]
-    agent, advised = TensorDictModule(act, **KEYS), torch.tensor([[0.25], [0.5]])
+    agent, advised = acting(act, "guide_action"), torch.tensor([[0.25], [0.5]])
     episodes = drive_ablated(world(2), agent, SECTIONS, EVALUATION, removed, advised)
     advice = torch.stack(seen).squeeze(-1)
     assert (advice[:, :4, 0] == 0.25).all()
