@@ -130,7 +130,7 @@ def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
     """
     measures, known = {}, [each.name for each in fields(Measure)]
     for name, node in nodes.items():
-        if name in TAKEN:
+        if name in TAKEN or name.endswith("_episodes"):  # as `with_denominators` calls its own
             raise UserError(
                 f"evaluation.measures.{name}: {name} is already a column of the tables; give the "
                 "measure another name"

@@ -236,7 +236,7 @@ def test_a_measure_is_added_on_the_command_line_beside_those_of_the_env(added: l
     assert measures["last"] == Measure("reward", "last")
 
 
-@pytest.mark.parametrize("name", ["reward", "case"])
+@pytest.mark.parametrize("name", ["reward", "case", "lap_episodes"])
 def test_a_measure_named_as_another_column_is_refused(name: str) -> None:
     with pytest.raises(UserError, match=f"{name} is already a column of the tables"):
         measures_with(f"evaluation.measures.{name}.entry=reward")
