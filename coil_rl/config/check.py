@@ -25,6 +25,7 @@ from coil_rl.config.nodes import build, build_all, check_node
 from coil_rl.config.schema import TrainConfig, passive
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.extras import require
+from coil_rl.foreign.batch import optional_entries
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
@@ -433,7 +434,7 @@ def _check_flag(env: EnvBase, key: NestedKey, name: str) -> None:
     """
     found = [group[key] for group in check_entry(env, key, name)]
     rows = env.batch_size.numel()
-    of_info = key in getattr(env, "optional", ())
+    of_info = key in optional_entries(env)
     if not any(
         (of_info or spec.dtype == torch.bool) and spec.shape.numel() == rows for spec in found
     ):

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 from coil_rl.envs.seeded_env import SeededEnv
 from coil_rl.foreign.rows import Entries, Rows
@@ -154,3 +155,13 @@ def same(one: Any, other: Any) -> bool:
             return False
         return all(same(value, other[key]) for key, value in one.items())
     return np.array_equal(one.cpu().numpy(), other.cpu().numpy(), equal_nan=one.is_floating_point())
+
+
+def optional_entries(env: EnvBase) -> Sequence[tuple[str, ...]]:
+    """Return the entries in which NaN is a number without a value; none in an env of another kind.
+
+    Args:
+        env: an env, with or without transforms. A `SerialEnv` cannot be asked for an attribute.
+    """
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    return base.optional if isinstance(base, SeededRows) else ()

@@ -24,7 +24,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from coil_rl.foreign.batch import SeededRows, same
+from coil_rl.foreign.batch import SeededRows, optional_entries, same
 from coil_rl.foreign.controllers import PerRow
 from coil_rl.foreign.faults import ForeignError
 from coil_rl.foreign.gymnasium_env import GymnasiumEnv
@@ -144,8 +144,7 @@ class Trial:
             return self.env.rollout(self.steps, policy, break_when_any_done=False)
 
     def _look_at_numbers(self, rollout: TensorDictBase) -> None:
-        known = self.base.optional if isinstance(self.base, SeededRows) else ()
-        optional = {part for key in known for part in (key, ("next", *key))}
+        optional = {part for key in optional_entries(self.env) for part in (key, ("next", *key))}
         for key, value in rollout.items(True, True):
             numbers = value.nan_to_num() if key in optional else value
             if value.is_floating_point() and not numbers.isfinite().all():

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.errors import UserError
-from coil_rl.foreign.batch import SeededRows
+from coil_rl.foreign.batch import optional_entries
 from coil_rl.learners.policy import NOISE
 from coil_rl.ranges import Share, checked
 from coil_rl.run.lean_steps import LeanSteps
@@ -51,7 +51,7 @@ class Rollout:
         self.env, self.policy, self.steps = env.train(), policy, steps
         self.base_env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
         self.keys = None if keys is None else list(dict.fromkeys(keys))
-        optional = self.base_env.optional if isinstance(self.base_env, SeededRows) else ()
+        optional = optional_entries(env)
         self.unchecked = [*optional, *(("next", *key) for key in optional)]
         self.lean: LeanSteps | None = None
         if self.keys is not None and LeanSteps.covers(env, policy, self.keys):

@@ -2,9 +2,10 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.envs import PendulumEnv
+from torchrl.envs import Compose, PendulumEnv, SerialEnv, TransformedEnv
 
 from coil_rl import EnvBatch, GymnasiumEnv
+from coil_rl.foreign.batch import optional_entries
 
 
 def test_rows_are_single_envs():
@@ -37,3 +38,10 @@ def test_global_random_numbers_are_not_touched_by_resets():
 def test_env_that_is_a_batch_itself_is_refused():
     with pytest.raises(ValueError, match=r"GymnasiumEnv has the batch size \[2\]"):
         EnvBatch(partial(GymnasiumEnv, "CartPole-v1", 2))
+
+
+def test_entries_that_may_lack_a_number_are_those_of_info():
+    env = GymnasiumEnv("CartPole-v1", 2, info=["lives"])
+    assert optional_entries(TransformedEnv(env, Compose())) == [("info", "lives")]
+    for other in (EnvBatch(PendulumEnv, 2), SerialEnv(2, PendulumEnv)):
+        assert not optional_entries(TransformedEnv(other, Compose()))
