@@ -261,6 +261,8 @@ class Run:
         trial = self.trial
         if cases is not None:
             trial = trial_with_cases(trial, whole("cases", cases))
+        if folder is None:
+            trial = replace(trial, pictures=[])
         with tempfile.TemporaryDirectory() as temporary:
             place = Path(temporary) if folder is None else Path(folder).expanduser()
             judgement = self.judge(trial, place, self.seed)
