@@ -8,7 +8,7 @@ from run_folders import driven, make_run
 
 from coil_rl.measures import measures_of
 from coil_rl.run.evaluation import EvaluationResult
-from coil_rl.run.judge import Judgement
+from coil_rl.run.judge import Evaluation, Judgement, Trial
 from coil_rl.run.reasons import page_of
 from coil_rl.run.run import Run
 
@@ -37,6 +37,7 @@ def test_table_of_a_run_says_of_how_many_episodes_a_mean_is():
     judgement.add(
         EvaluationResult([{"case": str(n), "reward": 1.0, "lap": lap} for n, lap in laps]), "coil"
     )
-    run = SimpleNamespace(trial=None, seed=0, judge=lambda trial, folder, seed: judgement)
+    trial = Trial("coil", Evaluation(["0", "1"], {}, {}), make_env=None)
+    run = SimpleNamespace(trial=trial, seed=0, judge=lambda trial, folder, seed: judgement)
     mean = Run.evaluate(run).iloc[-1]
     assert (mean["lap"], mean["episodes"], mean["lap_episodes"]) == (50.0, 2, 1)
