@@ -866,6 +866,13 @@ def test_picture_of_real_numbers_up_to_255_is_named():
 # Kind 5: what a person writes into a file.
 
 
+def test_file_that_is_no_yaml_is_named_with_its_line(tmp_path):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text("a: [1,\nb: }\n")
+    said = called("train", "--config-dir", str(tmp_path), "+experiment=mine", code=2).stderr
+    assert "mine.yaml, line 2: it is no YAML: " in said
+
+
 # Kind 6: how a run goes on.
 
 

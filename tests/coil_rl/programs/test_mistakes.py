@@ -163,7 +163,10 @@ def test_error_of_the_program_itself_shows_its_traceback(started, monkeypatch):
     ("change", "message"),
     [
         ({"evaluation.policy": "best"}, None),  # replaced by the requested evaluation
-        (b"a: [1,\n  b: }", "config.yaml, line 2: it is no YAML: "),
+        (
+            b"a: [1,\n  b: }",
+            "config.yaml is not the configuration of a run (line 2: it is no YAML: ",
+        ),
         (b"- 1\n", "config.yaml is not the configuration of a run (it holds no keys)"),
         (b"", "is not the configuration of a run ("),
         ({"seed": "abc"}, "Value 'abc' of type 'str' could not be converted to Integer"),
