@@ -18,6 +18,7 @@ MEAN_CASE = "mean"  # in the column `case`: the means over the cases
 REDUCTIONS = ("mean", "sum", "min", "max", "last", "any", "count", "mean_nonzero")
 # Columns that evaluation.csv and episodes.csv have besides the measures.
 TAKEN = ("driver", "advice", "actions", "case", "reward", "steps", "episodes", "seed")
+EPISODES = "_episodes"  # suffix of the columns of `with_denominators`
 TYPES = {"at_least": float, "at_most": float, "reduction": str, "title": str, "format": str}
 FORMAT = r"[+,]?\d{0,2}(\.\d)?[efg%]?"  # of numbers; its width has at most two digits
 
@@ -130,7 +131,7 @@ def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
     """
     measures, known = {}, [each.name for each in fields(Measure)]
     for name, node in nodes.items():
-        if name in TAKEN or name.endswith("_episodes"):  # as `with_denominators` calls its own
+        if name in TAKEN or name.endswith(EPISODES):
             raise UserError(
                 f"evaluation.measures.{name}: {name} is already a column of the tables; give the "
                 "measure another name"
@@ -229,6 +230,6 @@ def with_denominators(
         return [dict(row) for row in rows]
     result = []
     for row, count in zip(rows, counts, strict=True):
-        of_measures = {f"{name}_episodes": count[name] for name in partial}
+        of_measures = {f"{name}{EPISODES}": count[name] for name in partial}
         result.append({**row, "episodes": count["episodes"], **of_measures})
     return result

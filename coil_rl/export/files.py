@@ -160,8 +160,12 @@ def explained(content: bytes, contract: Mapping[str, Any]) -> bytes:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Silence what the libraries say about themselves in the block, and undo what they set."""
-    said = redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO())
-    with Guard(), warnings.catch_warnings(), said[0], said[1]:
+    with (
+        Guard(),
+        warnings.catch_warnings(),
+        redirect_stdout(io.StringIO()),
+        redirect_stderr(io.StringIO()),
+    ):
         logging.disable(logging.WARNING)
         warnings.simplefilter("ignore")
         yield

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from coil_rl.errors import UserError
-from coil_rl.measures import Measure, with_denominators
+from coil_rl.measures import EPISODES, Measure, with_denominators
 from coil_rl.record import DRIVER
 from coil_rl.report.guides import is_guide, shared_guides
 from coil_rl.report.runs import FALLBACK, GUIDE, TERM, Run, by_label
@@ -22,7 +22,6 @@ from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate,
 from coil_rl.report.table import return_format
 
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
-EPISODES = "_episodes"  # suffix of the columns of `with_denominators`
 
 
 @dataclass(frozen=True, eq=False)

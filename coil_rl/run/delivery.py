@@ -145,10 +145,11 @@ class Delivery:
         return hold is not None and bool(hold.held)
 
     def _affordable(self, shares: int = 1) -> int:
-        """Return the frames that the test may take: its share, or what the start test has left.
+        """Return the frames that the test may take: some shares, or what the start test has left.
 
-        The two tests together have two shares. If the start test found a guide ahead but had too
-        few cases to hold it, its own frames do not count, so that this test has more cases.
+        The two tests together have two shares, of which each takes one if it can. If the start test
+        found a guide ahead but had too few cases to hold it, its own frames do not count, so that
+        this test has more cases.
         """
         share = math.ceil(SHARE * self.cases.frames)
         taken = 0 if self.cases.guide_ahead else self.cases.steps
